@@ -1,0 +1,58 @@
+"""Ray as this project uses it: one way to connect, and one way to spread calls with a bounded number in flight."""
+
+import logging
+import os
+from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
+from typing import Any, TypeVar
+
+import ray
+
+Item = TypeVar("Item")
+
+
+def connect() -> None:
+    """Join the cluster that the environment names (RAY_ADDRESS, or a job's own), else start a local one. Idempotent.
+
+    Workers' output stays in Ray's session folder: what a worker has to say comes back as a result or an exception.
+    """
+    if ray.is_initialized():
+        return
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's coming default; unset, each init warns
+    # A token for a local cluster is what we want, and no news.
+    logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
+    ray.init(log_to_driver=False, logging_level=logging.WARNING)
+
+
+def cpus() -> int:
+    """CPU cores of the whole cluster, at least 1."""
+    return max(1, int(_resources().get("CPU", 1)))
+
+
+def gpus() -> int:
+    """GPUs of the whole cluster."""
+    return int(_resources().get("GPU", 0))
+
+
+def _resources() -> dict[str, float]:
+    found: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
+    return found
+
+
+def bounded(
+    submit: Callable[[Item], "ray.ObjectRef[Any]"], items: Iterable[Item], window: int
+) -> Iterator[tuple[Item, Any]]:
+    """Call `submit` on every item with at most `window` calls in flight; yield (item, result) as they finish.
+
+    An exception in a call is raised here, after nothing new has been submitted.
+    """
+    waiting = iter(items)
+    running: dict[Any, Item] = {submit(item): item for item in islice(waiting, window)}
+    while running:
+        [done], _ = ray.wait(list(running), num_returns=1)
+        item = running.pop(done)
+        result = ray.get(done)
+        for following in islice(waiting, 1):
+            running[submit(following)] = following
+        yield item, result

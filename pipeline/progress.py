@@ -1,0 +1,90 @@
+"""Progress of long work: a bar on a terminal, a JSON line every few seconds elsewhere; rate and time left in both."""
+
+import json
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+SECONDS_BETWEEN_LINES = 5.0
+
+console = Console(stderr=True, highlight=False, soft_wrap=True)
+"Where progress and remarks go; results go to standard output."
+
+
+class Meter(Protocol):
+    """What long work tells of itself while it runs."""
+
+    def advance(self, count: float = 1, **facts: float | str) -> None:
+        """`count` more units are done; `facts` are shown beside the bar until others come."""
+
+    def note(self, text: str) -> None:
+        """One remark that stays on the screen."""
+
+
+@contextmanager
+def progress(total: float | None, label: str, unit: str = "images") -> Iterator[Meter]:
+    """Show the progress of `total` units of work (None where unknown)."""
+    if not console.is_terminal:
+        meter = _Lines(total, label, unit)
+        yield meter
+        meter.line(last=True)
+        return
+    columns = (
+        TextColumn("{task.description}"), BarColumn(bar_width=30), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[facts]}"),
+    )  # fmt: skip
+    with Progress(*columns, console=console) as bar:
+        yield _Bar(bar, total, label, unit)
+
+
+class _Bar:
+    def __init__(self, bar: Progress, total: float | None, label: str, unit: str) -> None:
+        self._bar, self._unit, self._start, self._done = bar, unit, time.monotonic(), 0.0
+        self._task = bar.add_task(label, total=total, rate="", facts="")
+
+    def advance(self, count: float = 1, **facts: float | str) -> None:
+        self._done += count
+        rate = f"{self._done / max(1e-9, time.monotonic() - self._start):.1f} {self._unit}/s"
+        self._bar.update(self._task, advance=count, rate=rate)
+        if facts:
+            shown = "  ".join(f"{name} {_short(value)}" for name, value in facts.items())
+            self._bar.update(self._task, facts=shown)
+
+    def note(self, text: str) -> None:
+        self._bar.console.print(text)
+
+
+class _Lines:
+    def __init__(self, total: float | None, label: str, unit: str) -> None:
+        self._total, self._label, self._unit = total, label, unit
+        self._start = self._said = time.monotonic()
+        self._done = 0.0
+        self._facts: dict[str, float | str] = {}
+
+    def advance(self, count: float = 1, **facts: float | str) -> None:
+        self._done += count
+        self._facts.update(facts)
+        if time.monotonic() - self._said >= SECONDS_BETWEEN_LINES:
+            self.line()
+
+    def line(self, last: bool = False) -> None:
+        self._said = time.monotonic()
+        seconds = max(1e-9, self._said - self._start)
+        rate = self._done / seconds
+        said: dict[str, object] = {"step": self._label, "done": self._done, "total": self._total, "unit": self._unit}
+        said |= {"per_second": round(rate, 2), "seconds": round(seconds, 1)}
+        if self._total is not None and rate > 0 and not last:
+            said["seconds_left"] = round((self._total - self._done) / rate, 1)
+        print(json.dumps(said | self._facts), file=sys.stderr, flush=True)
+
+    def note(self, text: str) -> None:
+        print(json.dumps({"step": self._label, "note": text}), file=sys.stderr, flush=True)
+
+
+def _short(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.3g}"

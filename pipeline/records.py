@@ -1,0 +1,89 @@
+"""The shared vocabulary: what an image is, which of them it is (key), where it shows, and why one was refused."""
+
+import hashlib
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+
+import pyarrow as pa
+
+
+class InputError(ValueError):
+    """Input that cannot be used. The message is one sentence for a person: what was found, what was expected, what
+    to do. Jobs print it alone and exit with 2."""
+
+
+class Split(StrEnum):
+    """Which part of a data set an image belongs to. The official test set is all of query and gallery."""
+
+    TRAIN = "train"
+    QUERY = "query"
+    GALLERY = "gallery"
+
+
+class View(StrEnum):
+    """From where an image was taken. `google` is University-1652's street view images found by a web search."""
+
+    DRONE = "drone"
+    SATELLITE = "satellite"
+    STREET = "street"
+    GOOGLE = "google"
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeoTag:
+    """Where the place that an image shows lies, WGS84, and how the camera looked at it."""
+
+    lat: float
+    "Latitude of the place shown, degrees north."
+    lon: float
+    "Longitude of the place shown, degrees east."
+    altitude_m: float | None = None
+    "Height of the camera above the ground, metres."
+    heading_deg: float | None = None
+    "Direction in which the camera looks, degrees clockwise from north."
+    pitch_deg: float | None = None
+    "Angle of the optical axis below the horizon, degrees: -90 looks straight down."
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageRecord:
+    """One image as a source found it; nothing has been read of it yet but its path."""
+
+    path: str
+    "Where the bytes are; a plain path or a URI."
+    split: Split
+    view: View
+    location: str
+    "The label: the folder's name, never an index."
+    geotag: GeoTag | None = None
+
+    @property
+    def key(self) -> str:
+        """Name of this image in the data set: `[a-z0-9_-]+`, derived from split, view, location and file name alone."""
+        stem = self.path.rsplit("/", 1)[-1].rsplit(".", 1)[0]
+        return make_key(self.split, self.view, self.location, stem)
+
+
+def make_key(split: Split, view: View, location: str, stem: str) -> str:
+    """Key of an image: stable under re-sharding, without dots (webdataset cuts a name at the first one).
+
+    Where a character had to be replaced, eight digits of the original name's hash keep two names apart.
+    """
+    named = f"{split}-{view}-{location}-{stem}"
+    slug = re.sub(r"[^a-z0-9_-]", "_", named.lower())
+    return slug if slug == named else f"{slug}-{hashlib.sha256(named.encode()).hexdigest()[:8]}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rejection:
+    """An image that was refused, and why."""
+
+    path: str
+    reason: str
+    "Short and countable: the same words for the same fault."
+    found: str
+    "What this file held, for the person who mends it."
+
+
+REJECTED_SCHEMA = pa.schema([("path", pa.string()), ("reason", pa.string()), ("found", pa.string())])

@@ -1,0 +1,111 @@
+"""Files on any storage that fsspec knows: a plain path, file://, s3://, gs://, memory://. Writing is all or nothing."""
+
+import json
+import os
+import tempfile
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any, cast
+
+import fsspec
+from fsspec.implementations.local import LocalFileSystem
+
+
+def locate(path: str) -> tuple[Any, str]:
+    """The fsspec file system of a path and the path on it."""
+    filesystem, inner = fsspec.core.url_to_fs(path)
+    return filesystem, inner
+
+
+def is_local(path: str) -> bool:
+    return isinstance(locate(path)[0], LocalFileSystem)
+
+
+def absolute(path: str) -> str:
+    """The path as another process with another working directory would have to name it; URIs stay as they are."""
+    return path if "://" in path else os.path.abspath(os.path.expanduser(path))
+
+
+def join(folder: str, *names: str) -> str:
+    return "/".join([folder.rstrip("/"), *names])
+
+
+def exists(path: str) -> bool:
+    filesystem, inner = locate(path)
+    return bool(filesystem.exists(inner))
+
+
+def names(folder: str) -> list[str]:
+    """File names in a folder, sorted, without temporary and hidden ones; an absent folder has none."""
+    filesystem, inner = locate(folder)
+    if not filesystem.isdir(inner):
+        return []
+    found = (entry.rstrip("/").rsplit("/", 1)[-1] for entry in filesystem.ls(inner, detail=False))
+    return sorted(name for name in found if not name.startswith("."))
+
+
+def walk(folder: str) -> list[str]:
+    """Paths, relative to the folder, of all files below it, sorted; hidden ones left out."""
+    filesystem, inner = locate(folder)
+    root = inner.rstrip("/") + "/"
+    below = (path.removeprefix(root) for path in filesystem.find(inner))
+    return sorted(path for path in below if not any(part.startswith(".") for part in path.split("/")))
+
+
+def is_folder(path: str) -> bool:
+    filesystem, inner = locate(path)
+    return bool(filesystem.isdir(inner))
+
+
+def read_bytes(path: str) -> bytes:
+    filesystem, inner = locate(path)
+    data: bytes = filesystem.cat_file(inner)
+    return data
+
+
+def read_json(path: str) -> Any:
+    return json.loads(read_bytes(path))
+
+
+def open_read(path: str) -> IO[bytes]:
+    filesystem, inner = locate(path)
+    stream: IO[bytes] = filesystem.open(inner, "rb")
+    return stream
+
+
+@contextmanager
+def atomic(path: str) -> Iterator[IO[bytes]]:
+    """A stream to write a file through, which appears under its name when complete or not at all.
+
+    On a local disk: a hidden temporary neighbour, fsynced and renamed. Elsewhere: one upload at the end, which object
+    stores make visible whole.
+    """
+    filesystem, inner = locate(path)
+    filesystem.makedirs(inner.rsplit("/", 1)[0], exist_ok=True)
+    if not isinstance(filesystem, LocalFileSystem):
+        with tempfile.NamedTemporaryFile() as stream:
+            yield cast(IO[bytes], stream)
+            stream.flush()
+            filesystem.put_file(stream.name, inner)
+        return
+    target = Path(inner)
+    temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}")
+    try:
+        with temporary.open("wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: str, data: bytes) -> None:
+    with atomic(path) as stream:
+        stream.write(data)
+
+
+def write_json(path: str, value: Any) -> None:
+    write_bytes(path, (json.dumps(value, indent=2, ensure_ascii=False) + "\n").encode())
