@@ -1,0 +1,224 @@
+"""Shards -> batches: shuffled pairs of views for training, in order for embedding, by key for pictures.
+
+In: a set of shards. Out: batches of images as bytes (B, 3, H, W) with their labels. What is seen when is a pure function
+of the seed, the epoch and the rank, so a run that is continued sees what it would have seen.
+"""
+
+import json
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from webdataset.tariterators import group_by_keys, tar_file_expander
+
+from pipeline import storage
+from pipeline.records import InputError, Split, View
+from pipeline.shards import Manifest, Shard, read_manifest
+from pipeline.transforms import Augmentation, DecodeError, Pixels, augment, decode, resize
+
+In = TypeVar("In")
+Out = TypeVar("Out")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """One image as a shard holds it."""
+
+    key: str
+    data: bytes
+    "The encoded image."
+    facts: dict[str, Any]
+    "The JSON beside it."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch:
+    """Images of one view."""
+
+    images_B3HW: npt.NDArray[np.uint8]
+    location_B: npt.NDArray[np.int64]
+    "Class numbers, as the manifest's classes are in order."
+    view: View
+    keys: tuple[str, ...]
+
+
+def read_shard(shards: str, name: str) -> Iterator[Sample]:
+    """The samples of one tar in their order."""
+    path = storage.join(shards, f"{name}.tar")
+    with storage.open_read(path) as stream:
+        for sample in group_by_keys(tar_file_expander([{"url": path, "stream": stream}])):
+            [ending] = [name for name in sample if not name.startswith("__") and name != "json"]
+            yield Sample(key=sample["__key__"], data=sample[ending], facts=json.loads(sample["json"]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Span:
+    """A run of samples within one shard."""
+
+    name: str
+    start: int
+    stop: int
+
+
+def plan_pass(shards: Sequence[Shard], wanted: int, rank: int, world: int, rng: np.random.Generator) -> list[Span]:
+    """The spans that `rank` of `world` reads so that all ranks together see `world * wanted` samples of these shards.
+
+    The shards in random order form a ring, entered at a random sample: which samples fall off at the end differs from
+    pass to pass, and no two ranks see the same one while the ring is long enough. A shorter ring is gone round again.
+    """
+    order = [shards[number] for number in rng.permutation(len(shards))]
+    total = sum(shard.samples for shard in order)
+    if total == 0:
+        return []
+    position = (int(rng.integers(total)) + rank * wanted) % total
+    spans: list[Span] = []
+    while wanted > 0:
+        inside = position
+        for shard in order:
+            if inside < shard.samples:
+                take = min(wanted, shard.samples - inside)
+                spans.append(Span(name=shard.name, start=inside, stop=inside + take))
+                break
+            inside -= shard.samples
+        position, wanted = (position + take) % total, wanted - take
+    return spans
+
+
+def read_spans(shards: str, spans: Iterable[Span]) -> Iterator[Sample]:
+    for span in spans:
+        yield from islice(read_shard(shards, span.name), span.start, span.stop)
+
+
+def shuffled(samples: Iterable[Sample], buffer: int, rng: np.random.Generator) -> Iterator[Sample]:
+    """Samples in random order as far as `buffer` encoded images allow."""
+    held: list[Sample] = []
+    for sample in samples:
+        if len(held) < buffer:
+            held.append(sample)
+            continue
+        chosen = int(rng.integers(buffer))
+        yield held[chosen]
+        held[chosen] = sample
+    for chosen in rng.permutation(len(held)):
+        yield held[chosen]
+
+
+def ahead(function: Callable[[In], Out], items: Iterable[In], threads: int, depth: int) -> Iterator[Out]:
+    """`map` by threads, in order, at most `depth` items ahead of the consumer. Decoding releases the GIL."""
+    with ThreadPoolExecutor(threads) as pool:
+        waiting: deque[Future[Out]] = deque()
+        try:
+            for item in items:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) > depth:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """How training images are read."""
+
+    batch_size: int = 8
+    "Images of each view per step and worker [LPN lineage: 8]."
+    image_size: int = 256
+    "Side in pixels that the network is given."
+    augmentation: Augmentation = field(default_factory=Augmentation)
+    seed: int = 0
+    shuffle_buffer: int = 4096
+    "Encoded images held for shuffling; those of University-1652 take some 40 kB each."
+    threads: int = 2
+    "That decode and augment ahead of the network."
+
+
+class TrainingStream:
+    """Pairs of batches of a set's training split, drawn independently from each view.
+
+    An epoch is one pass over the satellite view; its last partial batch is dropped, other images each time. The UAV view
+    gives as many images, drawn anew each epoch.
+
+    Raises InputError when the set cannot be trained on.
+    """
+
+    def __init__(self, shards: str, reading: Reading, rank: int = 0, world: int = 1) -> None:
+        self.shards, self.reading, self.rank, self.world = shards, reading, rank, world
+        self.manifest: Manifest = read_manifest(shards)
+        self.classes = {location: number for number, location in enumerate(self.manifest.classes)}
+        counts = {
+            view: sum(s.samples for s in self.manifest.of(Split.TRAIN, view)) for view in (View.DRONE, View.SATELLITE)
+        }
+        together = reading.batch_size * world
+        self.steps = counts[View.SATELLITE] // together
+        "Steps of an epoch, the same for every rank."
+        if self.steps == 0 or counts[View.DRONE] == 0:
+            raise InputError(
+                f"{shards} has {counts[View.SATELLITE]} satellite and {counts[View.DRONE]} UAV training images; expected at "
+                f"least one batch of {together} satellite images and some of the UAV; pack more, or train with a smaller batch"
+            )
+
+    def epoch(self, epoch: int) -> Iterator[tuple[Batch, Batch]]:
+        """The (UAV, satellite) batches of one epoch, a pure function of seed, epoch, rank and world."""
+        return zip(self._view(View.DRONE, epoch), self._view(View.SATELLITE, epoch), strict=True)
+
+    def _view(self, view: View, epoch: int) -> Iterator[Batch]:
+        reading, wanted = self.reading, self.steps * self.reading.batch_size
+        number = list(View).index(view)
+        # The plan is every rank's alike; the order within a rank is its own.
+        plan_rng = np.random.default_rng([reading.seed, epoch, number])
+        spans = plan_pass(self.manifest.of(Split.TRAIN, view), wanted, self.rank, self.world, plan_rng)
+        order_rng = np.random.default_rng([reading.seed, epoch, number, self.rank])
+        samples = shuffled(read_spans(self.shards, spans), reading.shuffle_buffer, order_rng)
+
+        def prepare(numbered: tuple[int, Sample]) -> tuple[Sample, Pixels]:
+            position, sample = numbered
+            # A generator for each image: what becomes of it does not depend on which thread had it.
+            rng = np.random.default_rng([reading.seed, epoch, number, self.rank, position])
+            return sample, augment(decode(sample.data), view, reading.image_size, reading.augmentation, rng)
+
+        ready = ahead(prepare, enumerate(samples), reading.threads, 4 * reading.batch_size)
+        while group := list(islice(ready, reading.batch_size)):
+            labels = [self.classes[sample.facts["location"]] for sample, _ in group]
+            yield Batch(
+                images_B3HW=stack([image for _, image in group]),
+                location_B=np.asarray(labels, np.int64),
+                view=view,
+                keys=tuple(sample.key for sample, _ in group),
+            )
+
+
+def stack(images_HW3: Sequence[Pixels]) -> npt.NDArray[np.uint8]:
+    """Images of one size as (B, 3, H, W), channels last in memory, which is how the network wants them."""
+    return np.stack(images_HW3).transpose(0, 3, 1, 2)
+
+
+def decoded(
+    shards: str, name: str, image_size: int, threads: int, depth: int
+) -> Iterator[tuple[Sample, Pixels | DecodeError]]:
+    """The images of one shard in order, decoded and resized by threads; what cannot be decoded comes as its error."""
+
+    def prepare(sample: Sample) -> tuple[Sample, Pixels | DecodeError]:
+        try:
+            return sample, resize(decode(sample.data), image_size)
+        except DecodeError as error:
+            return sample, error
+
+    yield from ahead(prepare, read_shard(shards, name), threads, depth)
+
+
+def fetch(shards: str, keys: Iterable[str]) -> dict[str, bytes]:
+    """The encoded images of some keys; keys that no shard holds are absent."""
+    wanted = set(keys)
+    found: dict[str, bytes] = {}
+    for shard in read_manifest(shards).shards:
+        prefix = f"{shard.split}-{shard.view}-"
+        if any(key.startswith(prefix) for key in wanted):
+            found |= {sample.key: sample.data for sample in read_shard(shards, shard.name) if sample.key in wanted}
+    return found
