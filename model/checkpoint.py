@@ -1,0 +1,95 @@
+"""Weights and config in one file that `torch.load(..., weights_only=True)` reads: no code runs when one is opened.
+
+In: a run's state. Out: bytes, and from bytes the encoder they describe. Where the bytes are kept is the caller's matter.
+"""
+
+import dataclasses
+import hashlib
+import io
+import json
+import pickle
+from typing import Any
+
+import torch
+
+from model.pvda import FeatureEncoder, PVDAConfig
+
+FORMAT = 1
+
+
+class CheckpointError(ValueError):
+    """A file that is not a checkpoint of ours. The message says what was found, what was expected and what to do."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Checkpoint:
+    """A run at the end of an epoch."""
+
+    network: PVDAConfig
+    recipe: dict[str, Any]
+    "The resolved config of the whole run, as plain values."
+    locations: list[str]
+    "Names of the classifier's outputs, in order."
+    epoch: int
+    "Epochs that are over."
+    history: list[dict[str, Any]]
+    "One row per epoch, as metrics.jsonl has them."
+    state: dict[str, Any]
+    "As `Training.state` gives it; only `modules` where a checkpoint is not meant to be trained on."
+
+    @property
+    def encoder_weights(self) -> dict[str, torch.Tensor]:
+        weights: dict[str, torch.Tensor] = self.state["modules"]["encoder"]
+        return weights
+
+
+def dumps(checkpoint: Checkpoint) -> bytes:
+    """The checkpoint as the bytes of a file."""
+    plain = {field.name: getattr(checkpoint, field.name) for field in dataclasses.fields(checkpoint)}
+    plain |= {"format": FORMAT, "network": json.dumps(dataclasses.asdict(checkpoint.network))}
+    plain |= {name: json.dumps(plain[name]) for name in ("recipe", "history")}
+    buffer = io.BytesIO()
+    torch.save(plain, buffer)
+    return buffer.getvalue()
+
+
+def loads(data: bytes, name: str = "the checkpoint") -> Checkpoint:
+    """The checkpoint that `dumps` made; `name` stands in the message when it is none.
+
+    Raises CheckpointError.
+    """
+    try:
+        plain = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        if plain.pop("format") != FORMAT:
+            raise ValueError("another format")
+        network = PVDAConfig(**json.loads(plain.pop("network")))
+        recipe, history = json.loads(plain.pop("recipe")), json.loads(plain.pop("history"))
+        return Checkpoint(network=network, recipe=recipe, history=history, **plain)
+    except (RuntimeError, pickle.UnpicklingError, EOFError, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"{name} is not a checkpoint of format {FORMAT} ({type(error).__name__}); expected a last.pt written by "
+            "jobs/train.py; name that file"
+        ) from error
+
+
+def build_encoder(checkpoint: Checkpoint) -> FeatureEncoder:
+    """The encoder with the checkpoint's weights, in evaluation mode."""
+    encoder = FeatureEncoder(checkpoint.network)
+    encoder.load_state_dict(checkpoint.encoder_weights)
+    return encoder.eval()
+
+
+def load_encoder(path: str) -> FeatureEncoder:
+    """The encoder of a checkpoint on the local disk, in evaluation mode."""
+    with open(path, "rb") as stream:
+        return build_encoder(loads(stream.read(), path))
+
+
+def fingerprint(checkpoint: Checkpoint, preprocessing: str) -> str:
+    """Hash of all that an embedding depends on: weights, network and preprocessing; 64 hexadecimal digits."""
+    digest = hashlib.sha256()
+    digest.update(json.dumps([dataclasses.asdict(checkpoint.network), preprocessing], sort_keys=True).encode())
+    for name, tensor in sorted(checkpoint.encoder_weights.items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.contiguous().flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,43 @@
+"""The paper's losses, one function per equation; 1 is the UAV's view, 2 the satellite's.
+
+All reduce by the mean over the images of a view, then sum over views and rings [LPN]: literal sums over the data set, as
+printed, would weigh 54 UAV images against one satellite image.
+Shapes: B images, P rings, L locations.
+"""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+DRONE, SATELLITE = 0, 1
+"The view labels that the discriminator learns."
+
+
+def location_loss(logits1_BPL: Tensor, location1_B: Tensor, logits2_BPL: Tensor, location2_B: Tensor) -> Tensor:
+    """Eq. 1, L_L: cross-entropy of the locations, summed over rings and views."""
+    return sum_over_rings(logits1_BPL, location1_B) + sum_over_rings(logits2_BPL, location2_B)
+
+
+def sum_over_rings(logits_BPL: Tensor, location_B: Tensor) -> Tensor:
+    """Cross-entropy of one view: mean over images, summed over rings."""
+    parts = logits_BPL.shape[1]
+    return F.cross_entropy(logits_BPL.flatten(0, 1), location_B.repeat_interleave(parts)) * parts
+
+
+def view_loss(verdict1_B2: Tensor, verdict2_B2: Tensor) -> Tensor:
+    """Eq. 2, L_V: cross-entropy of the true views; trains the discriminator."""
+    return _views(verdict1_B2, DRONE) + _views(verdict2_B2, SATELLITE)
+
+
+def adversarial_loss(verdict1_B2: Tensor, verdict2_B2: Tensor) -> Tensor:
+    """Eq. 3, L_A: cross-entropy of the swapped views; trains the encoder to be mistaken for the other view."""
+    return _views(verdict1_B2, SATELLITE) + _views(verdict2_B2, DRONE)
+
+
+def feature_loss(location: Tensor, adversarial: Tensor, alpha: float) -> Tensor:
+    """Eq. 4, L_FL = L_L + alpha * L_A."""
+    return location + alpha * adversarial
+
+
+def _views(verdict_B2: Tensor, label: int) -> Tensor:
+    return F.cross_entropy(verdict_B2, torch.full((len(verdict_B2),), label, device=verdict_B2.device))

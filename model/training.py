@@ -1,0 +1,172 @@
+"""The two-step update of PVDA, and the state that a checkpoint holds. Knows no Ray and no files.
+
+In: a batch of each view. Out: changed weights, and the losses of the step.
+Shapes: B images of a view, H x W pixels or cells, C channels of the maps, P rings, L locations.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+from torch.optim import SGD, Adam, AdamW, Optimizer
+
+from model.losses import DRONE, SATELLITE, adversarial_loss, feature_loss, location_loss, view_loss
+from model.pvda import FeatureEncoder, LocationClassifier, PVDAConfig, ViewDiscriminator
+from model.schedule import Phase
+
+
+@dataclass(frozen=True, kw_only=True)
+class Optimisation:
+    """How the weights are moved. The defaults are the paper's."""
+
+    kind: Literal["sgd", "adamw"] = "sgd"
+    "Of the encoder and classifier: SGD with Nesterov momentum [LPN], or AdamW for short runs from scratch."
+    backbone_rate: float = 0.001
+    "Learning rate of the backbone [paper]."
+    head_rate: float = 0.01
+    "Learning rate of the rings' refinement [paper]."
+    classifier_rate: float = 0.01
+    "Learning rate of the location classifier [paper]."
+    discriminator_rate: float = 0.002
+    "Learning rate of D, which Adam moves [paper]."
+    momentum: float = 0.9
+    "Of SGD [LPN]."
+    weight_decay: float = 5e-4
+    "Of encoder and classifier [LPN]; D has none [chosen]."
+
+
+class Learner(nn.Module):
+    """Encoder and classifier as one module: one forward pass an iteration, which is what DDP wants to see.
+
+    The encoder runs once per view, so that BatchNorm's statistics are a view's own [LPN].
+    """
+
+    def __init__(self, config: PVDAConfig, locations: int) -> None:
+        super().__init__()
+        self.encoder = FeatureEncoder(config)
+        self.classifier = LocationClassifier(config, locations)
+
+    def forward(self, images1_B3HW: Tensor, images2_B3HW: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """UAV and satellite images -> maps of each (B, C, H, W), location logits of each (B, P, L)."""
+        maps1_BCHW, g1_BPD = self.encoder(images1_B3HW)
+        maps2_BCHW, g2_BPD = self.encoder(images2_B3HW)
+        return maps1_BCHW, maps2_BCHW, self.classifier(g1_BPD), self.classifier(g2_BPD)
+
+
+class Training:
+    """Networks and optimisers of one run, and the iteration that moves them.
+
+    `distribute` wraps each trained module (DDP over several workers); `adversary=False` leaves the discriminator out,
+    which is LPN.
+    """
+
+    def __init__(
+        self,
+        config: PVDAConfig,
+        optimisation: Optimisation,
+        locations: int,
+        *,
+        adversary: bool = True,
+        device: torch.device | str = "cpu",
+        distribute: Callable[[nn.Module], nn.Module] = lambda module: module,
+    ) -> None:
+        self.device = torch.device(device)
+        self.learner = Learner(config, locations).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._learner = distribute(self.learner)
+        encoder, rates = self.learner.encoder, optimisation
+        groups = [
+            {"params": list(encoder.backbone.parameters()), "start": rates.backbone_rate, "name": "backbone"},
+            {"params": list(encoder.refine.parameters()), "start": rates.head_rate, "name": "head"},
+            {
+                "params": list(self.learner.classifier.parameters()),
+                "start": rates.classifier_rate,
+                "name": "classifier",
+            },
+        ]
+        self.optimisers: list[Optimizer] = [
+            SGD(groups, lr=0.0, momentum=rates.momentum, nesterov=True, weight_decay=rates.weight_decay)
+            if rates.kind == "sgd"
+            else AdamW(groups, lr=0.0, weight_decay=rates.weight_decay)
+        ]
+        self.discriminator: ViewDiscriminator | None = None
+        if adversary:
+            discriminator = ViewDiscriminator(config, encoder.backbone.channels)
+            self.discriminator = discriminator.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+            self._discriminator = distribute(self.discriminator)
+            own = {
+                "params": list(discriminator.parameters()),
+                "start": rates.discriminator_rate,
+                "name": "discriminator",
+            }
+            self.optimisers.append(Adam([own], lr=0.0))
+        for module in self.modules.values():
+            module.train()
+
+    @property
+    def modules(self) -> dict[str, nn.Module]:
+        """The networks by the name under which a checkpoint holds them."""
+        named: dict[str, nn.Module] = {"encoder": self.learner.encoder, "classifier": self.learner.classifier}
+        return named | ({"discriminator": self.discriminator} if self.discriminator is not None else {})
+
+    @property
+    def rates(self) -> dict[str, float]:
+        """Learning rates in force, by group."""
+        return {group["name"]: group["lr"] for optimiser in self.optimisers for group in optimiser.param_groups}
+
+    def step(
+        self, images1_B3HW: Tensor, location1_B: Tensor, images2_B3HW: Tensor, location2_B: Tensor, now: Phase
+    ) -> dict[str, Tensor]:
+        """One iteration: D takes a step on Eq. 2, then encoder and classifier one on Eq. 4. Returns detached scalars.
+
+        One encoder pass serves both steps; D sees both views in one batch, since BatchNorm over separate batches would
+        erase the very shift that it must see.
+        """
+        for optimiser in self.optimisers:
+            for group in optimiser.param_groups:
+                group["lr"] = group["start"] * now.rate_scale
+        maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = self._learner(images1_B3HW, images2_B3HW)
+        located = location_loss(logits1_BPL, location1_B, logits2_BPL, location2_B)
+        losses = {"location_loss": located}
+        total = located
+        if self.discriminator is not None:
+            both_BCHW = torch.cat([maps1_BCHW, maps2_BCHW])
+            losses |= self._discriminate(both_BCHW.detach(), len(maps1_BCHW))
+            # D's weights are constants of the second step; its BatchNorm stays in training mode.
+            self.discriminator.requires_grad_(False)
+            adversarial = adversarial_loss(*self.discriminator(both_BCHW).split(len(maps1_BCHW)))
+            self.discriminator.requires_grad_(True)
+            total = feature_loss(located, adversarial, now.alpha)
+            losses["adversarial_loss"] = adversarial
+        self.optimisers[0].zero_grad(set_to_none=True)
+        total.backward()  # type: ignore[no-untyped-call]
+        self.optimisers[0].step()
+        return {name: loss.detach() for name, loss in losses.items()}
+
+    def _discriminate(self, both_BCHW: Tensor, drones: int) -> dict[str, Tensor]:
+        """Step 1: move D towards telling the views apart."""
+        verdict_B2 = self._discriminator(both_BCHW)
+        loss = view_loss(*verdict_B2.split(drones))
+        self.optimisers[1].zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimisers[1].step()
+        truth_B = torch.full((len(verdict_B2),), SATELLITE, device=verdict_B2.device)
+        truth_B[:drones] = DRONE
+        return {"view_loss": loss, "discriminator_accuracy": (verdict_B2.argmax(1) == truth_B).float().mean()}
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the next step depends on, besides the data's order, as tensors and plain values."""
+        return {
+            "modules": {name: module.state_dict() for name, module in self.modules.items()},
+            "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
+            "rng": torch.get_rng_state(),
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on where `state` was taken."""
+        for name, module in self.modules.items():
+            module.load_state_dict(state["modules"][name])
+        for optimiser, held in zip(self.optimisers, state["optimisers"], strict=True):
+            optimiser.load_state_dict(held)
+        torch.set_rng_state(state["rng"])
