@@ -1,0 +1,46 @@
+"""How every job starts and ends: a command line derived from its settings, one sentence and exit code 2 on bad input."""
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import tyro
+
+from model.checkpoint import CheckpointError
+from pipeline.progress import console
+from pipeline.records import InputError
+
+
+def run(job: Callable[..., Any], check: Callable[[Sequence[str]], None] = lambda arguments: None) -> None:
+    """Parse the command line for `job` (its parameters, or its one settings dataclass) and run it.
+
+    `check` may refuse the raw arguments with a better sentence than the parser has. Exits 0 when the output is complete, 2
+    on a wrong call or unusable input, 1 on failure.
+    """
+    config = (
+        tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes,
+        tyro.conf.CascadeSubcommandArgs,  # flags may stand before or after a recipe's name
+        tyro.conf.EnumChoicesFromValues,  # `--view drone`
+        tyro.conf.FlagConversionOff,  # `--mirror False`: one way to say it, and recipes can be overridden both ways
+    )  # fmt: skip
+    try:
+        check(sys.argv[1:])
+        tyro.cli(job, config=config)
+    except (InputError, CheckpointError) as error:
+        _say(str(error))
+        sys.exit(2)
+    except Failure as error:
+        _say(str(error))
+        sys.exit(1)
+    except KeyboardInterrupt:
+        console.print("stopped; run the same command again to go on")
+        sys.exit(130)
+
+
+class Failure(RuntimeError):
+    """A job that could not finish for a reason that needs no traceback: one sentence, exit code 1."""
+
+
+def _say(sentence: str) -> None:
+    console.print("error:", style="bold red", end=" ")
+    console.print(sentence, markup=False)

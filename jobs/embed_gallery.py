@@ -1,0 +1,71 @@
+"""Shards + checkpoint -> feature table: `embed_gallery.py --shards DIR --checkpoint FILE --out TABLE`."""
+
+from dataclasses import dataclass, fields
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from jobs.cli import run
+from model.checkpoint import build_encoder, fingerprint, loads
+from model.inference import embed
+from pipeline import storage
+from pipeline.embed import EmbeddingSettings, Encoder, Network, embed_gallery
+from pipeline.features import Floats
+from pipeline.records import InputError
+from pipeline.transforms import PREPROCESSING
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(EmbeddingSettings):
+    """Which shards are embedded, by which network, into which table."""
+
+    checkpoint: str
+    "A last.pt of jobs/train.py."
+    mirror: bool = True
+    "Whether the embeddings of an image and its mirror image are summed [LPN]."
+
+
+def make_encoder(data: bytes, mirror: bool, threads: int) -> Encoder:
+    """The encoder of a checkpoint's bytes, on the GPU where there is one. Called on the worker."""
+    # Ray sets OMP_NUM_THREADS to the actor's cores before torch is imported; said again for callers without Ray.
+    torch.set_num_threads(threads)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    encoder = build_encoder(loads(data)).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def encode(images_B3HW: npt.NDArray[np.uint8]) -> Floats:
+        result: Floats = embed(encoder, torch.from_numpy(images_B3HW).to(device), mirror).cpu().numpy()
+        return result
+
+    return encode
+
+
+def network_of(data: bytes, name: str, mirror: bool = True) -> Network:
+    """What the embedder needs to know of a checkpoint.
+
+    Raises CheckpointError when the bytes are none.
+    """
+    checkpoint = loads(data, name)
+    preprocessing = f"{PREPROCESSING}, mirror {mirror}"
+    return Network(
+        fingerprint=fingerprint(checkpoint, preprocessing),
+        image_size=checkpoint.network.image_size,
+        factory=partial(make_encoder, data, mirror),
+    )
+
+
+def main(settings: Settings) -> None:
+    """Embed shards into a feature table, one part per shard; finished parts are skipped."""
+    if not storage.exists(settings.checkpoint):
+        raise InputError(
+            f"no checkpoint at {settings.checkpoint}; expected a last.pt of jobs/train.py; check --checkpoint"
+        )
+    given = {field.name: getattr(settings, field.name) for field in fields(EmbeddingSettings)}
+    given |= {"shards": storage.absolute(settings.shards), "out": storage.absolute(settings.out)}
+    network = network_of(storage.read_bytes(settings.checkpoint), settings.checkpoint, settings.mirror)
+    embed_gallery(EmbeddingSettings(**given), network)
+
+
+if __name__ == "__main__":
+    run(main)
