@@ -1,0 +1,44 @@
+"""Fixtures that several tests share: one Ray for all, and a tiny data set made by the simulator."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+os.environ.setdefault("RAY_AUTH_MODE", "disabled")  # the same for every Ray process that the tests start
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+
+
+@pytest.fixture(scope="session")
+def ray_cluster() -> Iterator[None]:
+    """A local Ray of this test session, with two CPUs however many there are."""
+    import ray
+
+    from pipeline import cluster
+
+    os.environ.pop("RAY_ADDRESS", None)
+    cluster.connect()
+    yield
+    ray.shutdown()
+
+
+@pytest.fixture(scope="session")
+def tiny_world(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) -> Path:
+    """A data set in University-1652's layout: 6 training locations, 3 test locations, 2 distractors, 3 views of 64 px."""
+    from pipeline.simulate import SimulationSettings, simulate
+
+    out = tmp_path_factory.mktemp("world")
+    return simulate(
+        SimulationSettings(out=str(out), train_locations=6, test_locations=3, distractors=2, views=3, size=64)
+    )
+
+
+@pytest.fixture(scope="session")
+def tiny_shards(tmp_path_factory: pytest.TempPathFactory, tiny_world: Path) -> str:
+    """That data set as shards of 8 images."""
+    from pipeline.shards import PackingSettings, pack
+
+    out = str(tmp_path_factory.mktemp("shards"))
+    pack(PackingSettings(source="university1652", root=str(tiny_world), out=out, samples_per_shard=8))
+    return out
