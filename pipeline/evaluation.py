@@ -1,0 +1,189 @@
+"""The evaluation stage: feature tables on disk -> metrics, per-query rows and the report in one folder.
+
+In: one table with query and gallery rows, or one table for each. Out: `queries.parquet`, `metrics.parquet`,
+`report.html`, `evaluation.json` (what all of it was made from) and, last, `metrics.json`: where that file is, the
+evaluation is complete.
+"""
+
+import hashlib
+import json
+import time
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline import report, storage, stream
+from pipeline.features import FeatureTable, open_table
+from pipeline.progress import console, progress
+from pipeline.records import InputError, Split, View
+from pipeline.retrieval import METRICS_SCHEMA, Protocol, Task, possible_tasks, retrieve
+from pipeline.shards import read_manifest
+
+ViewName = Literal["drone", "satellite", "street", "google"]
+METRICS, RESULTS, INPUTS = "metrics.json", "queries.parquet", "evaluation.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationSettings:
+    """What to evaluate: --table for every task that it allows, or --queries and --gallery for one."""
+
+    out: str
+    "Folder for the results; a path or a URI."
+    table: str | None = None
+    "Feature table with query and gallery rows: every task of two views, and multi-query drone->satellite."
+    queries: str | None = None
+    "Feature table that holds the query rows."
+    gallery: str | None = None
+    "Feature table that holds the gallery rows."
+    protocol: Protocol = "full"
+    "full: the official one, with all distractors. queried-only: gallery rows of queried locations alone."
+    multi_query: bool = False
+    "One query per location, the mean of its queries' features; with --queries and --gallery."
+    query_view: ViewName | None = None
+    "View of the queries; needed where the tables allow more than one task."
+    gallery_view: ViewName | None = None
+    "View of the gallery."
+    shards: str | None = None
+    "Folder of the shards that were embedded: their pictures are shown in the report."
+    run: str | None = None
+    "Folder of the training run: its curves are shown in the report."
+    beside: str | None = None
+    "Folder of another evaluation on the same images, shown beside this one, such as the untrained network's."
+    title: str = "Retrieval evaluation"
+    "Headline of the report."
+
+    def __post_init__(self) -> None:
+        one, two = self.table is not None, (self.queries is not None, self.gallery is not None)
+        if one == any(two) or (any(two) and not all(two)):
+            given = [f"--{name}" for name in ("table", "queries", "gallery") if getattr(self, name) is not None]
+            raise InputError(
+                f"found {' and '.join(given) or 'no table'}; expected --table alone, or --queries and --gallery together"
+            )
+        if one and self.multi_query:
+            raise InputError("found --multi-query with --table, which evaluates it already; leave it out")
+
+
+def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
+    """Evaluate into `settings.out` and return the metric rows. A finished evaluation of the same inputs is left as it is.
+
+    Raises InputError when the tables do not go together or allow no task, or when the folder holds something else.
+    """
+    queries, gallery, tasks = plan(settings)
+    ranked = {
+        "fingerprint": queries.fingerprint, "queries": identity(queries), "gallery": identity(gallery),
+        "protocol": settings.protocol, "tasks": [str(task) for task in tasks],
+    }  # fmt: skip
+    if settings.shards:
+        read_manifest(settings.shards)  # that there are none is better said before the ranking than after it
+    extras = report.read_extras(settings.title, settings.run, settings.beside)
+    shown = {"title": settings.title, "shards": settings.shards, "extras": extras.sha256}
+    earlier = _earlier(settings.out)
+    if earlier and earlier["ranked"] != ranked:
+        different = ", ".join(name for name, value in ranked.items() if earlier["ranked"].get(name) != value)
+        raise InputError(
+            f"{settings.out} holds an evaluation of something else (different {different}); expected the same or an "
+            "empty folder; choose another --out"
+        )
+    if earlier and earlier["shown"] == shown:
+        _say(f"{settings.out} is complete: the same features were evaluated before; nothing to do")
+    elif earlier:
+        _write_report(settings, report.read_findings(settings.out), extras)
+        storage.write_json(storage.join(settings.out, INPUTS), {"ranked": ranked, "shown": shown})
+        _say(f"{settings.out}: ranked before; wrote report.html anew")
+    else:
+        _evaluate(settings, queries, gallery, tasks, {"ranked": ranked, "shown": shown}, extras)
+    rows: list[dict[str, Any]] = storage.read_json(storage.join(settings.out, METRICS))
+    return rows
+
+
+def plan(settings: EvaluationSettings) -> tuple[FeatureTable, FeatureTable, list[Task]]:
+    """The two tables and the tasks they are to be evaluated on.
+
+    Raises InputError when they come from different networks, allow no task, or more than the one that was asked for.
+    """
+    queries = open_table(settings.table or settings.queries or "")
+    gallery = queries if settings.table else open_table(settings.gallery or "")
+    if queries.fingerprint != gallery.fingerprint:
+        raise InputError(
+            f"queries were embedded by network {queries.fingerprint[:12]} and the gallery by {gallery.fingerprint[:12]}; "
+            "expected one; embed both with the same checkpoint (jobs/embed_gallery.py --checkpoint)"
+        )
+    possible = [
+        task for task in possible_tasks(queries, gallery)
+        if settings.query_view in (None, str(task.query_view)) and settings.gallery_view in (None, str(task.gallery_view))
+    ]  # fmt: skip
+    if not possible:
+        raise InputError(
+            f"found {_held(queries, Split.QUERY)} and {_held(gallery, Split.GALLERY)}; expected query rows of one view and "
+            "gallery rows of another; embed both splits, or name other views with --query-view and --gallery-view"
+        )
+    if settings.table:
+        both = Task(query_view=View.DRONE, gallery_view=View.SATELLITE)
+        merged = [replace(task, multi_query=True) for task in possible if task == both]
+        return queries, gallery, possible + merged
+    if len(possible) > 1:
+        raise InputError(
+            f"the tables allow {', '.join(task.name for task in possible)}; expected one task; choose with --query-view and "
+            "--gallery-view, or give one --table for all of them"
+        )
+    return queries, gallery, [replace(possible[0], multi_query=settings.multi_query)]
+
+
+def identity(table: FeatureTable) -> str:
+    """Hash of what a table holds, from its parts' footers: the same for a copy elsewhere."""
+    said = [[footer.fingerprint, footer.shard_sha256, footer.rows] for footer in table.footers]
+    return hashlib.sha256(json.dumps([table.dimension, list(table.parts), said]).encode()).hexdigest()
+
+
+def _evaluate(
+    settings: EvaluationSettings, queries: FeatureTable, gallery: FeatureTable, tasks: list[Task],
+    inputs: dict[str, Any], extras: report.Extras,
+) -> None:  # fmt: skip
+    begin = time.monotonic()
+    found, spent = [], {}
+    for task in tasks:
+        started = time.monotonic()
+        known = settings.protocol == "full" and not task.multi_query
+        pairs = queries.counts[Split.QUERY, task.query_view] * gallery.counts[Split.GALLERY, task.gallery_view]
+        with progress(pairs if known else None, str(task), "scores") as meter:
+            found.append(retrieve(task, queries, gallery, settings.protocol, advance=meter.advance))
+        spent[str(task)] = time.monotonic() - started
+    rows, results = [each.metrics for each in found], pa.concat_tables([each.queries for each in found])
+    for name, table in ((RESULTS, results), ("metrics.parquet", pa.Table.from_pylist(rows, METRICS_SCHEMA))):
+        with storage.atomic(storage.join(settings.out, name)) as stream_out:
+            pq.write_table(table, stream_out)
+    started = time.monotonic()
+    _write_report(settings, report.Findings(name=settings.title, metrics=rows, results=results), extras)
+    spent["report"] = time.monotonic() - started
+    storage.write_json(storage.join(settings.out, INPUTS), inputs)
+    storage.write_json(storage.join(settings.out, METRICS), rows)
+    parts = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.items())
+    _say(f"{storage.join(settings.out, METRICS)}: {time.monotonic() - begin:.1f} s ({parts})")
+
+
+def _write_report(settings: EvaluationSettings, findings: report.Findings, extras: report.Extras) -> None:
+    shards = settings.shards
+    page = report.render(findings, extras, (lambda keys: stream.fetch(shards, keys)) if shards else report.no_pictures)
+    storage.write_bytes(storage.join(settings.out, "report.html"), page.encode())
+
+
+def _earlier(out: str) -> dict[str, Any] | None:
+    if not storage.exists(storage.join(out, METRICS)):
+        return None
+    if not storage.exists(storage.join(out, INPUTS)):
+        raise InputError(
+            f"{out} holds a {METRICS} without {INPUTS}; expected an evaluation's folder; choose another --out"
+        )
+    said: dict[str, Any] = storage.read_json(storage.join(out, INPUTS))
+    return said
+
+
+def _say(remark: str) -> None:
+    console.print(remark, markup=False, soft_wrap=True)  # paths are not markup, and stay whole for whoever copies them
+
+
+def _held(table: FeatureTable, split: Split) -> str:
+    views = [str(view) for (held, view), count in table.counts.items() if held == split and count]
+    return f"{split} rows of {' and '.join(sorted(views)) or 'no view'} in {table.path}"

@@ -1,0 +1,169 @@
+"""Query table x gallery table -> one row per query and one row of measures per task.
+
+In: selections of feature tables. Out: a task's result rows (Arrow) and its metric row (a dict), named by task, protocol
+and whether a location's queries were merged into one.
+Shapes: B rows of a block, Q queries, L locations, D dimensions.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+
+from pipeline import metrics
+from pipeline.features import FeatureTable, Floats, Words
+from pipeline.metrics import Scores, Whole
+from pipeline.ranking import PAIR_ROWS, Blocks, Ranking, Side, on_grid, rank, side_of_array
+from pipeline.records import InputError, Split, View
+
+Protocol = Literal["full", "queried-only"]
+"full: the official one, the whole gallery with its distractors. queried-only: gallery rows of queried locations alone."
+TOP = 10
+
+METRICS_SCHEMA = pa.schema([
+    ("task", pa.string()), ("protocol", pa.string()), ("multi_query", pa.bool_()), ("queries", pa.int64()),
+    ("gallery", pa.int64()), ("r1", pa.float64()), ("r5", pa.float64()), ("r10", pa.float64()), ("r1p", pa.float64()),
+    ("ap", pa.float64()), ("fingerprint", pa.string()),
+])  # fmt: skip
+RESULTS_SCHEMA = pa.schema([
+    ("query", pa.string()),  # the key; of merged queries, the location
+    ("location", pa.string()), ("task", pa.string()), ("protocol", pa.string()), ("multi_query", pa.bool_()),
+    ("matches", pa.int64()),  # true matches in the gallery
+    ("first_match_rank", pa.int64()),  # from 1; null where there is no match, and so are its key and score
+    ("first_match_key", pa.string()), ("first_match_score", pa.float32()),
+    ("ap", pa.float64()), ("top_keys", pa.list_(pa.string())), ("top_scores", pa.list_(pa.float32())),
+    ("top_locations", pa.list_(pa.string())),
+])  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """What is looked for in what."""
+
+    query_view: View
+    gallery_view: View
+    multi_query: bool = False
+    "All queries of a location as one: their mean."
+
+    @property
+    def name(self) -> str:
+        return f"{self.query_view}->{self.gallery_view}"
+
+    def __str__(self) -> str:
+        return f"{self.name}, multi-query" if self.multi_query else self.name
+
+
+def possible_tasks(queries: FeatureTable, gallery: FeatureTable) -> list[Task]:
+    """Every pair of two different views of which there are query rows and gallery rows, drone->satellite first."""
+    query_views = [view for view in View if queries.counts.get((Split.QUERY, view))]
+    gallery_views = [view for view in View if gallery.counts.get((Split.GALLERY, view))]
+    return [Task(query_view=q, gallery_view=g) for q in query_views for g in gallery_views if q != g]
+
+
+def side_of(table: FeatureTable) -> Side:
+    """The selected rows of a feature table."""
+    labels = table.labels()
+    return Side(keys=labels.keys, locations=labels.locations, blocks=table.blocks)
+
+
+def only_locations(side: Side, locations: Words) -> Side:
+    """The rows that show one of these locations: the gallery of the protocol `queried-only`."""
+    keep = np.isin(side.locations, locations)
+
+    def blocks(rows: int) -> Iterator[Floats]:
+        begin = 0
+        for block_BD in side.blocks(rows):
+            kept_BD = block_BD[keep[begin : begin + len(block_BD)]]
+            begin += len(block_BD)
+            if len(kept_BD):
+                yield kept_BD
+
+    return Side(keys=side.keys[keep], locations=side.locations[keep], blocks=blocks)
+
+
+def mean_by_location(side: Side) -> Side:
+    """One query per location: the mean of its vectors, brought to unit length; its key is the location's name."""
+    names, location_Q = np.unique(side.locations, return_inverse=True)
+    total_LD, begin = np.zeros((len(names), 0)), 0
+    for block_BD in side.blocks(PAIR_ROWS):
+        if not begin:
+            total_LD = np.zeros((len(names), block_BD.shape[1]))
+        # Sums on the grid are exact, so the mean does not depend on the order of the rows either.
+        np.add.at(total_LD, location_Q[begin : begin + len(block_BD)], on_grid(block_BD).astype(np.float64))
+        begin += len(block_BD)
+    length_L1 = np.linalg.norm(total_LD, axis=1, keepdims=True)
+    mean_LD = (total_LD / np.maximum(length_L1, np.finfo(np.float64).tiny)).astype(np.float32)
+    return side_of_array(names, names, mean_LD)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskResults:
+    """What came of one task."""
+
+    metrics: dict[str, Any]
+    "One row of METRICS_SCHEMA."
+    queries: pa.Table
+    "Rows of RESULTS_SCHEMA, in the queries' order."
+
+
+def retrieve(
+    task: Task,
+    queries: FeatureTable,
+    gallery: FeatureTable,
+    protocol: Protocol = "full",
+    blocks: Blocks | None = None,
+    advance: Callable[[int], None] = lambda scores: None,
+) -> TaskResults:
+    """Rank and measure one task. `advance` is told how many scores have been settled.
+
+    Raises InputError when no gallery row is left, or a feature is not of unit length.
+    """
+    query_side = side_of(queries.select(Split.QUERY, task.query_view))
+    gallery_side = side_of(gallery.select(Split.GALLERY, task.gallery_view))
+    if task.multi_query:
+        query_side = mean_by_location(query_side)
+    if protocol == "queried-only":
+        gallery_side = only_locations(gallery_side, query_side.locations)
+    if not len(gallery_side.keys) or not len(query_side.keys):
+        raise InputError(
+            f"{task} has {len(query_side.keys)} queries and {len(gallery_side.keys)} gallery rows under the protocol "
+            f"{protocol}; expected some of both, with location names in common; check the tables' splits and locations"
+        )
+    ranking = rank(query_side, gallery_side, TOP, blocks, advance)
+    scores = metrics.summarise(ranking.first_rank_Q, ranking.ap_Q, len(gallery_side.keys))
+    return TaskResults(
+        metrics=_metric_row(task, protocol, query_side, gallery_side, scores, queries.fingerprint),
+        queries=_result_rows(task, protocol, query_side, gallery_side, ranking),
+    )
+
+
+def _metric_row(
+    task: Task, protocol: Protocol, queries: Side, gallery: Side, scores: Scores, fingerprint: str
+) -> dict[str, Any]:
+    return {
+        "task": task.name, "protocol": protocol, "multi_query": task.multi_query, "queries": len(queries.keys),
+        "gallery": len(gallery.keys), "r1": scores.r1, "r5": scores.r5, "r10": scores.r10, "r1p": scores.r1p,
+        "ap": scores.ap, "fingerprint": fingerprint,
+    }  # fmt: skip
+
+
+def _result_rows(task: Task, protocol: Protocol, queries: Side, gallery: Side, found: Ranking) -> pa.Table:
+    unmatched_Q = found.first_rank_Q == 0
+    count, kept = found.top_rows_QK.shape
+    ends = pa.array(np.arange(count + 1) * kept, pa.int32())
+
+    def lists(values_QK: Whole | Words | Floats, kind: pa.DataType) -> pa.ListArray:
+        return pa.ListArray.from_arrays(ends, pa.array(values_QK.ravel().tolist(), kind))
+
+    columns = [
+        pa.array(queries.keys.tolist(), pa.string()), pa.array(queries.locations.tolist(), pa.string()),
+        pa.array([task.name] * count), pa.array([str(protocol)] * count), pa.array([task.multi_query] * count),
+        pa.array(found.matches_Q), pa.array(found.first_rank_Q, mask=unmatched_Q),
+        pa.array(gallery.keys[found.first_row_Q].tolist(), pa.string(), mask=unmatched_Q),
+        pa.array(found.first_score_Q, mask=unmatched_Q), pa.array(found.ap_Q),
+        lists(gallery.keys[found.top_rows_QK], pa.string()), lists(found.top_scores_QK, pa.float32()),
+        lists(gallery.locations[found.top_rows_QK], pa.string()),
+    ]  # fmt: skip
+    return pa.Table.from_arrays(columns, schema=RESULTS_SCHEMA)

@@ -1,0 +1,120 @@
+"""The report in a real browser: it opens without a word on the console, sends nothing, and fits a phone."""
+
+import io
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+from PIL import Image
+
+from pipeline import report
+from pipeline.report_inputs import Extras, Findings
+from pipeline.retrieval import RESULTS_SCHEMA
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="needs Playwright: install the project with [dev]")
+CHROMIUM = next(
+    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
+)
+ARGUMENTS = [
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium")
+
+LONG = "a-location-with-a-name-that-does-not-end-" * 4
+
+
+def result(location: str, first: int | None) -> dict[str, Any]:
+    """A query whose true match stands at this rank."""
+    tops = [location if rank == first else f"other{rank}" for rank in range(1, 6)]
+    return {
+        "query": f"query-{location}", "location": location, "task": "drone->satellite", "protocol": "full",
+        "multi_query": False,
+        "matches": int(first is not None), "first_match_rank": first, "first_match_key": first and "gallery-true",
+        "first_match_score": first and 0.1, "ap": 0.0, "top_keys": tops, "top_scores": [0.9, 0.8, 0.7, 0.6, 0.5],
+        "top_locations": tops,
+    }  # fmt: skip
+
+
+def findings(rows: list[dict[str, Any]], name: str) -> Findings:
+    counts = {
+        "task": "drone->satellite",
+        "protocol": "full",
+        "multi_query": False,
+        "queries": len(rows),
+        "gallery": 51_355,
+    }
+    metrics = counts | dict.fromkeys(("r1", "r5", "r10", "r1p", "ap"), 1.0) | {"fingerprint": "f" * 64}
+    return Findings(name=name, metrics=[metrics], results=pa.Table.from_pylist(rows, RESULTS_SCHEMA))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with sync_api.sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A page with every section, and a name that is far too long."""
+    stream = io.BytesIO()
+    Image.new("RGB", (300, 300), "olive").save(stream, "JPEG")
+    rows = [result("0001", 1), result(LONG, 1), result("0002", 3), result(LONG, 12_345), result("0004", None)]
+    training = tuple({"epoch": e, "location_loss": 9 / e, "view_loss": 0.7, "alpha": 0.9 + e // 5} for e in range(1, 9))
+    extras = Extras(title="A town", beside=findings(rows, LONG), training=training)
+    path: Path = tmp_path_factory.mktemp("page") / "report.html"
+    path.write_text(report.render(findings(rows, "out"), extras, lambda keys: dict.fromkeys(keys, stream.getvalue())))
+    return path.as_uri()
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(375, "light"), (768, "light"), (1024, "dark"), (1600, "dark")])
+def test_the_page_opens_in_silence_and_fits(browser: Any, address: str, width: int, scheme: str) -> None:
+    page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
+    said: list[str] = []
+    asked: list[str] = []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(address)
+    page.evaluate("document.querySelectorAll('img').forEach(image => image.loading = 'eager')")
+    page.wait_for_function("[...document.images].every(image => image.complete && image.naturalWidth > 0)")
+    assert said == []
+    assert [url for url in asked if not url.startswith("data:")] == [address]
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    outside = """[...document.querySelectorAll('table, .panel *, .tile *, .chart *')].filter(e => {
+        const box = e.getBoundingClientRect(); return box.width && box.right > innerWidth + 0.5 }).length"""
+    assert page.evaluate(outside) == 0
+    page.close()
+
+
+def test_true_matches_are_framed_green_and_wrong_ones_red(browser: Any, address: str) -> None:
+    page = browser.new_page()
+    page.goto(address)
+    colours = {
+        kind: set(
+            page.eval_on_selector_all(
+                f".answer.{kind} .frame", "all => all.map(e => getComputedStyle(e).borderTopColor)"
+            )
+        )
+        for kind in ("right", "wrong")
+    }
+    assert colours == {"right": {"rgb(22, 128, 60)"}, "wrong": {"rgb(200, 50, 43)"}}
+    assert set(page.locator(".answer.right .badge").all_inner_texts()) == {"✓"}
+    assert set(page.locator(".answer.wrong .badge").all_inner_texts()) == {"✗"}
+    assert page.locator("img:not([alt])").count() == 0
+    page.close()
+
+
+def test_the_sections_are_reached_by_keyboard(browser: Any, address: str) -> None:
+    page = browser.new_page()
+    page.goto(address)
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.getAttribute('href')") == "#measures"
+    page.keyboard.press("Enter")
+    assert page.url.endswith("#measures")
+    page.close()
