@@ -21,7 +21,6 @@ def run(job: Callable[..., Any], check: Callable[[Sequence[str]], None] = lambda
         tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes,
         tyro.conf.CascadeSubcommandArgs,  # flags may stand before or after a recipe's name
         tyro.conf.EnumChoicesFromValues,  # `--view drone`
-        tyro.conf.FlagConversionOff,  # `--mirror False`: one way to say it, and recipes can be overridden both ways
     )  # fmt: skip
     try:
         check(sys.argv[1:])

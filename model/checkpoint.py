@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import io
 import json
-import pickle
 from typing import Any
 
 import torch
@@ -65,7 +64,7 @@ def loads(data: bytes, name: str = "the checkpoint") -> Checkpoint:
         network = PVDAConfig(**json.loads(plain.pop("network")))
         recipe, history = json.loads(plain.pop("recipe")), json.loads(plain.pop("history"))
         return Checkpoint(network=network, recipe=recipe, history=history, **plain)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, AttributeError, KeyError, TypeError, ValueError) as error:
+    except Exception as error:  # torch raises many kinds over a damaged file, struct.error and IndexError among them
         raise CheckpointError(
             f"{name} is not a checkpoint of format {FORMAT} ({type(error).__name__}); expected a last.pt written by "
             "jobs/train.py; name that file"

@@ -40,9 +40,10 @@ class PVDAConfig:
     def __post_init__(self) -> None:
         if self.depth not in BLOCKS:
             raise ValueError(f"depth is {self.depth}, expected one of {', '.join(map(str, BLOCKS))}")
-        if self.image_size < 2 * self.parts * STRIDE:
+        least = max(2 * self.parts, 4) * STRIDE  # the discriminator halves the maps twice
+        if self.image_size < least:
             raise ValueError(
-                f"image_size is {self.image_size}, expected at least {2 * self.parts * STRIDE} pixels for {self.parts} parts; "
+                f"image_size is {self.image_size}, expected at least {least} pixels for {self.parts} parts; "
                 "use larger images or fewer parts"
             )
 

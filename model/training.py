@@ -135,7 +135,7 @@ class Training:
             losses |= self._discriminate(both_BCHW.detach(), len(maps1_BCHW))
             # D's weights are constants of the second step; its BatchNorm stays in training mode.
             self.discriminator.requires_grad_(False)
-            adversarial = adversarial_loss(*self.discriminator(both_BCHW).split(len(maps1_BCHW)))
+            adversarial = adversarial_loss(*self.discriminator(both_BCHW).tensor_split([len(maps1_BCHW)]))
             self.discriminator.requires_grad_(True)
             total = feature_loss(located, adversarial, now.alpha)
             losses["adversarial_loss"] = adversarial
@@ -147,7 +147,7 @@ class Training:
     def _discriminate(self, both_BCHW: Tensor, drones: int) -> dict[str, Tensor]:
         """Step 1: move D towards telling the views apart."""
         verdict_B2 = self._discriminator(both_BCHW)
-        loss = view_loss(*verdict_B2.split(drones))
+        loss = view_loss(*verdict_B2.tensor_split([drones]))
         self.optimisers[1].zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimisers[1].step()

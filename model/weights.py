@@ -17,7 +17,7 @@ def read_state_dict(path: str) -> dict[str, Tensor]:
     try:
         if Path(path).suffix == ".safetensors":
             return safetensors.torch.load_file(path)
-        state: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
+        state = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise CheckpointError(
             f"no weights at {path}; expected a state dict of torchvision's ResNet: on a machine with a network, "
@@ -27,6 +27,10 @@ def read_state_dict(path: str) -> dict[str, Tensor]:
         raise CheckpointError(
             f"{path} is no state dict ({type(error).__name__}); expected .pth or .safetensors"
         ) from error
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise CheckpointError(
+            f"{path} holds something else than tensors by name; expected a state dict; save model.state_dict() alone"
+        )
     return state
 
 

@@ -9,7 +9,6 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -143,21 +142,14 @@ class FeatureTable:
     dimension: int
     parts: tuple[str, ...]
     footers: tuple[PartFooter, ...]
+    counts: dict[tuple[Split, View], int]
+    "Rows of each split and view that the whole table holds, whatever is selected."
     split: Split | None = None
     view: View | None = None
 
     def select(self, split: Split | None = None, view: View | None = None) -> "FeatureTable":
         """The rows of one split or one view (None: any)."""
         return replace(self, split=split, view=view)
-
-    @cached_property
-    def counts(self) -> dict[tuple[Split, View], int]:
-        """Rows of each split and view that the table holds (of the whole table, whatever was selected)."""
-        found: Counter[tuple[Split, View]] = Counter()
-        for table in self._read(["split", "view"], filtered=False):
-            pairs = zip(table["split"].to_pylist(), table["view"].to_pylist(), strict=True)
-            found.update((Split(split), View(view)) for split, view in pairs)
-        return dict(found)
 
     @property
     def rows(self) -> int:
@@ -187,17 +179,39 @@ class FeatureTable:
         """All selected embeddings at once, float32 (rows, D)."""
         return np.concatenate([np.empty((0, self.dimension), np.float32), *self.blocks()])
 
-    def _read(self, columns: list[str], rows: int = BLOCK_ROWS, filtered: bool = True) -> Iterator[pa.Table]:
-        wanted = {"split": self.split, "view": self.view} if filtered else {}
-        tests = {name: value for name, value in wanted.items() if value is not None}
+    def _read(self, columns: list[str], rows: int = BLOCK_ROWS) -> Iterator[pa.Table]:
+        wanted = {"split": self.split, "view": self.view}
+        tests = {name: str(value) for name, value in wanted.items() if value is not None}
         for part in self.parts:
             with storage.open_read(storage.join(self.path, part)) as stream:
-                for batch in pq.ParquetFile(stream).iter_batches(rows, columns=[*columns, *tests]):
+                parquet = pq.ParquetFile(stream)
+                groups = [group for group in range(parquet.num_row_groups) if _may_hold(parquet, group, tests)]
+                for batch in parquet.iter_batches(rows, groups, columns=[*columns, *tests]):
                     table = pa.Table.from_batches([batch])
                     for name, value in tests.items():
-                        table = table.filter(pc.equal(table[name].cast(pa.string()), str(value)))
+                        table = table.filter(pc.equal(table[name].cast(pa.string()), value))
                     if len(table):
                         yield table.select(columns)
+
+
+def _may_hold(parquet: pq.ParquetFile, group: int, tests: dict[str, str]) -> bool:
+    """Whether a row group's statistics leave room for the wanted values: most parts hold one split and view only."""
+    for name, value in tests.items():
+        column = parquet.schema_arrow.get_field_index(name)
+        bounds = parquet.metadata.row_group(group).column(column).statistics
+        if bounds is not None and bounds.has_min_max and not bounds.min <= value <= bounds.max:
+            return False
+    return True
+
+
+def _count(path: str, parts: Sequence[str]) -> dict[tuple[Split, View], int]:
+    found: Counter[tuple[Split, View]] = Counter()
+    for part in parts:
+        with storage.open_read(storage.join(path, part)) as stream:
+            table = pq.read_table(stream, columns=["split", "view"])
+        for row in table.group_by(["split", "view"]).aggregate([([], "count_all")]).to_pylist():
+            found[Split(row["split"]), View(row["view"])] += row["count_all"]
+    return dict(found)
 
 
 def open_table(path: str) -> FeatureTable:
@@ -218,5 +232,10 @@ def open_table(path: str) -> FeatureTable:
     with storage.open_read(storage.join(path, names[0])) as stream:
         dimension = pq.ParquetFile(stream).schema_arrow.field("embedding").type.list_size
     return FeatureTable(
-        path=path, fingerprint=fingerprints[0], dimension=dimension, parts=tuple(names), footers=footers
+        path=path,
+        fingerprint=fingerprints[0],
+        dimension=dimension,
+        parts=tuple(names),
+        footers=footers,
+        counts=_count(path, names),
     )

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import simplejpeg
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 
 from pipeline.records import View
 
@@ -17,6 +17,13 @@ Pixels = npt.NDArray[np.uint8]
 PREPROCESSING = "resize bicubic pillow, ImageNet normalisation"
 "Part of the fingerprint: tables made with another preprocessing do not mix."
 ORIENTATION_TAG = 0x0112
+UPRIGHT = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}  # fmt: skip
+"""What turns an image upright, by EXIF orientation. Not ImageOps.exif_transpose: it writes all other tags again, and fails
+where a camera gave one of them a type that is not its own."""
 
 
 class DecodeError(ValueError):
@@ -35,21 +42,31 @@ def decode(data: bytes) -> Pixels:
     if not data:
         raise DecodeError("empty file", "0 bytes")
     try:
-        with Image.open(io.BytesIO(data)) as image:  # reads the header only
-            upright = image.getexif().get(ORIENTATION_TAG, 1) == 1
-            if image.format == "JPEG" and image.mode in ("RGB", "L") and upright:
+        with Image.open(io.BytesIO(data)) as opened:  # reads the header only
+            if opened.format == "JPEG" and opened.mode in ("RGB", "L") and _turn(opened) is None:
                 rgb: Pixels = simplejpeg.decode_jpeg(data, "RGB")
                 return rgb
+            opened.load()  # Pillow turns a TIFF upright here, and its tag is gone
+            turn = _turn(opened)
+            image = opened if turn is None else opened.transpose(turn)
             if image.mode.startswith("I"):  # 16 bits a pixel, which Pillow's convert would clip at 255
-                grey_HW = (np.asarray(ImageOps.exif_transpose(image)).astype(np.uint32) >> 8).astype(np.uint8)
+                grey_HW = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)
                 return np.repeat(grey_HW[:, :, None], 3, axis=2)
-            return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+            if image.mode == "P":  # by way of RGBA: Pillow warns of every palette that holds transparency
+                image = image.convert("RGBA")
+            return np.asarray(image.convert("RGB"))
     except UnidentifiedImageError:
         raise DecodeError("not an image", f"{len(data)} bytes that begin with {data[:8]!r}") from None
     except Image.DecompressionBombError as error:
         raise DecodeError("too many pixels", str(error)) from None
-    except (OSError, ValueError, SyntaxError) as error:
+    except MemoryError:
+        raise  # this machine's fault and not the image's
+    except Exception as error:  # Pillow raises many kinds over damaged headers and metadata
         raise DecodeError("damaged image", f"{len(data)} bytes; {error}") from None
+
+
+def _turn(image: Image.Image) -> Image.Transpose | None:
+    return UPRIGHT.get(image.getexif().get(ORIENTATION_TAG, 1))
 
 
 def resize(image_HW3: Pixels, size: int) -> Pixels:
