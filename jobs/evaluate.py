@@ -3,6 +3,8 @@
 Writes metrics.json, metrics.parquet, queries.parquet and report.html to --out and prints the measures in percent.
 """
 
+from typing import Any
+
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -15,7 +17,11 @@ MEASURES = {"r1": "R@1", "r5": "R@5", "r10": "R@10", "r1p": "R@1%", "ap": "AP"}
 
 def main(settings: EvaluationSettings) -> None:
     """Rank queries against galleries and measure: Recall@K and AP, official protocol first."""
-    rows = evaluate(settings)
+    print_table(evaluate(settings))
+
+
+def print_table(rows: list[dict[str, Any]]) -> None:
+    """The measures of one evaluation on standard output, in percent."""
     table = Table(title=f"{rows[0]['protocol']} protocol, percent", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("task")
     for heading in (*MEASURES.values(), "queries", "gallery"):

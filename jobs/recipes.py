@@ -38,7 +38,7 @@ def paper() -> Recipe:
     return Recipe()
 
 
-def smoke() -> Recipe:
+def smoke(epochs: int = 80) -> Recipe:
     """Minutes on two cores, from scratch: a thin ResNet-18 with AdamW, one cosine and a gentle adversary.
 
     The paper's rates suppose ImageNet weights and days of training; from scratch they learn nothing in minutes. It stays
@@ -52,8 +52,8 @@ def smoke() -> Recipe:
         optimisation=Optimisation(
             kind="adamw", backbone_rate=3e-3, head_rate=3e-3, classifier_rate=3e-3, discriminator_rate=1e-3
         ),
-        schedule=Schedule(epochs=80, shape="cosine", warmup_epochs=4, alpha=0.1, alpha_step=0.0),
-        augmentation=Augmentation(pad=4),
+        schedule=Schedule(epochs=epochs, shape="cosine", warmup_epochs=4, alpha=0.1, alpha_step=0.0),
+        augmentation=Augmentation(pad=4, rotation=180),
         batch_size=16,
     )
 

@@ -11,6 +11,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils.tensorboard import SummaryWriter
@@ -100,8 +101,6 @@ def start(run: Run, place: Place, locations: int) -> tuple[Training, list[dict[s
         recipe.network, recipe.optimisation, locations,
         adversary=recipe.adversary, device=place.device, distribute=place.distribute,
     )  # fmt: skip
-    # The same weights on every worker, then a stream of random numbers (dropout) of each worker's own.
-    torch.manual_seed(recipe.seed + 1_000_003 * place.rank)
     held = read_checkpoint(run)
     if held is not None:
         training.load_state(held.state)
@@ -138,10 +137,19 @@ def checkpoint(run: Run, training: Training, stream: TrainingStream, history: li
     )  # fmt: skip
 
 
+def untrained(run: Run) -> bytes:
+    """The checkpoint of a run before its first step: what training starts from, to be compared with."""
+    stream = open_stream(run, Place())
+    training, _ = start(run, Place(), len(stream.classes))
+    return dumps(checkpoint(run, training, stream, []))
+
+
 def train_epoch(
     training: Training, stream: TrainingStream, recipe: Recipe, epoch: int, place: Place, report: Report
 ) -> dict[str, Any]:
     """One pass over the satellite view; returns the epoch's row of metrics.jsonl."""
+    # Dropout's random numbers are a function of seed, epoch and rank, on every device, however often a run was resumed.
+    torch.manual_seed(int(np.random.SeedSequence([recipe.seed, epoch, place.rank]).generate_state(1)[0]))
     began = told = time.monotonic()
     sums: dict[str, Tensor] = defaultdict(lambda: torch.zeros((), device=training.device))
     untold = 0

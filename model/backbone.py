@@ -17,6 +17,9 @@ BLOCKS: dict[int, tuple[int, int, int, int]] = {
 }
 STRIDE = 16
 "Pixels of the image per cell of the maps: layer4's own halving is removed (PVDA, section 3; LPN)."
+LEAST_CHANNELS = 16
+"""Into a strided 1x1 shortcut. In the backward pass of a thinner one, channels last, oneDNN writes past its memory on CPUs
+with AVX-512 (its issue 6035; seen with torch 2.13), and the process crashes sooner or later."""
 
 
 class BasicBlock(nn.Module):
@@ -67,6 +70,11 @@ def shortcut(inside: int, outside: int, stride: int) -> nn.Module | None:
     if stride == 1 and inside == outside:
         return None
     return nn.Sequential(nn.Conv2d(inside, outside, 1, stride, bias=False), nn.BatchNorm2d(outside))
+
+
+def layer1_channels(depth: Depth, width: float) -> int:
+    """Channels that leave layer1 and enter the first strided shortcut."""
+    return round(64 * width) * (BasicBlock if depth < 50 else Bottleneck).expansion
 
 
 class ResNet(nn.Module):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from model.backbone import BLOCKS, STRIDE, Depth, ResNet
+from model.backbone import BLOCKS, LEAST_CHANNELS, STRIDE, Depth, ResNet, layer1_channels
 from model.rings import Divisor, ring_average
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -40,6 +40,12 @@ class PVDAConfig:
     def __post_init__(self) -> None:
         if self.depth not in BLOCKS:
             raise ValueError(f"depth is {self.depth}, expected one of {', '.join(map(str, BLOCKS))}")
+        if layer1_channels(self.depth, self.width) < LEAST_CHANNELS:
+            raise ValueError(
+                f"width is {self.width}, which gives layer1 of a ResNet-{self.depth} "
+                f"{layer1_channels(self.depth, self.width)} channels; expected at least {LEAST_CHANNELS} (thinner ones crash "
+                "oneDNN); use a larger width"
+            )
         least = max(2 * self.parts, 4) * STRIDE  # the discriminator halves the maps twice
         if self.image_size < least:
             raise ValueError(

@@ -26,6 +26,8 @@ from pipeline.records import InputError, Split, View
 
 SCHEMA_VERSION = 1
 INDEX, IDS, FACTS = "index.faiss", "ids.parquet", "index.json"
+TRAINING_ROWS = 65_536
+"At most so many rows train a compressed index."
 HELD_QUERIES = 256
 "Rows of the table that are searched for to measure recall."
 UNITS = {"": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
@@ -133,7 +135,7 @@ def _fill(table: FeatureTable, factory: str) -> tuple[Any, int]:
         ) from None
     trained_on = 0
     if not index.is_trained:
-        sample_ND = next(table.blocks())  # shards are ordered by hash: the first block is a fair sample
+        sample_ND = training_sample(table)
         trained_on = len(sample_ND)
         index.train(sample_ND)
     with progress(table.rows, "indexing", "rows") as meter:
@@ -141,6 +143,17 @@ def _fill(table: FeatureTable, factory: str) -> tuple[Any, int]:
             index.add(block_BD)
             meter.advance(len(block_BD))
     return index, trained_on
+
+
+def training_sample(table: FeatureTable) -> Floats:
+    """The table's first rows (N, D), at most TRAINING_ROWS: shards are ordered by hash, so they are a fair sample."""
+    blocks, rows = [], 0
+    for block_BD in table.blocks():
+        blocks.append(block_BD[: TRAINING_ROWS - rows])
+        rows += len(blocks[-1])
+        if rows == TRAINING_ROWS:
+            break
+    return np.concatenate(blocks)
 
 
 def measure_recall(index: Any, table: FeatureTable) -> dict[str, float]:

@@ -8,7 +8,7 @@ from enum import StrEnum
 import pyarrow as pa
 
 
-class InputError(ValueError):
+class InputError(Exception):
     """Input that cannot be used. The message is one sentence for a person: what was found, what was expected, what
     to do. Jobs print it alone and exit with 2."""
 

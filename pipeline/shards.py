@@ -210,6 +210,7 @@ def pack(settings: PackingSettings) -> Manifest:
             rejected.append(found)
         else:
             records.append(found)
+    total = len(records) + len(rejected)
     plans, twice = plan_shards(records, settings.samples_per_shard)
     rejected += twice
     shards: list[Shard] = []
@@ -222,7 +223,6 @@ def pack(settings: PackingSettings) -> Manifest:
             rejected += refused
             meter.advance(len(plan.records), refused=len(rejected))
     write_rejected(settings.out, rejected)
-    total = len(records) + len(rejected)
     if len(rejected) > settings.max_bad_fraction * total:
         common = ", ".join(
             f"{reason} ({count})" for reason, count in Counter(r.reason for r in rejected).most_common(3)
@@ -268,6 +268,4 @@ def read_manifest(shards: str) -> Manifest:
         )
         return Manifest(**said | {"shards": shard_list, "classes": tuple(said["classes"])})
     except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{path} is damaged ({error}); delete it and run jobs/make_shards.py again") from None

@@ -12,7 +12,7 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 @pytest.fixture(scope="session")
 def ray_cluster() -> Iterator[None]:
-    """A local Ray of this test session, with two CPUs however many there are."""
+    """A local Ray of this test session."""
     import ray
 
     from pipeline import cluster
@@ -42,3 +42,13 @@ def tiny_shards(tmp_path_factory: pytest.TempPathFactory, tiny_world: Path) -> s
     out = str(tmp_path_factory.mktemp("shards"))
     pack(PackingSettings(source="university1652", root=str(tiny_world), out=out, samples_per_shard=8))
     return out
+
+
+@pytest.fixture
+def ray_address(ray_cluster: None, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The session's Ray as jobs in processes of their own find it: through the environment."""
+    import ray
+
+    address: str = ray.get_runtime_context().gcs_address
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    return address

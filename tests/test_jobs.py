@@ -1,0 +1,95 @@
+"""Every job as a stranger calls it: help, the whole road by command lines, again on finished output, and wrong calls."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import faiss
+import pytest
+
+ROOT = Path(__file__).parent.parent
+JOBS = ["simulate", "make_shards", "train", "embed_gallery", "build_index", "evaluate", "demo"]
+
+
+def call(job: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(ROOT / "jobs" / f"{job}.py"), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.mark.parametrize("job", JOBS)
+def test_every_job_has_help(job: str) -> None:
+    done = call(job, "--help")
+    assert done.returncode == 0
+    assert "--out" in done.stdout
+
+
+def test_every_job_runs_as_a_module_too() -> None:
+    command = [sys.executable, "-m", "jobs.make_shards", "--help"]
+    assert subprocess.run(command, capture_output=True, cwd=ROOT, check=False).returncode == 0
+
+
+WRONG: list[tuple[str, list[str], str]] = [
+    ("make_shards", ["--source", "university1652", "--root", "{}/nowhere", "--out", "{}/o"], "no folder"),
+    ("make_shards", ["--source", "university1652", "--root", "{}", "--out", "{}/o"], "no images below"),
+    ("make_shards", ["--source", "flickr", "--root", "{}", "--out", "{}/o"], "expected one of: university1652"),
+    ("train", ["papr", "--shards", "{}", "--out", "{}/o"], "unknown recipe 'papr'"),
+    ("train", ["smoke", "--shards", "{}", "--out", "{}/o"], "not a finished set of shards"),
+    ("embed_gallery", ["--shards", "{}", "--checkpoint", "{}/none.pt", "--out", "{}/o"], "no checkpoint at"),
+    ("build_index", ["--table", "{}", "--out", "{}/o"], "no feature table at"),
+    ("evaluate", ["--table", "{}", "--out", "{}/o"], "no feature table at"),
+    ("simulate", ["--out", "{}/o", "--train-locations", "1", "--test-locations", "1", "--distractors", "0",
+                  "--textures", "{}/nowhere"], "nowhere"),
+    ("make_shards", ["--root", "{}", "--out", "{}/o", "--source", "university1652", "--no-such-flag"], "--no-such-flag"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("job", "arguments", "sentence"), WRONG, ids=[f"{job}: {said}" for job, _, said in WRONG])
+def test_a_wrong_call_gets_a_sentence_and_exit_code_2(
+    tmp_path: Path, job: str, arguments: list[str], sentence: str
+) -> None:
+    done = call(job, *(argument.format(tmp_path) for argument in arguments))
+    assert done.returncode == 2
+    assert sentence in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "o").exists()
+
+
+def test_the_road_by_command_lines_and_again(
+    tmp_path: Path, tiny_shards: str, tiny_world: Path, ray_address: str
+) -> None:
+    """embed, index and evaluate after a training of two steps; then each again, which does nothing and says so."""
+    run, table, index, out = (tmp_path / name for name in ("run", "table", "index", "evaluation"))
+    small = ("--epochs", 1, "--batch-size", 3, "--part-dim", 16, "--workers", 0)
+    calls: list[tuple[str, list[object]]] = [
+        (
+            "make_shards",
+            ["--source", "university1652", "--root", tiny_world, "--out", tiny_shards, "--samples-per-shard", 8],
+        ),
+        ("train", ["smoke", "--shards", tiny_shards, "--out", run, *small]),
+        ("embed_gallery", ["--shards", tiny_shards, "--checkpoint", run / "last.pt", "--out", table]),
+        ("build_index", ["--table", table, "--out", index, "--split", "gallery", "--view", "satellite"]),
+        ("evaluate", ["--table", table, "--out", out, "--shards", tiny_shards, "--run", run]),
+    ]
+    for job, arguments in calls:
+        done = call(job, *arguments)
+        assert done.returncode == 0, done.stderr
+    for job, arguments in calls:
+        done = call(job, *arguments)
+        assert done.returncode == 0, done.stderr
+        assert "nothing to do" in done.stderr
+    assert faiss.read_index(str(index / "index.faiss")).ntotal == 5
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert [(row["task"], row["multi_query"]) for row in metrics] == [
+        ("drone->satellite", False), ("satellite->drone", False), ("drone->satellite", True),
+    ]  # fmt: skip
+    assert (metrics[0]["queries"], metrics[0]["gallery"]) == (9, 5)
+    assert "data:image/jpeg" in (out / "report.html").read_text()
+    pair = ("--queries", table, "--gallery", table, "--query-view", "drone", "--gallery-view", "satellite")
+    done = call("evaluate", *pair, "--out", tmp_path / "pair", "--multi-query", "--protocol", "queried-only")
+    assert done.returncode == 0, done.stderr
+    other = call("train", "smoke", "--shards", tiny_shards, "--out", tmp_path / "run2", *small, "--seed", 5)
+    assert other.returncode == 0, other.stderr
+    mixed = call("embed_gallery", "--shards", tiny_shards, "--checkpoint", tmp_path / "run2/last.pt", "--out", table)
+    assert mixed.returncode == 2
+    assert "choose another --out" in mixed.stderr

@@ -1,0 +1,104 @@
+"""`ray job submit --working-dir . -- python jobs/X.py …` against a cluster that this test starts and ends itself."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+BIN = Path(sys.executable).parent
+
+
+def free_ports(count: int) -> list[int]:
+    sockets = [socket.socket() for _ in range(count)]
+    for one in sockets:
+        one.bind(("127.0.0.1", 0))
+    ports = [int(one.getsockname()[1]) for one in sockets]
+    for one in sockets:
+        one.close()
+    return ports
+
+
+@pytest.fixture(scope="module")
+def submit_environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """A head node of its own ports and session folder; ended by its process group, never by `ray stop`."""
+    port, dashboard, client = free_ports(3)
+    scratch = tmp_path_factory.mktemp("r")
+    environment = os.environ | {"RAY_AUTH_MODE": "disabled", "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
+    environment.pop("RAY_ADDRESS", None)
+    command = [
+        str(BIN / "ray"), "start", "--head", "--block", "--node-ip-address=127.0.0.1", f"--port={port}",
+        f"--dashboard-port={dashboard}", f"--ray-client-server-port={client}", "--num-cpus=2",
+        f"--temp-dir={scratch}", "--disable-usage-stats", f"--dashboard-agent-listen-port={free_ports(1)[0]}",
+    ]  # fmt: skip
+    with (scratch / "head.log").open("wb") as log:
+        head = subprocess.Popen(command, env=environment, stdout=log, stderr=log, start_new_session=True)
+    address = f"http://127.0.0.1:{dashboard}"
+    try:
+        for _ in range(120):
+            probe = subprocess.run(
+                [str(BIN / "ray"), "job", "list", "--address", address],
+                env=environment,
+                capture_output=True,
+                check=False,
+            )
+            if probe.returncode == 0:
+                break
+            assert head.poll() is None, (scratch / "head.log").read_text()
+            time.sleep(1)
+        yield environment | {"RAY_API_SERVER_ADDRESS": address}
+    finally:
+        head.terminate()  # `--block` ends the processes that it started, and then itself
+        try:
+            head.wait(timeout=5)
+        except subprocess.TimeoutExpired:
+            os.killpg(head.pid, signal.SIGKILL)
+            head.wait()
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def submit(environment: dict[str, str], job: str, *arguments: object) -> str:
+    command = [
+        str(BIN / "ray"),
+        "job",
+        "submit",
+        "--working-dir",
+        ".",
+        "--",
+        "python",
+        f"jobs/{job}.py",
+        *map(str, arguments),
+    ]
+    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout
+
+
+def test_every_job_runs_on_a_cluster_that_was_started_by_hand(
+    submit_environment: dict[str, str], tmp_path: Path
+) -> None:
+    flights, shards, run, table, index, out = (
+        tmp_path / name for name in ("flights", "shards", "run", "table", "index", "out")
+    )
+    small = ("--epochs", 1, "--batch-size", 2, "--part-dim", 16, "--discriminator-channels", 16)
+    counts = ("--train-locations", 4, "--test-locations", 2, "--distractors", 1, "--views", 2, "--size", 64)
+    road: list[tuple[object, ...]] = [
+        ("simulate", "--out", flights, *counts),
+        ("make_shards", "--source", "university1652", "--root", flights, "--out", shards),
+        ("train", "smoke", "--shards", shards, "--out", run, "--workers", 1, *small),
+        ("embed_gallery", "--shards", shards, "--checkpoint", run / "last.pt", "--out", table),
+        ("build_index", "--table", table, "--out", index),
+        ("evaluate", "--table", table, "--out", out),
+    ]
+    for job, *arguments in road:
+        said = submit(submit_environment, str(job), *arguments)
+        assert "succeeded" in said
+    assert (out / "report.html").exists()
+    assert "nothing to do" in submit(submit_environment, "embed_gallery", *road[3][1:])

@@ -1,0 +1,157 @@
+"""The training job: in this process and on Ray, to the end, on after a kill, and refused where it cannot run."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from jobs.recipes import Recipe, paper, smoke
+from jobs.train import Settings, refuse_unknown_recipe, train
+from jobs.training_loop import Run, read_checkpoint, untrained
+from model.checkpoint import CheckpointError, build_encoder, loads
+from pipeline.records import InputError
+
+
+def tiny(epochs: int = 2) -> Recipe:
+    """Three steps an epoch on the tiny world's six satellite images."""
+    recipe = smoke(epochs)
+    network = replace(recipe.network, width=0.25, part_dim=16, discriminator_channels=16, dropout=0.5)
+    return replace(recipe, network=network, batch_size=2)
+
+
+def settings(shards: str, out: Path, recipe: Recipe, **changes: object) -> Settings:
+    given = {"recipe": recipe, "shards": shards, "out": str(out), "workers": 0, "checkpoint_minutes": 0.0}
+    return Settings(**(given | changes))  # type: ignore[arg-type]
+
+
+def rows(out: Path) -> list[dict[str, object]]:
+    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return loads((path / "last.pt").read_bytes()).encoder_weights
+
+
+def test_a_run_ends_with_a_checkpoint_curves_and_an_encoder(tiny_shards: str, tmp_path: Path) -> None:
+    path = train(settings(tiny_shards, tmp_path, tiny()))
+    checkpoint = loads(Path(path).read_bytes())
+    assert checkpoint.epoch == 2
+    assert checkpoint.recipe["name"] == "smoke"
+    assert len(checkpoint.locations) == 6
+    assert build_encoder(checkpoint)(torch.zeros(2, 3, 64, 64, dtype=torch.uint8))[1].shape == (2, 2, 16)
+    assert [row["epoch"] for row in rows(tmp_path)] == [1, 2]
+    wanted = {"alpha", "location_loss", "view_loss", "adversarial_loss", "discriminator_accuracy", "learning_rates"}
+    assert wanted <= set(rows(tmp_path)[0])
+    board = EventAccumulator(str(tmp_path / "tensorboard"))
+    board.Reload()
+    assert [event.step for event in board.Scalars("location_loss")] == [1, 2]
+
+
+def test_a_finished_run_is_left_alone_and_another_recipe_refused(
+    tiny_shards: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = Path(train(settings(tiny_shards, tmp_path, tiny(1))))
+    before = path.stat().st_mtime_ns
+    train(settings(tiny_shards, tmp_path, tiny(1)))
+    assert path.stat().st_mtime_ns == before
+    assert "nothing to do" in capsys.readouterr().err
+    with pytest.raises(InputError, match="with another schedule; choose another --out"):
+        train(settings(tiny_shards, tmp_path, tiny(3)))
+
+
+def test_a_killed_run_goes_on_to_the_same_weights(
+    tiny_shards: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(settings(tiny_shards, tmp_path / "whole", tiny(3)))
+
+    import jobs.training_loop as loop
+
+    real = loop.train_epoch
+
+    def killed(*arguments: object) -> dict[str, object]:
+        if arguments[3] == 2:
+            raise KeyboardInterrupt
+        return real(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(loop, "train_epoch", killed)
+    with pytest.raises(KeyboardInterrupt):
+        train(settings(tiny_shards, tmp_path / "killed", tiny(3)))
+    monkeypatch.setattr(loop, "train_epoch", real)
+    assert [row["epoch"] for row in rows(tmp_path / "killed")] == [1, 2]
+    train(settings(tiny_shards, tmp_path / "killed", tiny(3)))
+    assert [row["epoch"] for row in rows(tmp_path / "killed")] == [1, 2, 3]
+    whole, again = weights(tmp_path / "whole"), weights(tmp_path / "killed")
+    assert all(torch.equal(whole[name], again[name]) for name in whole)
+    assert [r["location_loss"] for r in rows(tmp_path / "whole")] == [
+        r["location_loss"] for r in rows(tmp_path / "killed")
+    ]
+
+
+def test_ray_train_takes_the_same_steps_as_this_process(tiny_shards: str, tmp_path: Path, ray_cluster: None) -> None:
+    train(settings(tiny_shards, tmp_path / "here", tiny(1)))
+    train(settings(tiny_shards, tmp_path / "ray", tiny(1), workers=1))
+    here, there = weights(tmp_path / "here"), weights(tmp_path / "ray")
+    # Another number of threads may sum in another order.
+    assert all(torch.allclose(here[name].float(), there[name].float(), atol=1e-4) for name in here)
+    assert [row["epoch"] for row in rows(tmp_path / "ray")] == [1]
+
+
+def test_two_ray_workers_train_one_network(tiny_shards: str, tmp_path: Path, ray_cluster: None) -> None:
+    path = train(settings(tiny_shards, tmp_path, replace(tiny(1), batch_size=3), workers=2))
+    assert loads(Path(path).read_bytes()).history[0]["step"] == 1
+
+
+def test_training_starts_from_given_weights(tiny_shards: str, tmp_path: Path) -> None:
+    recipe = tiny(1)
+    run = Run(shards=tiny_shards, out=str(tmp_path), recipe=replace(recipe, seed=9))
+    other = build_encoder(loads(untrained(run))).backbone.state_dict()
+    torch.save(other | {"fc.weight": torch.zeros(3)}, tmp_path / "other.pth")
+    still = replace(recipe, optimisation=replace(recipe.optimisation, backbone_rate=0.0))
+    train(settings(tiny_shards, tmp_path / "run", still, weights=str(tmp_path / "other.pth")))
+    trained = weights(tmp_path / "run")
+    assert torch.equal(trained["backbone.layer4.0.conv1.weight"], other["layer4.0.conv1.weight"])
+    with pytest.raises(CheckpointError, match="no weights at"):
+        train(settings(tiny_shards, tmp_path / "run2", recipe, weights=str(tmp_path / "none.pth")))
+
+
+def test_a_damaged_checkpoint_is_named(tiny_shards: str, tmp_path: Path) -> None:
+    (tmp_path / "last.pt").write_bytes(b"PK\x03\x04 torn")
+    with pytest.raises(CheckpointError, match="is not a checkpoint of format 1"):
+        read_checkpoint(Run(shards=tiny_shards, out=str(tmp_path), recipe=tiny()))
+
+
+def test_too_few_images_for_a_batch_are_told_before_anything_starts(tiny_shards: str, tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match="has 6 satellite and 18 UAV training images; expected at least one batch of 8"
+    ):
+        train(settings(tiny_shards, tmp_path, paper()))
+
+
+def test_an_unknown_recipe_is_answered_with_the_known_ones() -> None:
+    with pytest.raises(InputError, match="unknown recipe 'papr', expected one of: paper, smoke"):
+        refuse_unknown_recipe(["papr", "--shards", "x"])
+    refuse_unknown_recipe(["--help"])
+
+
+def test_the_paper_recipe_is_the_papers() -> None:
+    recipe = paper()
+    assert (recipe.network.depth, recipe.network.width, recipe.network.image_size, recipe.network.parts) == (
+        50,
+        1.0,
+        256,
+        4,
+    )
+    assert (recipe.network.part_dim, recipe.network.dropout, recipe.network.discriminator_channels) == (512, 0.75, 1024)
+    rates = recipe.optimisation
+    assert (rates.kind, rates.momentum, rates.weight_decay) == ("sgd", 0.9, 5e-4)
+    assert (rates.backbone_rate, rates.head_rate, rates.classifier_rate, rates.discriminator_rate) == (
+        0.001,
+        0.01,
+        0.01,
+        0.002,
+    )
+    assert (recipe.schedule.epochs, recipe.schedule.period, recipe.schedule.decay_epochs) == (560, 140, (60, 120))
+    assert (recipe.batch_size, recipe.augmentation.pad, recipe.augmentation.rotation) == (8, 10, 90)
