@@ -95,19 +95,25 @@ def open_stream(run: Run, place: Place) -> TrainingStream:
 
 def start(run: Run, place: Place, locations: int) -> tuple[Training, list[dict[str, Any]]]:
     """Networks and optimisers as the run's checkpoint has them, else fresh, and the rows of the epochs that are over."""
+    training = fresh(run, place, locations)
+    held = read_checkpoint(run)
+    if held is None:
+        return training, []
+    training.load_state(held.state)
+    return training, held.history
+
+
+def fresh(run: Run, place: Place, locations: int) -> Training:
+    """Networks and optimisers before the first step, the same on every worker."""
     recipe = run.recipe
     torch.manual_seed(recipe.seed)
     training = Training(
         recipe.network, recipe.optimisation, locations,
         adversary=recipe.adversary, device=place.device, distribute=place.distribute,
     )  # fmt: skip
-    held = read_checkpoint(run)
-    if held is not None:
-        training.load_state(held.state)
-        return training, held.history
     if run.weights is not None:
         load_backbone(training.learner.encoder.backbone, read_state_dict(run.weights), run.weights)
-    return training, []
+    return training
 
 
 def read_checkpoint(run: Run) -> Checkpoint | None:
@@ -138,10 +144,9 @@ def checkpoint(run: Run, training: Training, stream: TrainingStream, history: li
 
 
 def untrained(run: Run) -> bytes:
-    """The checkpoint of a run before its first step: what training starts from, to be compared with."""
+    """The checkpoint of a run before its first step, however far it is: what training starts from, to compare with."""
     stream = open_stream(run, Place())
-    training, _ = start(run, Place(), len(stream.classes))
-    return dumps(checkpoint(run, training, stream, []))
+    return dumps(checkpoint(run, fresh(run, Place(), len(stream.classes)), stream, []))
 
 
 def train_epoch(

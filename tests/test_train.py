@@ -50,6 +50,18 @@ def test_a_run_ends_with_a_checkpoint_curves_and_an_encoder(tiny_shards: str, tm
     assert [event.step for event in board.Scalars("location_loss")] == [1, 2]
 
 
+def test_the_untrained_network_is_the_one_before_the_first_step_even_when_the_run_is_over(
+    tiny_shards: str, tmp_path: Path
+) -> None:
+    run = Run(shards=tiny_shards, out=str(tmp_path), recipe=tiny(1))
+    before = loads(untrained(run))
+    train(settings(tiny_shards, tmp_path, tiny(1)))
+    after = loads(untrained(run))
+    assert after.epoch == 0
+    assert all(torch.equal(before.encoder_weights[name], tensor) for name, tensor in after.encoder_weights.items())
+    assert not torch.equal(after.encoder_weights["backbone.conv1.weight"], weights(tmp_path)["backbone.conv1.weight"])
+
+
 def test_a_finished_run_is_left_alone_and_another_recipe_refused(
     tiny_shards: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
