@@ -171,7 +171,7 @@ def train_epoch(
             seconds = time.monotonic() - began
             speed = (step + 1) * 2 * recipe.batch_size * place.world / seconds
             report({"steps": untold, "epoch": f"{epoch + 1}/{recipe.schedule.epochs}", "alpha": now.alpha,
-                    "rate": training.rates["backbone"], "images/s": speed} | means)  # fmt: skip
+                    "rates": "/".join(f"{rate:.2g}" for rate in training.rates.values()), "images/s": speed} | means)  # fmt: skip
             told, untold = time.monotonic(), 0
     return {
         "epoch": epoch + 1, "step": (epoch + 1) * stream.steps, "alpha": now.alpha,
