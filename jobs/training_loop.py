@@ -170,8 +170,9 @@ def train_epoch(
             means = {name: float(value) / (step + 1) for name, value in sums.items()}
             seconds = time.monotonic() - began
             speed = (step + 1) * 2 * recipe.batch_size * place.world / seconds
-            report({"steps": untold, "epoch": f"{epoch + 1}/{recipe.schedule.epochs}", "alpha": now.alpha,
-                    "rates": "/".join(f"{rate:.2g}" for rate in training.rates.values()), "images/s": speed} | means)  # fmt: skip
+            rates = "/".join(f"{rate:.2g}" for rate in training.rates.values())
+            facts = {"epoch": f"{epoch + 1}/{recipe.schedule.epochs}", "alpha": now.alpha, "rates": rates, "images/s": speed}
+            report({"steps": untold} | facts | means)
             told, untold = time.monotonic(), 0
     return {
         "epoch": epoch + 1, "step": (epoch + 1) * stream.steps, "alpha": now.alpha,
