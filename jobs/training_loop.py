@@ -171,7 +171,12 @@ def train_epoch(
             seconds = time.monotonic() - began
             speed = (step + 1) * 2 * recipe.batch_size * place.world / seconds
             rates = "/".join(f"{rate:.2g}" for rate in training.rates.values())
-            facts = {"epoch": f"{epoch + 1}/{recipe.schedule.epochs}", "alpha": now.alpha, "rates": rates, "images/s": speed}
+            facts = {
+                "epoch": f"{epoch + 1}/{recipe.schedule.epochs}",
+                "alpha": now.alpha,
+                "rates": rates,
+                "images/s": speed,
+            }
             report({"steps": untold} | facts | means)
             told, untold = time.monotonic(), 0
     return {
