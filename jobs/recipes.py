@@ -47,8 +47,7 @@ def paper_384() -> Recipe:
 def lpn() -> Recipe:
     """LPN at 256 px: no discriminator, its own 120 epochs with rates to a tenth after 80 [LPN].
 
-    The views are PVDA's two; LPN's own runs on University-1652 add street-view images through a second backbone. The paper
-    prints LPN's figures from LPN's own publication.
+    The views are PVDA's two; LPN's own runs on University-1652 add street-view images through a second backbone.
     """
     return Recipe(
         name="lpn",

@@ -1,13 +1,21 @@
 """Recipes are the paper's and LPN's; what is resolved from them is shown before training, and told apart from their own."""
 
 import io
+import math
+import shutil
+import subprocess
+import sys
 from dataclasses import fields, replace
+from pathlib import Path
 
 import pytest
+import torch
 from rich.console import Console
 
 from jobs.config_table import config_table, show_config
 from jobs.recipes import RECIPES, Recipe, alpha_zero, constant_alpha, lpn, no_restart, paper, paper_384, smoke
+from model.backbone import ResNet
+from model.checkpoint import loads
 from model.pvda import PVDAConfig
 from model.schedule import phase
 from model.training import Training
@@ -115,3 +123,31 @@ def test_the_table_goes_to_standard_error_and_keeps_to_the_screen(capsys: pytest
     assert said.out == ""
     assert "image_size=256" in said.err
     assert max(map(len, said.err.splitlines())) <= 80
+
+
+def test_recipe_paper_trains_a_whole_resnet50_from_torchvisions_weights(tmp_path: Path, tiny_shards: str) -> None:
+    """Two real steps by command line, on small images and a narrow D; the backbone has all its layers at full width."""
+    torch.manual_seed(5)
+    # As trained residual blocks do, each adds a little; at random they would add so much that one step throws conv1 far off.
+    given = {
+        name: tensor / 5 if name.endswith("bn3.weight") else tensor for name, tensor in ResNet(50).state_dict().items()
+    }
+    torch.save(given | {"fc.weight": torch.zeros(1000, 2048), "fc.bias": torch.zeros(1000)}, tmp_path / "resnet50.pth")
+    small = ["--image-size", "128", "--batch-size", "3", "--epochs", "1", "--discriminator-channels", "64"]
+    paths = ["--shards", tiny_shards, "--out", str(tmp_path / "run"), "--weights", str(tmp_path / "resnet50.pth")]
+    job = str(Path(__file__).parent.parent / "jobs" / "train.py")
+    command = [sys.executable, job, "paper", *paths, *small, "--workers", "0"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "recipe paper, 4 changed (*)" in done.stderr
+    assert "*image_size=128 (not 256)" in done.stderr
+    checkpoint = loads((tmp_path / "run" / "last.pt").read_bytes())
+    shutil.rmtree(tmp_path / "run")  # hundreds of megabytes, which pytest would keep
+    assert (checkpoint.network.depth, checkpoint.network.width, checkpoint.network.parts) == (50, 1.0, 4)
+    assert (checkpoint.recipe["name"], checkpoint.recipe["batch_size"]) == ("paper", 3)
+    assert (checkpoint.history[0]["step"], checkpoint.history[0]["alpha"]) == (2, 0.9)
+    assert all(math.isfinite(checkpoint.history[0][f"{loss}_loss"]) for loss in ("location", "view", "adversarial"))
+    for name in ("conv1.weight", "layer4.2.conv3.weight"):
+        now, before = checkpoint.encoder_weights[f"backbone.{name}"], given[name]
+        assert not torch.equal(now, before)
+        assert torch.cosine_similarity(now.flatten(), before.flatten(), dim=0) > 0.9  # it started from there
