@@ -22,7 +22,7 @@ class Settings(EmbeddingSettings):
     """Which shards are embedded, by which network, into which table."""
 
     checkpoint: str
-    "A last.pt of jobs/train.py."
+    "A last.pt of jobs/train.py, or what jobs/import_weights.py wrote."
     mirror: bool = True
     "Whether the embeddings of an image and its mirror image are summed [LPN]."
 

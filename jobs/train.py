@@ -18,6 +18,7 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 from jobs.cli import run
+from jobs.config_table import show_config
 from jobs.recipes import RECIPES, Recipe
 from jobs.training_loop import CHECKPOINT, Place, Run, open_stream, read_checkpoint, train_worker
 from model.pvda import FeatureEncoder
@@ -79,6 +80,7 @@ def train(settings: Settings) -> str:
         load_backbone(FeatureEncoder(this.recipe.network).backbone, read_state_dict(this.weights), this.weights)
     if held is not None:
         console.print(f"going on after epoch {done} of {epochs}")
+    show_config(settings.recipe, shards=this.shards, out=this.out, weights=this.weights, workers=settings.workers)
     with progress((epochs - done) * steps, f"training {settings.recipe.name}", "steps") as meter:
         if settings.workers == 0:
             train_worker(this, Place(), lambda told: show(meter, told))

@@ -9,7 +9,7 @@ import faiss
 import pytest
 
 ROOT = Path(__file__).parent.parent
-JOBS = ["simulate", "make_shards", "train", "embed_gallery", "build_index", "evaluate", "demo"]
+JOBS = ["simulate", "make_shards", "train", "embed_gallery", "build_index", "evaluate", "import_weights", "demo"]
 
 
 def call(job: str, *arguments: object) -> subprocess.CompletedProcess[str]:
@@ -36,6 +36,9 @@ WRONG: list[tuple[str, list[str], str]] = [
     ("train", ["papr", "--shards", "{}", "--out", "{}/o"], "unknown recipe 'papr'"),
     ("train", ["smoke", "--shards", "{}", "--out", "{}/o"], "not a finished set of shards"),
     ("embed_gallery", ["--shards", "{}", "--checkpoint", "{}/none.pt", "--out", "{}/o"], "no checkpoint at"),
+    ("import_weights", ["--torchvision", "{}/none.pth", "--out", "{}/o"], "no weights at"),
+    ("import_weights", ["--lpn", __file__, "--out", "{}/o"], "is no state dict"),
+    ("import_weights", ["--out", "{}/o"], "neither of --torchvision and --lpn"),
     ("build_index", ["--table", "{}", "--out", "{}/o"], "no feature table at"),
     ("evaluate", ["--table", "{}", "--out", "{}/o"], "no feature table at"),
     ("simulate", ["--out", "{}/o", "--train-locations", "1", "--test-locations", "1", "--distractors", "0",

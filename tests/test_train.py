@@ -143,7 +143,7 @@ def test_too_few_images_for_a_batch_are_told_before_anything_starts(tiny_shards:
 
 
 def test_an_unknown_recipe_is_answered_with_the_known_ones() -> None:
-    with pytest.raises(InputError, match="unknown recipe 'papr', expected one of: paper, smoke"):
+    with pytest.raises(InputError, match="unknown recipe 'papr', expected one of: paper, paper_384, lpn, "):
         refuse_unknown_recipe(["papr", "--shards", "x"])
     refuse_unknown_recipe(["--help"])
 

@@ -7,9 +7,9 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from model.backbone import ResNet
+from model.backbone import BLOCKS, Depth, ResNet
 from model.checkpoint import CheckpointError
-from model.weights import load_backbone, read_state_dict
+from model.weights import load_backbone, measure_backbone, read_state_dict
 
 
 def tiny(seed: int) -> ResNet:
@@ -79,3 +79,52 @@ def test_a_file_that_holds_something_else_is_refused_with_the_remedy(tmp_path: P
     torch.save(value, tmp_path / "else.pth")
     with pytest.raises(CheckpointError, match=r"else\.pth holds something else than tensors by name.*save model"):
         read_state_dict(str(tmp_path / "else.pth"))
+
+
+def test_a_folder_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"is no state dict \(.*directory.*expected \.pth or \.safetensors"):
+        read_state_dict(str(tmp_path))
+
+
+def published(depth: Depth) -> dict[str, Tensor]:
+    """Names and shapes of torchvision's ResNet of that depth, without memory."""
+    with torch.device("meta"):
+        fc = {"fc.weight": torch.empty(1000, 512 if depth < 50 else 2048), "fc.bias": torch.empty(1000)}
+        return ResNet(depth).state_dict() | fc
+
+
+@pytest.mark.parametrize(("depth", "tensors"), [(18, 122), (34, 218), (50, 320), (101, 626)])
+def test_a_state_dict_of_each_depth_loads_and_tells_its_depth(depth: Depth, tensors: int) -> None:
+    state = published(depth)
+    assert len(state) == tensors  # as torchvision's have them, the classifier's two included
+    assert measure_backbone(state, "resnet.pth") == (depth, 1.0)
+    with torch.device("meta"):
+        backbone = ResNet(depth)
+    load_backbone(backbone, state, "resnet.pth")
+
+
+@pytest.mark.parametrize("depth", BLOCKS)
+@pytest.mark.parametrize("other", BLOCKS)
+def test_a_state_dict_of_another_depth_is_refused(depth: Depth, other: Depth) -> None:
+    with torch.device("meta"):
+        backbone = ResNet(depth)
+    if depth == other:
+        load_backbone(backbone, published(other), "resnet.pth")
+        return
+    with pytest.raises(
+        CheckpointError, match=r"does not fit this backbone: .*layer.*; choose the depth that it was made"
+    ):
+        load_backbone(backbone, published(other), "resnet.pth")
+
+
+def test_the_width_is_told_too_and_what_is_no_resnet_of_ours_is_refused_by_what_it_has() -> None:
+    assert measure_backbone(foreign(), "thin.pth") == (18, 0.25)
+    resnet152 = published(101) | {f"layer2.{block}.conv3.weight": torch.ones(1) for block in range(4, 8)}
+    with pytest.raises(
+        CheckpointError, match=r"deep\.pth is of no ResNet that we build: .* 3, 8, 23, 3 bottleneck blocks"
+    ):
+        measure_backbone(resnet152, "deep.pth")
+    with pytest.raises(CheckpointError, match=r"conv1\.weight is missing, .*names begin with module\.conv1\.weight"):
+        measure_backbone({f"module.{key}": tensor for key, tensor in foreign().items()}, "wrapped.pth")
+    with pytest.raises(CheckpointError, match="begin with nothing"):
+        measure_backbone({}, "empty.pth")
