@@ -12,10 +12,9 @@ Item = TypeVar("Item")
 
 
 def connect() -> None:
-    """Join the cluster that the environment names (RAY_ADDRESS, which `ray job submit` sets), else start a local one.
+    """Join the cluster that RAY_ADDRESS names (`ray job submit` sets it) or that `ray start` began on this machine, else
+    start one for this process. Idempotent.
 
-    Idempotent. Left to itself, Ray would join whatever cluster was started last on this machine, also the private one of
-    another job, and fall with it.
     Workers' output stays in Ray's session folder: what a worker has to say comes back as a result or an exception.
     """
     if ray.is_initialized():
@@ -24,7 +23,7 @@ def connect() -> None:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's coming default; unset, each init warns
     # A token for a local cluster is what we want, and no news.
     logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
-    ray.init(address=os.environ.get("RAY_ADDRESS", "local"), log_to_driver=False, logging_level=logging.WARNING)
+    ray.init(log_to_driver=False, logging_level=logging.WARNING)
 
 
 def cpus() -> int:

@@ -17,8 +17,9 @@ def ray_cluster() -> Iterator[None]:
 
     from pipeline import cluster
 
-    os.environ.pop("RAY_ADDRESS", None)
-    cluster.connect()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_ADDRESS", "local")  # never a cluster that someone runs on this machine
+        cluster.connect()
     yield
     ray.shutdown()
 

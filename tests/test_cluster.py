@@ -1,4 +1,4 @@
-"""Joining Ray, and calls with a bounded number in flight."""
+"""Calls with a bounded number in flight."""
 
 from typing import Any
 
@@ -6,20 +6,6 @@ import pytest
 import ray
 
 from pipeline import cluster
-
-
-@pytest.mark.parametrize(("named", "joined"), [(None, "local"), ("10.0.0.1:6379", "10.0.0.1:6379")])
-def test_a_job_joins_the_named_cluster_or_starts_its_own_and_never_a_strangers(
-    monkeypatch: pytest.MonkeyPatch, named: str | None, joined: str
-) -> None:
-    asked: dict[str, Any] = {}
-    monkeypatch.setattr(ray, "is_initialized", lambda: False)
-    monkeypatch.setattr(ray, "init", lambda **settings: asked.update(settings))
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    if named is not None:
-        monkeypatch.setenv("RAY_ADDRESS", named)
-    cluster.connect()
-    assert asked["address"] == joined
 
 
 def test_calls_come_back_with_their_items_and_never_more_than_the_window_is_in_flight(ray_cluster: None) -> None:
