@@ -23,6 +23,7 @@ from pipeline.transforms import Augmentation, DecodeError, Pixels, augment, deco
 
 In = TypeVar("In")
 Out = TypeVar("Out")
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,6 +124,19 @@ def ahead(function: Callable[[In], Out], items: Iterable[In], threads: int, dept
             pool.shutdown(cancel_futures=True)
 
 
+def ready(items: Iterable[Item], depth: int) -> Iterator[Item]:
+    """The items in order, made by a thread of their own, `depth` of them before they are asked for."""
+    source, end = iter(items), object()
+    with ThreadPoolExecutor(1) as pool:
+        waiting: deque[Future[Any]] = deque(pool.submit(next, source, end) for _ in range(depth))
+        try:
+            while (item := waiting.popleft().result()) is not end:
+                waiting.append(pool.submit(next, source, end))
+                yield item
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reading:
     """How training images are read."""
@@ -164,11 +178,14 @@ class TrainingStream:
                 f"least one batch of {together} satellite images and some of the UAV; pack more, or train with a smaller batch"
             )
 
-    def epoch(self, epoch: int) -> Iterator[tuple[Batch, Batch]]:
-        """The (UAV, satellite) batches of one epoch, a pure function of seed, epoch, rank and world."""
-        return zip(self._view(View.DRONE, epoch), self._view(View.SATELLITE, epoch), strict=True)
+    def epoch(self, epoch: int, skip: int = 0) -> Iterator[tuple[Batch, Batch]]:
+        """The (UAV, satellite) batches of one epoch, a pure function of seed, epoch, rank and world.
 
-    def _view(self, view: View, epoch: int) -> Iterator[Batch]:
+        The first `skip` batches are left out, without decoding them; those that follow are what they always are.
+        """
+        return zip(self._view(View.DRONE, epoch, skip), self._view(View.SATELLITE, epoch, skip), strict=True)
+
+    def _view(self, view: View, epoch: int, skip: int) -> Iterator[Batch]:
         reading, wanted = self.reading, self.steps * self.reading.batch_size
         number = list(View).index(view)
         # The plan is every rank's alike; the order within a rank is its own.
@@ -183,8 +200,9 @@ class TrainingStream:
             rng = np.random.default_rng([reading.seed, epoch, number, self.rank, position])
             return sample, augment(decode(sample.data), view, reading.image_size, reading.augmentation, rng)
 
-        ready = ahead(prepare, enumerate(samples), reading.threads, 4 * reading.batch_size)
-        while group := list(islice(ready, reading.batch_size)):
+        numbered = islice(enumerate(samples), skip * reading.batch_size, None)
+        prepared = ahead(prepare, numbered, reading.threads, 4 * reading.batch_size)
+        while group := list(islice(prepared, reading.batch_size)):
             labels = [self.classes[sample.facts["location"]] for sample, _ in group]
             yield Batch(
                 images_B3HW=stack([image for _, image in group]),
