@@ -1,6 +1,6 @@
 """The two-step update of PVDA, and the state that a checkpoint holds. Knows no Ray and no files.
 
-In: a batch of each view. Out: changed weights, and the losses of the step.
+In: a batch of each view. Out: changed weights, and the measures of the step, which stay on the device.
 Shapes: B images of a view, H x W pixels or cells, C channels of the maps, P rings, L locations.
 """
 
@@ -10,11 +10,15 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import get_total_norm
 from torch.optim import SGD, Adam, AdamW, Optimizer
 
-from model.losses import DRONE, SATELLITE, adversarial_loss, feature_loss, location_loss, view_loss
+from model.losses import adversarial_terms, feature_loss, location_terms, view_terms
 from model.pvda import FeatureEncoder, LocationClassifier, PVDAConfig, ViewDiscriminator
 from model.schedule import Phase
+
+VIEWS = ("drone", "satellite")
+Precision = Literal["auto", "float32", "bfloat16"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +63,8 @@ class Training:
     """Networks and optimisers of one run, and the iteration that moves them.
 
     `distribute` wraps each trained module (DDP over several workers); `adversary=False` leaves the discriminator out,
-    which is LPN.
+    which is LPN. With `sync_bn` BatchNorm's statistics are those of all workers' images. In `bfloat16` the networks'
+    products are computed so, under autocast, and weights, losses and updates stay float32; `auto` does it on CUDA.
     """
 
     def __init__(
@@ -70,10 +75,15 @@ class Training:
         *,
         adversary: bool = True,
         device: torch.device | str = "cpu",
+        precision: Precision = "float32",
+        sync_bn: bool = False,
         distribute: Callable[[nn.Module], nn.Module] = lambda module: module,
     ) -> None:
         self.device = torch.device(device)
-        self.learner = Learner(config, locations).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.bfloat16 = precision == "bfloat16" or (precision == "auto" and self.device.type == "cuda")
+        placed = _placed(Learner(config, locations), self.device, sync_bn)
+        assert isinstance(placed, Learner)
+        self.learner = placed
         self._learner = distribute(self.learner)
         encoder, rates = self.learner.encoder, optimisation
         groups = [
@@ -92,8 +102,9 @@ class Training:
         ]
         self.discriminator: ViewDiscriminator | None = None
         if adversary:
-            discriminator = ViewDiscriminator(config, encoder.backbone.channels)
-            self.discriminator = discriminator.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+            discriminator = _placed(ViewDiscriminator(config, encoder.backbone.channels), self.device, sync_bn)
+            assert isinstance(discriminator, ViewDiscriminator)
+            self.discriminator = discriminator
             self._discriminator = distribute(self.discriminator)
             own = {
                 "params": list(discriminator.parameters()),
@@ -118,42 +129,60 @@ class Training:
     def step(
         self, images1_B3HW: Tensor, location1_B: Tensor, images2_B3HW: Tensor, location2_B: Tensor, now: Phase
     ) -> dict[str, Tensor]:
-        """One iteration: D takes a step on Eq. 2, then encoder and classifier one on Eq. 4. Returns detached scalars.
+        """One iteration: D takes a step on Eq. 2, then encoder and classifier one on Eq. 4.
 
         One encoder pass serves both steps; D sees both views in one batch, since BatchNorm over separate batches would
-        erase the very shift that it must see.
+        erase the very shift that it must see. Returns the step's measures, detached scalars that are still on the device:
+        each loss, whole and by view (and ring), how often D was right, and the length of each network's gradient.
         """
         for optimiser in self.optimisers:
             for group in optimiser.param_groups:
                 group["lr"] = group["start"] * now.rate_scale
-        maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = self._learner(images1_B3HW, images2_B3HW)
-        located = location_loss(logits1_BPL, location1_B, logits2_BPL, location2_B)
-        losses = {"location_loss": located}
-        total = located
+        with self._autocast():
+            maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = self._learner(images1_B3HW, images2_B3HW)
+        located_VP = location_terms(logits1_BPL, location1_B, logits2_BPL, location2_B)
+        total = located_VP.sum()
+        measures = {"location_loss": total} | _named("location_loss", located_VP)
         if self.discriminator is not None:
             both_BCHW = torch.cat([maps1_BCHW, maps2_BCHW])
-            losses |= self._discriminate(both_BCHW.detach(), len(maps1_BCHW))
+            measures |= self._discriminate(both_BCHW.detach(), len(maps1_BCHW))
             # D's weights are constants of the second step; its BatchNorm stays in training mode.
             self.discriminator.requires_grad_(False)
-            adversarial = adversarial_loss(*self.discriminator(both_BCHW).tensor_split([len(maps1_BCHW)]))
+            with self._autocast():
+                verdict_B2 = self.discriminator(both_BCHW)
             self.discriminator.requires_grad_(True)
-            total = feature_loss(located, adversarial, now.alpha)
-            losses["adversarial_loss"] = adversarial
+            adversarial_V = adversarial_terms(*verdict_B2.tensor_split([len(maps1_BCHW)]))
+            adversarial = adversarial_V.sum()
+            total = feature_loss(total, adversarial, now.alpha)
+            measures |= {"adversarial_loss": adversarial} | _named("adversarial_loss", adversarial_V)
         self.optimisers[0].zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
+        for name, module in (("encoder", self.learner.encoder), ("classifier", self.learner.classifier)):
+            measures[f"gradient_norm/{name}"] = gradient_norm(module)
         self.optimisers[0].step()
-        return {name: loss.detach() for name, loss in losses.items()}
+        return {name: measure.detach() for name, measure in measures.items()}
 
     def _discriminate(self, both_BCHW: Tensor, drones: int) -> dict[str, Tensor]:
         """Step 1: move D towards telling the views apart."""
-        verdict_B2 = self._discriminator(both_BCHW)
-        loss = view_loss(*verdict_B2.tensor_split([drones]))
+        with self._autocast():
+            verdict_B2 = self._discriminator(both_BCHW)
+        verdicts = verdict_B2.tensor_split([drones])
+        terms_V = view_terms(*verdicts)
+        loss = terms_V.sum()
         self.optimisers[1].zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
+        norm = gradient_norm(self._discriminator)
         self.optimisers[1].step()
-        truth_B = torch.full((len(verdict_B2),), SATELLITE, device=verdict_B2.device)
-        truth_B[:drones] = DRONE
-        return {"view_loss": loss, "discriminator_accuracy": (verdict_B2.argmax(1) == truth_B).float().mean()}
+        right_V = [(verdict_B2.argmax(1) == view).float() for view, verdict_B2 in enumerate(verdicts)]
+        return (
+            {"view_loss": loss, "discriminator_accuracy": torch.cat(right_V).mean()}
+            | {"gradient_norm/discriminator": norm}
+            | _named("view_loss", terms_V)
+            | _named("discriminator_accuracy", torch.stack([right_B.mean() for right_B in right_V]))
+        )
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16)
 
     def state(self) -> dict[str, Any]:
         """Everything that the next step depends on, besides the data's order, as tensors and plain values."""
@@ -170,3 +199,26 @@ class Training:
         for optimiser, held in zip(self.optimisers, state["optimisers"], strict=True):
             optimiser.load_state_dict(held)
         torch.set_rng_state(state["rng"])
+
+
+def gradient_norm(module: nn.Module) -> Tensor:
+    """Length of a network's gradient, all its parameters taken as one vector."""
+    return get_total_norm([parameter.grad for parameter in module.parameters() if parameter.grad is not None])
+
+
+def _placed(module: nn.Module, device: torch.device, sync_bn: bool) -> nn.Module:
+    if sync_bn:
+        module = nn.SyncBatchNorm.convert_sync_batchnorm(module)  # type: ignore[no-untyped-call]
+    return module.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
+
+
+def _named(name: str, terms: Tensor) -> dict[str, Tensor]:
+    """The terms of a measure by view (V,), and by ring where it has any (V, P)."""
+    if terms.dim() == 1:
+        return {f"{name}/{view}": term for view, term in zip(VIEWS, terms.unbind(), strict=True)}
+    rings = {
+        f"{name}/{view}/ring{ring}": term
+        for view, terms_P in zip(VIEWS, terms.unbind(), strict=True)
+        for ring, term in enumerate(terms_P.unbind(), start=1)
+    }
+    return _named(name, terms.sum(1)) | rings
