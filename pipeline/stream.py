@@ -17,6 +17,7 @@ import numpy.typing as npt
 from webdataset.tariterators import group_by_keys, tar_file_expander
 
 from pipeline import storage
+from pipeline.hold_out import held_out, without
 from pipeline.records import InputError, Split, View
 from pipeline.shards import Manifest, Shard, read_manifest
 from pipeline.transforms import Augmentation, DecodeError, Pixels, augment, decode, resize
@@ -90,9 +91,11 @@ def plan_pass(shards: Sequence[Shard], wanted: int, rank: int, world: int, rng: 
     return spans
 
 
-def read_spans(shards: str, spans: Iterable[Span]) -> Iterator[Sample]:
+def read_spans(shards: str, spans: Iterable[Span], left_out: frozenset[str] = frozenset()) -> Iterator[Sample]:
+    """The spans' samples; those of the locations that are left out do not count as there."""
     for span in spans:
-        yield from islice(read_shard(shards, span.name), span.start, span.stop)
+        samples = (sample for sample in read_shard(shards, span.name) if sample.facts["location"] not in left_out)
+        yield from islice(samples, span.start, span.stop)
 
 
 def shuffled(samples: Iterable[Sample], buffer: int, rng: np.random.Generator) -> Iterator[Sample]:
@@ -151,6 +154,8 @@ class Reading:
     "Encoded images held for shuffling; those of University-1652 take some 40 kB each."
     threads: int = 2
     "That decode and augment ahead of the network."
+    hold_out: float = 0.0
+    "Share of the locations that is left out: `held_out` of the stream."
 
 
 class TrainingStream:
@@ -165,10 +170,14 @@ class TrainingStream:
     def __init__(self, shards: str, reading: Reading, rank: int = 0, world: int = 1) -> None:
         self.shards, self.reading, self.rank, self.world = shards, reading, rank, world
         self.manifest: Manifest = read_manifest(shards)
-        self.classes = {location: number for number, location in enumerate(self.manifest.classes)}
-        counts = {
-            view: sum(s.samples for s in self.manifest.of(Split.TRAIN, view)) for view in (View.DRONE, View.SATELLITE)
+        self.held_out = held_out(self.manifest.classes, reading.hold_out)
+        kept = [location for location in self.manifest.classes if location not in self.held_out]
+        self.classes = {location: number for number, location in enumerate(kept)}
+        self._shards = {
+            view: without(shards, self.manifest.of(Split.TRAIN, view), self.held_out)
+            for view in (View.DRONE, View.SATELLITE)
         }
+        counts = {view: sum(shard.samples for shard in found) for view, found in self._shards.items()}
         together = reading.batch_size * world
         self.steps = counts[View.SATELLITE] // together
         "Steps of an epoch, the same for every rank."
@@ -190,9 +199,9 @@ class TrainingStream:
         number = list(View).index(view)
         # The plan is every rank's alike; the order within a rank is its own.
         plan_rng = np.random.default_rng([reading.seed, epoch, number])
-        spans = plan_pass(self.manifest.of(Split.TRAIN, view), wanted, self.rank, self.world, plan_rng)
+        spans = plan_pass(self._shards[view], wanted, self.rank, self.world, plan_rng)
         order_rng = np.random.default_rng([reading.seed, epoch, number, self.rank])
-        samples = shuffled(read_spans(self.shards, spans), reading.shuffle_buffer, order_rng)
+        samples = shuffled(read_spans(self.shards, spans, self.held_out), reading.shuffle_buffer, order_rng)
 
         def prepare(numbered: tuple[int, Sample]) -> tuple[Sample, Pixels]:
             position, sample = numbered
