@@ -85,7 +85,7 @@ class Worker:
         """The steps of one pass over the satellite view that are still to do; returns the epoch's row of metrics.jsonl."""
         recipe, steps = self.run.recipe, self.stream.steps
         told_at, told_steps = time.monotonic(), self.tally.steps
-        for images, labels in self._batches(epoch):
+        for images, labels in self.batches(epoch):
             step = self.tally.steps
             now = phase(recipe.schedule, epoch + step / steps)
             # Dropout's random numbers are a function of seed, epoch, step and rank, however often a run was resumed.
@@ -137,7 +137,7 @@ class Worker:
         whole = {name: mean for name, mean in self.means().items() if "/" not in name}
         self._report({"steps": steps} | facts | {"rates": rates, "images/s": self.speed} | whole)
 
-    def _batches(self, epoch: int) -> Iterator[tuple[list[Tensor], list[Tensor]]]:
+    def batches(self, epoch: int) -> Iterator[tuple[list[Tensor], list[Tensor]]]:
         """Images and labels of both views on the device, ready before the step asks for them."""
         device = self.training.device
 

@@ -145,9 +145,9 @@ class Training:
         located_VP = location_terms(logits1_BPL, location1_B, logits2_BPL, location2_B)
         total = located_VP.sum()
         measures = {"location_loss": total} | _named("location_loss", located_VP)
-        if self.discriminator is not None and self._discriminator is not None:
+        if self.discriminator is not None:
             both_BCHW = torch.cat([maps1_BCHW, maps2_BCHW])
-            measures |= self._discriminate(self._discriminator, both_BCHW.detach(), len(maps1_BCHW))
+            measures |= self.discriminate(both_BCHW.detach(), len(maps1_BCHW))
             # D's weights are constants of the second step; its BatchNorm stays in training mode.
             self.discriminator.requires_grad_(False)
             with self._autocast():
@@ -164,16 +164,17 @@ class Training:
         self.optimisers[0].step()
         return {name: measure.detach() for name, measure in measures.items()}
 
-    def _discriminate(self, discriminator: nn.Module, both_BCHW: Tensor, drones: int) -> dict[str, Tensor]:
-        """Step 1: move D towards telling the views apart."""
+    def discriminate(self, both_BCHW: Tensor, drones: int) -> dict[str, Tensor]:
+        """Step 1: move D towards telling the views apart; the first `drones` maps are the UAV's."""
+        assert self._discriminator is not None
         with self._autocast():
-            verdict_B2 = discriminator(both_BCHW)
+            verdict_B2 = self._discriminator(both_BCHW)
         verdicts = verdict_B2.tensor_split([drones])
         terms_V = view_terms(*verdicts)
         loss = terms_V.sum()
         self.optimisers[1].zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
-        norm = gradient_norm(discriminator)
+        norm = gradient_norm(self._discriminator)
         self.optimisers[1].step()
         right_V = [(verdict_B2.argmax(1) == view).float() for view, verdict_B2 in enumerate(verdicts)]
         return (

@@ -53,8 +53,8 @@ def checkpoint(epoch: int) -> Checkpoint:
 
 def work(rank: int, port: int, out: str) -> None:
     torch.set_num_threads(1)
-    store = torch.distributed.TCPStore("127.0.0.1", port, WORKERS, is_master=rank == 0)
-    torch.distributed.init_process_group("gloo", store=store, rank=rank, world_size=WORKERS)
+    address = f"tcp://127.0.0.1:{port}"
+    torch.distributed.init_process_group("gloo", init_method=address, rank=rank, world_size=WORKERS)
     torch.manual_seed(rank)  # DDP gives all workers the weights of rank 0
     training = frozen(Training(CONFIG, Optimisation(), LOCATIONS, distribute=distribute))
     drone, location1_B, satellite, location2_B = (tensor[rank * EACH : (rank + 1) * EACH] for tensor in batch())
@@ -72,7 +72,7 @@ def test_gradients_of_two_workers_are_those_of_one_with_all_their_images_and_all
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = int(free.getsockname()[1])
-    spawn(work, (port, str(tmp_path)), nprocs=WORKERS)
+    spawn(work, (port, str(tmp_path)), nprocs=WORKERS)  # type: ignore[no-untyped-call]
     torch.manual_seed(0)
     alone = frozen(Training(CONFIG, Optimisation(), LOCATIONS))
     for _ in range(2):
