@@ -14,9 +14,10 @@ from jobs.cli import run
 from jobs.embed_gallery import network_of
 from jobs.evaluate import print_table
 from jobs.recipes import smoke
+from jobs.run_folder import Run
 from jobs.train import Settings as TrainSettings
 from jobs.train import train
-from jobs.training_loop import Run, untrained
+from jobs.training_loop import untrained
 from pipeline import cluster, storage
 from pipeline.embed import EmbeddingSettings, embed_gallery
 from pipeline.evaluation import EvaluationSettings, evaluate

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from model.pvda import PVDAConfig
 from model.schedule import Schedule
-from model.training import Optimisation
+from model.training import Optimisation, Precision
 from pipeline.records import InputError
 from pipeline.transforms import Augmentation
 
@@ -26,12 +26,20 @@ class Recipe:
     "Images of each view per step and worker [LPN lineage: 8]."
     seed: int = 0
     "Of the weights, the data's order and the augmentation."
+    precision: Precision = "auto"
+    "Of the networks' products: float32, bfloat16 by autocast, or auto: bfloat16 on CUDA, float32 on a CPU [chosen]."
+    sync_bn: bool = False
+    "Whether BatchNorm's statistics are those of all workers' images; GPUs only [chosen: each worker's own]."
+    hold_out: float = 0.0
+    "Share of the training locations that is not trained on but looked at every `probe_epochs` [chosen: none]."
 
     def __post_init__(self) -> None:
         if self.batch_size < 2:
             raise InputError(
                 f"batch_size is {self.batch_size}, expected at least 2: BatchNorm needs two images of a view"
             )
+        if not 0 <= self.hold_out < 1:
+            raise InputError(f"hold_out is {self.hold_out}, expected a share of the locations, from 0 to below 1")
 
 
 def paper() -> Recipe:

@@ -1,26 +1,29 @@
 """Shards -> trained PVDA: `train.py RECIPE --shards DIR --out RUN [--weights FILE] [--workers N]`.
 
 Writes RUN/last.pt (weights, config, and all that going on needs), RUN/metrics.jsonl (a row per epoch) and
-RUN/tensorboard. Killed, it goes on from the last checkpoint when run again.
+RUN/tensorboard. Killed, it goes on from the last checkpoint when run again; where a Ray worker dies, by itself.
 """
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import torch
 import tyro
-from ray.train import RunConfig, ScalingConfig, get_context
+from ray.train import RunConfig, ScalingConfig, WorkerGroupError, get_context
 from ray.train.torch import TorchTrainer, get_device
 from ray.util.queue import Queue
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from jobs.cli import run
+from jobs.cli import Failure, run
 from jobs.config_table import show_config
 from jobs.recipes import RECIPES, Recipe
-from jobs.training_loop import CHECKPOINT, Place, Run, open_stream, read_checkpoint, train_worker
+from jobs.run_folder import CHECKPOINT, Conduct, Run, find_checkpoint
+from jobs.training_loop import Found, Place, open_stream, train_worker
+from model.checkpoint import CheckpointError
 from model.pvda import FeatureEncoder
 from model.weights import load_backbone, read_state_dict
 from pipeline import cluster, storage
@@ -38,7 +41,7 @@ else:  # the command line's subcommands: a recipe by name, each of its settings 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings:
+class Settings(Conduct):
     """What is trained on what, and by how many."""
 
     recipe: RecipeChoice
@@ -51,13 +54,23 @@ class Settings:
     workers: int = 1
     "Ray Train workers; 0 trains in this process."
     gpus_per_worker: float | None = None
-    "GPUs of a worker; by default one where the cluster has any."
-    checkpoint_minutes: float = 5.0
-    "Minutes between checkpoints, taken at the end of an epoch."
+    "GPUs of a worker; by default one where there are any."
+    max_failures: int = 3
+    "How often lost Ray workers are replaced and training goes on from the last checkpoint, before the job gives up."
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.workers < 0:
             raise InputError(f"--workers is {self.workers}, expected 0 (this process) or more")
+
+    @property
+    def run(self) -> Run:
+        """The run as every worker is told of it."""
+        conduct = {field.name: getattr(self, field.name) for field in fields(Conduct)}
+        return Run(
+            shards=storage.absolute(self.shards), out=storage.absolute(self.out), recipe=self.recipe,
+            weights=self.weights and storage.absolute(self.weights), **conduct,
+        )  # fmt: skip
 
 
 def train(settings: Settings) -> str:
@@ -65,25 +78,25 @@ def train(settings: Settings) -> str:
 
     Raises InputError or CheckpointError on unusable input, before any worker starts.
     """
-    this = Run(
-        shards=storage.absolute(settings.shards), out=storage.absolute(settings.out), recipe=settings.recipe,
-        weights=settings.weights and storage.absolute(settings.weights), checkpoint_minutes=settings.checkpoint_minutes,
-    )  # fmt: skip
+    this = settings.run
     path = storage.join(this.out, CHECKPOINT)
-    held, epochs = read_checkpoint(this), settings.recipe.schedule.epochs
-    done = 0 if held is None else held.epoch
+    found, epochs = find_checkpoint(this, console.print), settings.recipe.schedule.epochs
+    done, step = (found[1].epoch, found[1].step) if found is not None else (0, 0)
     if done == epochs:
         console.print(f"{path} is complete: {epochs} epochs of recipe {settings.recipe.name}; nothing to do")
         return path
     steps = open_stream(this, Place(world=max(1, settings.workers))).steps
-    if this.weights is not None and held is None:
+    if this.weights is not None and found is None:
         load_backbone(FeatureEncoder(this.recipe.network).backbone, read_state_dict(this.weights), this.weights)
-    if held is not None:
-        console.print(f"going on after epoch {done} of {epochs}")
+    if found is not None:
+        within = f" and {step} of {steps} steps" if step else ""
+        console.print(f"going on after epoch {done} of {epochs}{within}")
+    del found  # as large as the networks and their optimisers
     show_config(settings.recipe, shards=this.shards, out=this.out, weights=this.weights, workers=settings.workers)
-    with progress((epochs - done) * steps, f"training {settings.recipe.name}", "steps") as meter:
+    with progress((epochs - done) * steps - step, f"training {settings.recipe.name}", "steps") as meter:
         if settings.workers == 0:
-            train_worker(this, Place(), lambda told: show(meter, told))
+            device = "cuda" if torch.cuda.is_available() and settings.gpus_per_worker != 0 else "cpu"
+            train_worker(this, Place(device=device), lambda told: show(meter, told))
         else:
             train_on_ray(this, settings, meter)
     console.print(f"trained: {path}")
@@ -91,28 +104,61 @@ def train(settings: Settings) -> str:
 
 
 def train_on_ray(this: Run, settings: Settings, meter: Meter) -> None:
-    """Train with Ray Train's workers; what rank 0 tells comes back through a queue."""
+    """Train with Ray Train's workers. When one dies, the group is started again and goes on from the last checkpoint.
+
+    Not by Ray Train's own FailureConfig: that would try a run that has diverged again, and nobody would hear of it.
+    """
     cluster.connect()
-    told = Queue(actor_options={"num_cpus": 0})
     gpus = settings.gpus_per_worker
     if gpus is None:
         gpus = 1.0 if cluster.gpus() >= settings.workers else 0.0
+    if this.recipe.sync_bn and settings.workers > 1 and not gpus:
+        raise InputError(
+            f"sync_bn is on and {settings.workers} workers have no GPUs, expected GPUs: torch synchronises BatchNorm on "
+            "those alone; leave sync_bn off, or train with --workers 1"
+        )
     cpus = max(1, cluster.cpus() // settings.workers)
-    listener = threading.Thread(target=listen, args=(told, meter), daemon=True)
+    scaling = ScalingConfig(
+        num_workers=settings.workers,
+        use_gpu=gpus > 0,
+        resources_per_worker={"CPU": cpus} | ({"GPU": gpus} if gpus else {}),
+    )
+    for failures in count(1):
+        try:
+            train_group(this, scaling, cpus, meter)
+            break
+        except WorkerGroupError as error:
+            if failures > settings.max_failures:
+                raise
+            lost = ", ".join(sorted({type(failure).__name__ for failure in error.worker_failures.values()}))
+            meter.note(
+                f"lost a worker ({lost}); going on from the last checkpoint, {failures} of {settings.max_failures}"
+            )
+
+
+def train_group(this: Run, scaling: ScalingConfig, cpus: int, meter: Meter) -> None:
+    """Train with one group of workers; what they tell comes back through a queue.
+
+    Raises what a worker gave as the reason why no other group would fare better, WorkerGroupError where one died.
+    """
+    told, refused = Queue(actor_options={"num_cpus": 0}), list[Exception]()
+    listener = threading.Thread(target=listen, args=(told, meter, refused), daemon=True)
     listener.start()
     trainer = TorchTrainer(
         ray_worker,
         train_loop_config={"run": this, "told": told, "cpus": cpus},
-        scaling_config=ScalingConfig(
-            num_workers=settings.workers,
-            use_gpu=gpus > 0,
-            resources_per_worker={"CPU": cpus} | ({"GPU": gpus} if gpus else {}),
-        ),
+        scaling_config=scaling,
         # Ray Train's own records: our checkpoints are written by rank 0, so that they are the same with and without Ray.
         run_config=RunConfig(name="ray", storage_path=this.out),
     )
     try:
         trainer.fit()
+    except WorkerGroupError:
+        told.put(None)
+        listener.join()  # all has been heard
+        if refused:
+            raise refused[0] from None
+        raise
     finally:
         told.put(None)
         listener.join()
@@ -122,15 +168,18 @@ def train_on_ray(this: Run, settings: Settings, meter: Meter) -> None:
 def ray_worker(config: dict[str, Any]) -> None:
     """A Ray Train worker: the same loop, with DDP around what is trained."""
     torch.set_num_threads(config["cpus"])  # Ray's OMP_NUM_THREADS would say the same; set on purpose
-    context = get_context()
-    told, rank = config["told"], context.get_world_rank()
-    place = Place(
-        rank=rank,
-        world=context.get_world_size(),
-        device=str(get_device()),
-        distribute=distribute if context.get_world_size() > 1 else lambda module: module,
-    )
-    train_worker(config["run"], place, told.put if rank == 0 else lambda facts: None)
+    context, device = get_context(), get_device()
+    told, rank, world = config["told"], context.get_world_rank(), context.get_world_size()
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    place = Place(rank=rank, world=world, device=str(device))
+    if world > 1:
+        place = replace(place, distribute=distribute, share=share)
+    try:
+        train_worker(config["run"], place, told.put if rank == 0 else lambda facts: None)
+    except (Failure, InputError, CheckpointError) as error:
+        told.put({"refused": error})
+        raise
 
 
 def distribute(module: nn.Module) -> nn.Module:
@@ -139,15 +188,28 @@ def distribute(module: nn.Module) -> nn.Module:
     return DistributedDataParallel(module, broadcast_buffers=False)
 
 
-def listen(told: Queue, meter: Meter) -> None:
-    """Show what rank 0 tells until None comes."""
+def share(found: Found) -> Found:
+    """What rank 0 found."""
+    held = [found]
+    torch.distributed.broadcast_object_list(held, src=0)
+    return held[0]
+
+
+def listen(told: Queue, meter: Meter, refused: list[Exception]) -> None:
+    """Show what the workers tell until None comes; keep why they cannot go on."""
     while (facts := told.get()) is not None:
-        show(meter, facts)
+        if "refused" in facts:
+            refused.append(facts["refused"])
+        else:
+            show(meter, facts)
 
 
 def show(meter: Meter, told: dict[str, Any]) -> None:
     facts = dict(told)
-    meter.advance(facts.pop("steps"), **facts)
+    if "note" in facts:
+        meter.note(facts["note"])
+    else:
+        meter.advance(facts.pop("steps"), **facts)
 
 
 def refuse_unknown_recipe(arguments: Sequence[str]) -> None:

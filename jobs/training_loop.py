@@ -1,48 +1,35 @@
-"""What one training worker does, wherever it runs: stream batches, take steps, write checkpoints and curves.
+"""What one training worker does, wherever it runs: stream batches, take steps, tell, and leave checkpoints and curves.
 
-In: shards and a recipe. Out: RUN/last.pt, RUN/metrics.jsonl, RUN/tensorboard, written by rank 0.
+In: shards and a recipe. Out: the run's folder, written by rank 0.
 """
 
-import json
 import time
-from collections import defaultdict
-from collections.abc import Callable
-from contextlib import closing
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.utils.tensorboard import SummaryWriter
 
-from jobs.recipes import Recipe
-from model.checkpoint import Checkpoint, dumps, loads
+from jobs.cli import Failure
+from jobs.probes import look
+from jobs.run_folder import CHECKPOINT, Keeper, Run, find_checkpoint
+from jobs.tally import NotFinite, Tally
+from model.checkpoint import Checkpoint, dumps
 from model.schedule import phase
 from model.training import Training
 from model.weights import load_backbone, read_state_dict
 from pipeline import storage
-from pipeline.records import InputError
-from pipeline.stream import Reading, TrainingStream
+from pipeline.stream import Batch, Reading, TrainingStream, ready
 
-CHECKPOINT, CURVES = "last.pt", "metrics.jsonl"
+SECONDS_BETWEEN_REPORTS = 1.0
+BATCHES_READY = 2
+"Pairs of batches that wait for the step; decoding runs further ahead."
 Report = Callable[[dict[str, Any]], None]
-"Takes what a worker tells while it runs: `steps` done since the last time, and facts to show."
-
-
-@dataclass(frozen=True, kw_only=True)
-class Run:
-    """One training run: what is trained on what, and where it is kept."""
-
-    shards: str
-    "Folder or URI of the shards, as every worker can open it."
-    out: str
-    "Folder or URI of the run, likewise."
-    recipe: Recipe
-    weights: str | None = None
-    "State dict of torchvision's ResNet to start from."
-    checkpoint_minutes: float = 5.0
-    "A checkpoint is written at the end of the epoch in which so many minutes have passed, and of the last one."
+"Takes what a worker tells while it runs: `steps` done since the last time and facts to show, or a `note`."
+Found = tuple[str, Checkpoint] | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,28 +40,117 @@ class Place:
     world: int = 1
     device: str = "cpu"
     distribute: Callable[[nn.Module], nn.Module] = lambda module: module
+    share: Callable[[Found], Found] = lambda found: found
+    "Gives every worker what rank 0 has: all go on from one checkpoint, whatever each of them sees of the storage."
 
 
 def train_worker(run: Run, place: Place, report: Report) -> None:
-    """Train to the end of the recipe's schedule, from the run's checkpoint where there is one."""
-    recipe = run.recipe
-    stream = open_stream(run, place)
-    training, history = start(run, place, len(stream.classes))
-    epochs = recipe.schedule.epochs
-    if place.rank:
-        for epoch in range(len(history), epochs):
-            train_epoch(training, stream, recipe, epoch, place, report)
-        return
-    saved = time.monotonic()
-    with closing(Curves(run.out, len(history))) as curves:
-        for epoch in range(len(history), epochs):
-            history.append(train_epoch(training, stream, recipe, epoch, place, report))
-            curves.write(history)
-            if epoch + 1 == epochs or time.monotonic() - saved >= 60 * run.checkpoint_minutes:
-                storage.write_bytes(
-                    storage.join(run.out, CHECKPOINT), dumps(checkpoint(run, training, stream, history))
-                )
-                saved = time.monotonic()
+    """Train to the end of the recipe's schedule, from the run's checkpoint where there is one.
+
+    Raises Failure when training diverges; the last checkpoint is then one from before.
+    """
+    worker, epochs = Worker(run, place, report), run.recipe.schedule.epochs
+    with ExitStack() as stack:
+        keeper = stack.enter_context(closing(Keeper(run, worker.found))) if place.rank == 0 else None
+        for epoch in range(len(worker.history), epochs):
+            row = worker.epoch(epoch, keeper)
+            if keeper is None:
+                worker.over(row)
+                continue
+            if run.probe_epochs and ((epoch + 1) % run.probe_epochs == 0 or epoch + 1 == epochs):
+                row |= look(worker.training.learner.encoder, worker.stream)
+            worker.over(row)
+            keeper.epoch_over(worker.checkpoint, worker.history)
+
+
+class Worker:
+    """One training worker and where in the run it is."""
+
+    def __init__(self, run: Run, place: Place, report: Report) -> None:
+        self.run, self.place, self._report = run, place, report
+        self.stream = open_stream(run, place)
+        self.training = fresh(run, place, len(self.stream.classes))
+        if self.training.not_compiled is not None:
+            report({"note": f"not compiled, training goes on without: {self.training.not_compiled}"})
+        self.found = place.share(find_checkpoint(run) if place.rank == 0 else None)
+        self.history: list[dict[str, Any]] = []
+        "The rows of the epochs that are over."
+        self.tally = Tally()
+        if self.found is not None:
+            held = self.found[1]
+            self.training.load_state(held.state)
+            self.history, self.tally = list(held.history), Tally(held.step, held.running)
+
+    def epoch(self, epoch: int, keeper: Keeper | None) -> dict[str, Any]:
+        """The steps of one pass over the satellite view that are still to do; returns the epoch's row of metrics.jsonl."""
+        recipe, steps = self.run.recipe, self.stream.steps
+        told_at, told_steps = time.monotonic(), self.tally.steps
+        for images, labels in self.batches(epoch):
+            step = self.tally.steps
+            now = phase(recipe.schedule, epoch + step / steps)
+            # Dropout's random numbers are a function of seed, epoch, step and rank, however often a run was resumed.
+            seeds = np.random.SeedSequence([recipe.seed, epoch, step, self.place.rank])
+            torch.manual_seed(int(seeds.generate_state(1)[0]))
+            self.tally.add(self.training.step(images[0], labels[0], images[1], labels[1], now))
+            if time.monotonic() - told_at >= SECONDS_BETWEEN_REPORTS or step + 1 == steps:
+                facts = {"epoch": f"{epoch + 1}/{recipe.schedule.epochs}", "alpha": now.alpha}
+                self._tell(facts, self.tally.steps - told_steps)
+                told_at, told_steps = time.monotonic(), self.tally.steps
+            if keeper is not None and step + 1 < steps:
+                keeper.step_over(self.checkpoint)
+        return {
+            "epoch": epoch + 1, "step": (epoch + 1) * steps, "alpha": now.alpha,
+            "learning_rate_scale": now.rate_scale, "learning_rates": self.training.rates,
+            **self.means(), "images_per_second": self.speed, "seconds": self.tally.seconds,
+        }  # fmt: skip
+
+    def over(self, row: dict[str, Any]) -> None:
+        """The epoch of this row is over."""
+        self.history.append(row)
+        self.tally = Tally()
+
+    def checkpoint(self) -> Checkpoint:
+        """All that going on from here needs. Raises Failure where it would hold the ruins of a diverged run."""
+        self.means()
+        made = checkpoint(self.run, self.training, self.stream, self.history)
+        return replace(made, step=self.tally.steps, running=self.tally.running())
+
+    def means(self) -> dict[str, float]:
+        """Means of the epoch's measures so far; raises Failure where one is not finite."""
+        try:
+            return self.tally.means()
+        except NotFinite as error:
+            last = storage.join(self.run.out, CHECKPOINT)
+            raise Failure(
+                f"training diverged in epoch {len(self.history) + 1}, by step {self.tally.steps} of {self.stream.steps}: "
+                f"{error}, expected a finite number; {last}, where there is one, is from before; train anew into another --out "
+                "with lower learning rates or --precision float32"
+            ) from None
+
+    @property
+    def speed(self) -> float:
+        """Images per second of all workers, over the epoch so far."""
+        return self.tally.steps * 2 * self.run.recipe.batch_size * self.place.world / self.tally.seconds
+
+    def _tell(self, facts: dict[str, Any], steps: int) -> None:
+        rates = "/".join(f"{rate:.2g}" for rate in self.training.rates.values())
+        whole = {name: mean for name, mean in self.means().items() if "/" not in name}
+        self._report({"steps": steps} | facts | {"rates": rates, "images/s": self.speed} | whole)
+
+    def batches(self, epoch: int) -> Iterator[tuple[list[Tensor], list[Tensor]]]:
+        """Images and labels of both views on the device, ready before the step asks for them."""
+        device = self.training.device
+
+        def tensors(pair: tuple[Batch, Batch]) -> tuple[list[Tensor], list[Tensor]]:
+            images = [torch.from_numpy(batch.images_B3HW) for batch in pair]
+            labels = [torch.from_numpy(batch.location_B) for batch in pair]
+            if device.type == "cuda":  # from pinned memory the copy runs beside the computation
+                images = [tensor.pin_memory() for tensor in images]
+                labels = [tensor.pin_memory() for tensor in labels]
+            return images, labels
+
+        for images, labels in ready(map(tensors, self.stream.epoch(epoch, self.tally.steps)), BATCHES_READY):
+            yield [i.to(device, non_blocking=True) for i in images], [n.to(device, non_blocking=True) for n in labels]
 
 
 def open_stream(run: Run, place: Place) -> TrainingStream:
@@ -89,18 +165,9 @@ def open_stream(run: Run, place: Place) -> TrainingStream:
         augmentation=recipe.augmentation,
         seed=recipe.seed,
         threads=max(1, torch.get_num_threads()),
+        hold_out=recipe.hold_out,
     )
     return TrainingStream(run.shards, reading, place.rank, place.world)
-
-
-def start(run: Run, place: Place, locations: int) -> tuple[Training, list[dict[str, Any]]]:
-    """Networks and optimisers as the run's checkpoint has them, else fresh, and the rows of the epochs that are over."""
-    training = fresh(run, place, locations)
-    held = read_checkpoint(run)
-    if held is None:
-        return training, []
-    training.load_state(held.state)
-    return training, held.history
 
 
 def fresh(run: Run, place: Place, locations: int) -> Training:
@@ -109,34 +176,16 @@ def fresh(run: Run, place: Place, locations: int) -> Training:
     torch.manual_seed(recipe.seed)
     training = Training(
         recipe.network, recipe.optimisation, locations,
-        adversary=recipe.adversary, device=place.device, distribute=place.distribute,
+        adversary=recipe.adversary, device=place.device, distribute=place.distribute, precision=recipe.precision,
+        sync_bn=recipe.sync_bn and place.world > 1, compile_for=recipe.batch_size if run.compile else None,
     )  # fmt: skip
     if run.weights is not None:
         load_backbone(training.learner.encoder.backbone, read_state_dict(run.weights), run.weights)
     return training
 
 
-def read_checkpoint(run: Run) -> Checkpoint | None:
-    """The run's checkpoint, if it has one.
-
-    Raises InputError when it is of another recipe, CheckpointError when it is damaged.
-    """
-    path = storage.join(run.out, CHECKPOINT)
-    if not storage.exists(path):
-        return None
-    held = loads(storage.read_bytes(path), path)
-    # Through JSON, as the checkpoint has it: tuples become lists.
-    recipe = json.loads(json.dumps(asdict(run.recipe)))
-    changed = sorted(name for name in recipe | held.recipe if held.recipe.get(name) != recipe.get(name))
-    if changed:
-        raise InputError(
-            f"{path} was trained by recipe {held.recipe.get('name')} with another {', '.join(changed)}; choose another --out, "
-            "or the same recipe and settings to go on with it"
-        )
-    return held
-
-
 def checkpoint(run: Run, training: Training, stream: TrainingStream, history: list[dict[str, Any]]) -> Checkpoint:
+    """The run at the end of its last epoch in `history`."""
     return Checkpoint(
         network=run.recipe.network, recipe=asdict(run.recipe), locations=list(stream.classes),
         epoch=len(history), history=history, state=training.state(),
@@ -147,68 +196,3 @@ def untrained(run: Run) -> bytes:
     """The checkpoint of a run before its first step, however far it is: what training starts from, to compare with."""
     stream = open_stream(run, Place())
     return dumps(checkpoint(run, fresh(run, Place(), len(stream.classes)), stream, []))
-
-
-def train_epoch(
-    training: Training, stream: TrainingStream, recipe: Recipe, epoch: int, place: Place, report: Report
-) -> dict[str, Any]:
-    """One pass over the satellite view; returns the epoch's row of metrics.jsonl."""
-    # Dropout's random numbers are a function of seed, epoch and rank, on every device, however often a run was resumed.
-    torch.manual_seed(int(np.random.SeedSequence([recipe.seed, epoch, place.rank]).generate_state(1)[0]))
-    began = told = time.monotonic()
-    sums: dict[str, Tensor] = defaultdict(lambda: torch.zeros((), device=training.device))
-    untold = 0
-    now = phase(recipe.schedule, epoch)
-    for step, (drone, satellite) in enumerate(stream.epoch(epoch)):
-        now = phase(recipe.schedule, epoch + step / stream.steps)
-        images = [torch.from_numpy(batch.images_B3HW).to(training.device) for batch in (drone, satellite)]
-        labels = [torch.from_numpy(batch.location_B).to(training.device) for batch in (drone, satellite)]
-        for name, value in training.step(images[0], labels[0], images[1], labels[1], now).items():
-            sums[name] += value
-        untold += 1
-        if time.monotonic() - told >= 1 or step + 1 == stream.steps:
-            means = {name: float(value) / (step + 1) for name, value in sums.items()}
-            seconds = time.monotonic() - began
-            speed = (step + 1) * 2 * recipe.batch_size * place.world / seconds
-            rates = "/".join(f"{rate:.2g}" for rate in training.rates.values())
-            facts = {
-                "epoch": f"{epoch + 1}/{recipe.schedule.epochs}",
-                "alpha": now.alpha,
-                "rates": rates,
-                "images/s": speed,
-            }
-            report({"steps": untold} | facts | means)
-            told, untold = time.monotonic(), 0
-    return {
-        "epoch": epoch + 1, "step": (epoch + 1) * stream.steps, "alpha": now.alpha,
-        "learning_rate_scale": now.rate_scale, "learning_rates": training.rates,
-        **{name: float(value) / stream.steps for name, value in sums.items()},
-        "images_per_second": speed, "seconds": time.monotonic() - began,
-    }  # fmt: skip
-
-
-class Curves:
-    """The run's curves for people: RUN/metrics.jsonl whole after each epoch, and TensorBoard where RUN is on a disk."""
-
-    def __init__(self, out: str, epochs: int) -> None:
-        self._path = storage.join(out, CURVES)
-        self._board: SummaryWriter | None = None
-        if storage.is_local(out):
-            folder = storage.locate(storage.join(out, "tensorboard"))[1]
-            # What a killed run wrote after its last checkpoint is dropped, as it is from metrics.jsonl.
-            self._board = SummaryWriter(folder, purge_step=epochs + 1)
-
-    def write(self, history: list[dict[str, Any]]) -> None:
-        lines = "".join(json.dumps(row) + "\n" for row in history)
-        storage.write_bytes(self._path, lines.encode())
-        if self._board is not None:
-            row = history[-1]
-            flat = {name: value for name, value in row.items() if isinstance(value, float)}
-            flat |= {f"learning_rate/{group}": rate for group, rate in row["learning_rates"].items()}
-            for name, value in flat.items():
-                self._board.add_scalar(name, value, row["epoch"])
-            self._board.flush()
-
-    def close(self) -> None:
-        if self._board is not None:
-            self._board.close()

@@ -22,7 +22,7 @@ class CheckpointError(ValueError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Checkpoint:
-    """A run at the end of an epoch."""
+    """A run at the end of an epoch, or within one."""
 
     network: PVDAConfig
     recipe: dict[str, Any]
@@ -35,6 +35,10 @@ class Checkpoint:
     "One row per epoch, as metrics.jsonl has them."
     state: dict[str, Any]
     "As `Training.state` gives it; only `modules` where a checkpoint is not meant to be trained on."
+    step: int = 0
+    "Steps taken of the epoch that is not over."
+    running: dict[str, torch.Tensor] = dataclasses.field(default_factory=dict)
+    "Sums of that epoch's measures over these steps."
 
     @property
     def encoder_weights(self) -> dict[str, torch.Tensor]:

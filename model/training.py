@@ -1,20 +1,25 @@
 """The two-step update of PVDA, and the state that a checkpoint holds. Knows no Ray and no files.
 
-In: a batch of each view. Out: changed weights, and the losses of the step.
+In: a batch of each view. Out: changed weights, and the measures of the step, which stay on the device.
 Shapes: B images of a view, H x W pixels or cells, C channels of the maps, P rings, L locations.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import get_total_norm
 from torch.optim import SGD, Adam, AdamW, Optimizer
 
-from model.losses import DRONE, SATELLITE, adversarial_loss, feature_loss, location_loss, view_loss
+from model.losses import adversarial_terms, feature_loss, location_terms, view_terms
 from model.pvda import FeatureEncoder, LocationClassifier, PVDAConfig, ViewDiscriminator
 from model.schedule import Phase
+
+Module = TypeVar("Module", bound=nn.Module)
+VIEWS = ("drone", "satellite")
+Precision = Literal["auto", "float32", "bfloat16"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +64,9 @@ class Training:
     """Networks and optimisers of one run, and the iteration that moves them.
 
     `distribute` wraps each trained module (DDP over several workers); `adversary=False` leaves the discriminator out,
-    which is LPN.
+    which is LPN. With `sync_bn` BatchNorm's statistics are those of all workers' images. In `bfloat16` the networks'
+    products are computed so, under autocast, and weights, losses and updates stay float32; `auto` does it on CUDA.
+    With `compile_for` images of each view a step the networks are compiled; `not_compiled` says why they are not.
     """
 
     def __init__(
@@ -70,39 +77,45 @@ class Training:
         *,
         adversary: bool = True,
         device: torch.device | str = "cpu",
+        precision: Precision = "float32",
+        sync_bn: bool = False,
+        compile_for: int | None = None,
         distribute: Callable[[nn.Module], nn.Module] = lambda module: module,
     ) -> None:
         self.device = torch.device(device)
-        self.learner = Learner(config, locations).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.bfloat16 = precision == "bfloat16" or (precision == "auto" and self.device.type == "cuda")
+        self.learner = _placed(Learner(config, locations), self.device, sync_bn)
+        self.discriminator: ViewDiscriminator | None = None
+        if adversary:
+            discriminator = ViewDiscriminator(config, self.learner.encoder.backbone.channels)
+            self.discriminator = _placed(discriminator, self.device, sync_bn)
+        for module in self.modules.values():
+            module.train()
+        self.not_compiled = None if compile_for is None else self._compile(config.image_size, compile_for)
+        "Why the networks are not compiled though they should be."
         self._learner = distribute(self.learner)
-        encoder, rates = self.learner.encoder, optimisation
+        self._discriminator = None if self.discriminator is None else distribute(self.discriminator)
+        self.optimisers = self._optimisers(optimisation)
+
+    def _optimisers(self, rates: Optimisation) -> list[Optimizer]:
+        """Of encoder and classifier, and of D where there is one; every group knows the rate that it starts with."""
+
+        def group(name: str, module: nn.Module, rate: float) -> dict[str, Any]:
+            return {"params": list(module.parameters()), "start": rate, "name": name}
+
         groups = [
-            {"params": list(encoder.backbone.parameters()), "start": rates.backbone_rate, "name": "backbone"},
-            {"params": list(encoder.refine.parameters()), "start": rates.head_rate, "name": "head"},
-            {
-                "params": list(self.learner.classifier.parameters()),
-                "start": rates.classifier_rate,
-                "name": "classifier",
-            },
+            group("backbone", self.learner.encoder.backbone, rates.backbone_rate),
+            group("head", self.learner.encoder.refine, rates.head_rate),
+            group("classifier", self.learner.classifier, rates.classifier_rate),
         ]
-        self.optimisers: list[Optimizer] = [
+        optimisers: list[Optimizer] = [
             SGD(groups, lr=0.0, momentum=rates.momentum, nesterov=True, weight_decay=rates.weight_decay)
             if rates.kind == "sgd"
             else AdamW(groups, lr=0.0, weight_decay=rates.weight_decay)
         ]
-        self.discriminator: ViewDiscriminator | None = None
-        if adversary:
-            discriminator = ViewDiscriminator(config, encoder.backbone.channels)
-            self.discriminator = discriminator.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-            self._discriminator = distribute(self.discriminator)
-            own = {
-                "params": list(discriminator.parameters()),
-                "start": rates.discriminator_rate,
-                "name": "discriminator",
-            }
-            self.optimisers.append(Adam([own], lr=0.0))
-        for module in self.modules.values():
-            module.train()
+        if self.discriminator is not None:
+            optimisers.append(Adam([group("discriminator", self.discriminator, rates.discriminator_rate)], lr=0.0))
+        return optimisers
 
     @property
     def modules(self) -> dict[str, nn.Module]:
@@ -118,42 +131,85 @@ class Training:
     def step(
         self, images1_B3HW: Tensor, location1_B: Tensor, images2_B3HW: Tensor, location2_B: Tensor, now: Phase
     ) -> dict[str, Tensor]:
-        """One iteration: D takes a step on Eq. 2, then encoder and classifier one on Eq. 4. Returns detached scalars.
+        """One iteration: D takes a step on Eq. 2, then encoder and classifier one on Eq. 4.
 
         One encoder pass serves both steps; D sees both views in one batch, since BatchNorm over separate batches would
-        erase the very shift that it must see.
+        erase the very shift that it must see. Returns the step's measures, detached scalars that are still on the device:
+        each loss, whole and by view (and ring), how often D was right, and the length of each network's gradient.
         """
         for optimiser in self.optimisers:
             for group in optimiser.param_groups:
                 group["lr"] = group["start"] * now.rate_scale
-        maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = self._learner(images1_B3HW, images2_B3HW)
-        located = location_loss(logits1_BPL, location1_B, logits2_BPL, location2_B)
-        losses = {"location_loss": located}
-        total = located
+        with self._autocast():
+            maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = self._learner(images1_B3HW, images2_B3HW)
+        located_VP = location_terms(logits1_BPL, location1_B, logits2_BPL, location2_B)
+        total = located_VP.sum()
+        measures = {"location_loss": total} | _named("location_loss", located_VP)
         if self.discriminator is not None:
             both_BCHW = torch.cat([maps1_BCHW, maps2_BCHW])
-            losses |= self._discriminate(both_BCHW.detach(), len(maps1_BCHW))
+            measures |= self.discriminate(both_BCHW.detach(), len(maps1_BCHW))
             # D's weights are constants of the second step; its BatchNorm stays in training mode.
             self.discriminator.requires_grad_(False)
-            adversarial = adversarial_loss(*self.discriminator(both_BCHW).tensor_split([len(maps1_BCHW)]))
+            with self._autocast():
+                verdict_B2 = self.discriminator(both_BCHW)
             self.discriminator.requires_grad_(True)
-            total = feature_loss(located, adversarial, now.alpha)
-            losses["adversarial_loss"] = adversarial
+            adversarial_V = adversarial_terms(*verdict_B2.tensor_split([len(maps1_BCHW)]))
+            adversarial = adversarial_V.sum()
+            total = feature_loss(total, adversarial, now.alpha)
+            measures |= {"adversarial_loss": adversarial} | _named("adversarial_loss", adversarial_V)
         self.optimisers[0].zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
+        for name, module in (("encoder", self.learner.encoder), ("classifier", self.learner.classifier)):
+            measures[f"gradient_norm/{name}"] = gradient_norm(module)
         self.optimisers[0].step()
-        return {name: loss.detach() for name, loss in losses.items()}
+        return {name: measure.detach() for name, measure in measures.items()}
 
-    def _discriminate(self, both_BCHW: Tensor, drones: int) -> dict[str, Tensor]:
-        """Step 1: move D towards telling the views apart."""
-        verdict_B2 = self._discriminator(both_BCHW)
-        loss = view_loss(*verdict_B2.tensor_split([drones]))
+    def discriminate(self, both_BCHW: Tensor, drones: int) -> dict[str, Tensor]:
+        """Step 1: move D towards telling the views apart; the first `drones` maps are the UAV's."""
+        assert self._discriminator is not None
+        with self._autocast():
+            verdict_B2 = self._discriminator(both_BCHW)
+        verdicts = verdict_B2.tensor_split([drones])
+        terms_V = view_terms(*verdicts)
+        loss = terms_V.sum()
         self.optimisers[1].zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
+        norm = gradient_norm(self._discriminator)
         self.optimisers[1].step()
-        truth_B = torch.full((len(verdict_B2),), SATELLITE, device=verdict_B2.device)
-        truth_B[:drones] = DRONE
-        return {"view_loss": loss, "discriminator_accuracy": (verdict_B2.argmax(1) == truth_B).float().mean()}
+        right_V = [(verdict_B2.argmax(1) == view).float() for view, verdict_B2 in enumerate(verdicts)]
+        return (
+            {"view_loss": loss, "discriminator_accuracy": torch.cat(right_V).mean()}
+            | {"gradient_norm/discriminator": norm}
+            | _named("view_loss", terms_V)
+            | _named("discriminator_accuracy", torch.stack([right_B.mean() for right_B in right_V]))
+        )
+
+    def _compile(self, size: int, count: int) -> str | None:
+        """Compile the networks in place, and try them: torch compiles at the first call. Returns why it cannot."""
+        networks = [self.learner] + ([self.discriminator] if self.discriminator is not None else [])
+        held = [{name: tensor.clone() for name, tensor in network.state_dict().items()} for network in networks]
+        images_B3HW = torch.zeros(count, 3, size, size, dtype=torch.uint8, device=self.device)
+        images_B3HW = images_B3HW.to(memory_format=torch.channels_last)
+        try:
+            for network in networks:
+                network.compile()
+            with self._autocast():
+                maps1_BCHW, maps2_BCHW, *logits = self.learner(images_B3HW, images_B3HW)
+                if self.discriminator is not None:
+                    logits.append(self.discriminator(torch.cat([maps1_BCHW, maps2_BCHW])))
+            sum(one.float().mean() for one in logits).backward()
+        except Exception as error:  # the compiler's own kinds, the C++ compiler's, the driver's
+            for network in networks:
+                network._compiled_call_impl = None  # torch has no public way back
+            return f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error).strip() else ''}"
+        finally:  # the trial left its marks on BatchNorm's statistics
+            for network, state in zip(networks, held, strict=True):
+                network.load_state_dict(state)
+                network.zero_grad(set_to_none=True)
+        return None
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16)
 
     def state(self) -> dict[str, Any]:
         """Everything that the next step depends on, besides the data's order, as tensors and plain values."""
@@ -170,3 +226,26 @@ class Training:
         for optimiser, held in zip(self.optimisers, state["optimisers"], strict=True):
             optimiser.load_state_dict(held)
         torch.set_rng_state(state["rng"])
+
+
+def gradient_norm(module: nn.Module) -> Tensor:
+    """Length of a network's gradient, all its parameters taken as one vector."""
+    return get_total_norm([parameter.grad for parameter in module.parameters() if parameter.grad is not None])
+
+
+def _placed(module: Module, device: torch.device, sync_bn: bool) -> Module:
+    if sync_bn:
+        module = nn.SyncBatchNorm.convert_sync_batchnorm(module)  # type: ignore[no-untyped-call]
+    return module.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
+
+
+def _named(name: str, terms: Tensor) -> dict[str, Tensor]:
+    """The terms of a measure by view (V,), and by ring where it has any (V, P)."""
+    if terms.dim() == 1:
+        return {f"{name}/{view}": term for view, term in zip(VIEWS, terms.unbind(), strict=True)}
+    rings = {
+        f"{name}/{view}/ring{ring}": term
+        for view, terms_P in zip(VIEWS, terms.unbind(), strict=True)
+        for ring, term in enumerate(terms_P.unbind(), start=1)
+    }
+    return _named(name, terms.sum(1)) | rings

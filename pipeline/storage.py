@@ -102,6 +102,32 @@ def atomic(path: str) -> Iterator[IO[bytes]]:
         temporary.unlink(missing_ok=True)
 
 
+def copy(source: str, target: str) -> None:
+    """A second name for a file's content on the same storage, all or nothing; both must be written whole from then on.
+
+    On a local disk a hard link, which costs nothing, where the disk has them.
+    """
+    filesystem, inner = locate(source)
+    other = locate(target)[1]
+    if not isinstance(filesystem, LocalFileSystem):
+        filesystem.copy(inner, other)
+        return
+    temporary = Path(other).with_name(f".{Path(other).name}.{uuid.uuid4().hex[:8]}")
+    try:
+        os.link(inner, temporary)
+    except OSError:
+        write_bytes(target, read_bytes(source))
+    else:
+        temporary.replace(other)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def remove(path: str) -> None:
+    filesystem, inner = locate(path)
+    filesystem.rm_file(inner)
+
+
 def write_bytes(path: str, data: bytes) -> None:
     with atomic(path) as stream:
         stream.write(data)

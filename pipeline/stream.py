@@ -17,12 +17,14 @@ import numpy.typing as npt
 from webdataset.tariterators import group_by_keys, tar_file_expander
 
 from pipeline import storage
+from pipeline.hold_out import held_out, without
 from pipeline.records import InputError, Split, View
 from pipeline.shards import Manifest, Shard, read_manifest
 from pipeline.transforms import Augmentation, DecodeError, Pixels, augment, decode, resize
 
 In = TypeVar("In")
 Out = TypeVar("Out")
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,9 +91,11 @@ def plan_pass(shards: Sequence[Shard], wanted: int, rank: int, world: int, rng: 
     return spans
 
 
-def read_spans(shards: str, spans: Iterable[Span]) -> Iterator[Sample]:
+def read_spans(shards: str, spans: Iterable[Span], left_out: frozenset[str] = frozenset()) -> Iterator[Sample]:
+    """The spans' samples; those of the locations that are left out do not count as there."""
     for span in spans:
-        yield from islice(read_shard(shards, span.name), span.start, span.stop)
+        samples = (sample for sample in read_shard(shards, span.name) if sample.facts["location"] not in left_out)
+        yield from islice(samples, span.start, span.stop)
 
 
 def shuffled(samples: Iterable[Sample], buffer: int, rng: np.random.Generator) -> Iterator[Sample]:
@@ -123,6 +127,19 @@ def ahead(function: Callable[[In], Out], items: Iterable[In], threads: int, dept
             pool.shutdown(cancel_futures=True)
 
 
+def ready(items: Iterable[Item], depth: int) -> Iterator[Item]:
+    """The items in order, made by a thread of their own, `depth` of them before they are asked for."""
+    source, end = iter(items), object()
+    with ThreadPoolExecutor(1) as pool:
+        waiting: deque[Future[Any]] = deque(pool.submit(next, source, end) for _ in range(depth))
+        try:
+            while (item := waiting.popleft().result()) is not end:
+                waiting.append(pool.submit(next, source, end))
+                yield item
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reading:
     """How training images are read."""
@@ -137,6 +154,8 @@ class Reading:
     "Encoded images held for shuffling; those of University-1652 take some 40 kB each."
     threads: int = 2
     "That decode and augment ahead of the network."
+    hold_out: float = 0.0
+    "Share of the locations that is left out: `held_out` of the stream."
 
 
 class TrainingStream:
@@ -151,10 +170,14 @@ class TrainingStream:
     def __init__(self, shards: str, reading: Reading, rank: int = 0, world: int = 1) -> None:
         self.shards, self.reading, self.rank, self.world = shards, reading, rank, world
         self.manifest: Manifest = read_manifest(shards)
-        self.classes = {location: number for number, location in enumerate(self.manifest.classes)}
-        counts = {
-            view: sum(s.samples for s in self.manifest.of(Split.TRAIN, view)) for view in (View.DRONE, View.SATELLITE)
+        self.held_out = held_out(self.manifest.classes, reading.hold_out)
+        kept = [location for location in self.manifest.classes if location not in self.held_out]
+        self.classes = {location: number for number, location in enumerate(kept)}
+        self._shards = {
+            view: without(shards, self.manifest.of(Split.TRAIN, view), self.held_out)
+            for view in (View.DRONE, View.SATELLITE)
         }
+        counts = {view: sum(shard.samples for shard in found) for view, found in self._shards.items()}
         together = reading.batch_size * world
         self.steps = counts[View.SATELLITE] // together
         "Steps of an epoch, the same for every rank."
@@ -164,18 +187,21 @@ class TrainingStream:
                 f"least one batch of {together} satellite images and some of the UAV; pack more, or train with a smaller batch"
             )
 
-    def epoch(self, epoch: int) -> Iterator[tuple[Batch, Batch]]:
-        """The (UAV, satellite) batches of one epoch, a pure function of seed, epoch, rank and world."""
-        return zip(self._view(View.DRONE, epoch), self._view(View.SATELLITE, epoch), strict=True)
+    def epoch(self, epoch: int, skip: int = 0) -> Iterator[tuple[Batch, Batch]]:
+        """The (UAV, satellite) batches of one epoch, a pure function of seed, epoch, rank and world.
 
-    def _view(self, view: View, epoch: int) -> Iterator[Batch]:
+        The first `skip` batches are left out, without decoding them; those that follow are what they always are.
+        """
+        return zip(self._view(View.DRONE, epoch, skip), self._view(View.SATELLITE, epoch, skip), strict=True)
+
+    def _view(self, view: View, epoch: int, skip: int) -> Iterator[Batch]:
         reading, wanted = self.reading, self.steps * self.reading.batch_size
         number = list(View).index(view)
         # The plan is every rank's alike; the order within a rank is its own.
         plan_rng = np.random.default_rng([reading.seed, epoch, number])
-        spans = plan_pass(self.manifest.of(Split.TRAIN, view), wanted, self.rank, self.world, plan_rng)
+        spans = plan_pass(self._shards[view], wanted, self.rank, self.world, plan_rng)
         order_rng = np.random.default_rng([reading.seed, epoch, number, self.rank])
-        samples = shuffled(read_spans(self.shards, spans), reading.shuffle_buffer, order_rng)
+        samples = shuffled(read_spans(self.shards, spans, self.held_out), reading.shuffle_buffer, order_rng)
 
         def prepare(numbered: tuple[int, Sample]) -> tuple[Sample, Pixels]:
             position, sample = numbered
@@ -183,8 +209,9 @@ class TrainingStream:
             rng = np.random.default_rng([reading.seed, epoch, number, self.rank, position])
             return sample, augment(decode(sample.data), view, reading.image_size, reading.augmentation, rng)
 
-        ready = ahead(prepare, enumerate(samples), reading.threads, 4 * reading.batch_size)
-        while group := list(islice(ready, reading.batch_size)):
+        numbered = islice(enumerate(samples), skip * reading.batch_size, None)
+        prepared = ahead(prepare, numbered, reading.threads, 4 * reading.batch_size)
+        while group := list(islice(prepared, reading.batch_size)):
             labels = [self.classes[sample.facts["location"]] for sample, _ in group]
             yield Batch(
                 images_B3HW=stack([image for _, image in group]),

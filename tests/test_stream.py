@@ -33,9 +33,10 @@ from pipeline.stream import (
     plan_pass,
     read_shard,
     read_spans,
+    ready,
     shuffled,
 )  # fmt: skip
-from pipeline.transforms import Augmentation, DecodeError
+from pipeline.transforms import Augmentation, DecodeError, decode
 
 CLASSES = ("0003", "0008", "0839", "Aa")
 SATELLITES, DRONES = 21, 40
@@ -179,6 +180,27 @@ def test_work_ahead_runs_beside_the_consumer_and_hands_on_an_error_at_its_place(
         next(results)
 
 
+def test_items_are_ready_before_they_are_asked_for_and_no_more_than_so_many() -> None:
+    made, third = count(), Event()
+
+    def source() -> Iterator[int]:
+        while (number := next(made)) < 10:
+            if number == 3:
+                third.set()
+            if number == 6:
+                raise DecodeError("damaged image", "here")
+            yield number
+
+    items = ready(source(), depth=3)
+    assert next(items) == 0
+    assert third.wait(10)  # while nobody asks
+    assert next(made) == 4
+    assert [next(items) for _ in range(4)] == [1, 2, 3, 5]
+    with pytest.raises(DecodeError, match="here"):
+        next(items)
+    assert list(ready(range(5), depth=9)) == list(range(5))
+
+
 def test_a_shard_reads_back_as_it_was_packed(shards: str) -> None:
     samples = list(read_shard(shards, "train-satellite-000002"))
     assert [held.key for held in samples] == [held.facts["key"] for held in samples]
@@ -259,6 +281,23 @@ def test_an_epoch_can_be_seen_without_those_before_it(shards: str) -> None:
     for number in (0, 1):
         last = list(stream.epoch(number))
     assert [pair[1].keys for pair in last] == [pair[1].keys for pair in epoch(shards, 1)]
+
+
+@pytest.mark.parametrize("skip", [0, 1, 4, 5])
+def test_an_epoch_can_be_entered_at_any_step_and_goes_on_as_it_would_have(
+    shards: str, skip: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lively = replace(PLAIN, augmentation=Augmentation(pad=2), shuffle_buffer=7)
+    whole = epoch(shards, 2, reading=lively)
+    opened = count()
+    monkeypatch.setattr("pipeline.stream.decode", lambda data: (next(opened), decode(data))[1])
+    rest = list(TrainingStream(shards, lively).epoch(2, skip))
+    assert len(rest) == len(whole) - skip
+    assert next(opened) == 2 * 4 * len(rest)  # what is skipped is not decoded
+    for pair, same in zip(whole[skip:], rest, strict=True):
+        for batch, other in zip(pair, same, strict=True):
+            assert batch.keys == other.keys
+            assert np.array_equal(batch.images_B3HW, other.images_B3HW)
 
 
 def test_labels_are_the_manifests_class_numbers_and_images_those_of_their_keys(shards: str) -> None:

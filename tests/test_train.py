@@ -9,8 +9,9 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from jobs.recipes import Recipe, paper, smoke
+from jobs.run_folder import Run, read_checkpoint
 from jobs.train import Settings, refuse_unknown_recipe, train
-from jobs.training_loop import Run, read_checkpoint, untrained
+from jobs.training_loop import untrained
 from model.checkpoint import CheckpointError, build_encoder, loads
 from pipeline.records import InputError
 
@@ -72,34 +73,6 @@ def test_a_finished_run_is_left_alone_and_another_recipe_refused(
     assert "nothing to do" in capsys.readouterr().err
     with pytest.raises(InputError, match="with another schedule; choose another --out"):
         train(settings(tiny_shards, tmp_path, tiny(3)))
-
-
-def test_a_killed_run_goes_on_to_the_same_weights(
-    tiny_shards: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    train(settings(tiny_shards, tmp_path / "whole", tiny(3)))
-
-    import jobs.training_loop as loop
-
-    real = loop.train_epoch
-
-    def killed(*arguments: object) -> dict[str, object]:
-        if arguments[3] == 2:
-            raise KeyboardInterrupt
-        return real(*arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(loop, "train_epoch", killed)
-    with pytest.raises(KeyboardInterrupt):
-        train(settings(tiny_shards, tmp_path / "killed", tiny(3)))
-    monkeypatch.setattr(loop, "train_epoch", real)
-    assert [row["epoch"] for row in rows(tmp_path / "killed")] == [1, 2]
-    train(settings(tiny_shards, tmp_path / "killed", tiny(3)))
-    assert [row["epoch"] for row in rows(tmp_path / "killed")] == [1, 2, 3]
-    whole, again = weights(tmp_path / "whole"), weights(tmp_path / "killed")
-    assert all(torch.equal(whole[name], again[name]) for name in whole)
-    assert [r["location_loss"] for r in rows(tmp_path / "whole")] == [
-        r["location_loss"] for r in rows(tmp_path / "killed")
-    ]
 
 
 def test_ray_train_takes_the_same_steps_as_this_process(tiny_shards: str, tmp_path: Path, ray_cluster: None) -> None:

@@ -199,7 +199,7 @@ def test_with_alpha_zero_encoder_and_classifier_become_what_they_are_without_an_
 
 def test_without_an_adversary_there_is_no_discriminator() -> None:
     plain = make(adversary=False)
-    assert set(plain.step(*batch(), NOW)) == {"location_loss"}
+    assert {name.split("/")[0] for name in plain.step(*batch(), NOW)} == {"location_loss", "gradient_norm"}
     assert plain.discriminator is None
     assert len(plain.optimisers) == 1
     assert set(plain.modules) == {"encoder", "classifier"}
@@ -234,12 +234,46 @@ def test_the_optimisers_are_those_of_the_paper_unless_a_short_run_asks_for_adamw
 
 def test_a_step_tells_its_losses_and_how_often_the_discriminator_was_right() -> None:
     training = make()
-    losses = training.step(*batch(), NOW)
-    assert set(losses) == {"location_loss", "view_loss", "adversarial_loss", "discriminator_accuracy"}
-    assert not any(loss.requires_grad for loss in losses.values())
+    measures = training.step(*batch(), NOW)
+    whole = {"location_loss", "view_loss", "adversarial_loss", "discriminator_accuracy"}
+    assert {name for name in measures if "/" not in name} == whole
+    assert not any(measure.requires_grad for measure in measures.values())
     for seed in range(12):  # brightness gives the views away, and the encoder is held
-        losses = training.step(*batch(seed), Phase(alpha=0.0, rate_scale=1.0))
-    assert float(losses["discriminator_accuracy"]) == 1.0
+        measures = training.step(*batch(seed), Phase(alpha=0.0, rate_scale=1.0))
+    for name in ("discriminator_accuracy", "discriminator_accuracy/drone", "discriminator_accuracy/satellite"):
+        assert float(measures[name]) == 1.0
+
+
+def test_the_losses_of_views_and_rings_add_up_to_the_whole() -> None:
+    measures = {name: float(value) for name, value in make().step(*batch(0, 2, 4), NOW).items()}
+    for name in ("location_loss", "view_loss", "adversarial_loss"):
+        assert measures[f"{name}/drone"] + measures[f"{name}/satellite"] == pytest.approx(measures[name])
+    for view in ("drone", "satellite"):
+        rings = [measures[f"location_loss/{view}/ring{ring}"] for ring in (1, 2)]
+        assert sum(rings) == pytest.approx(measures[f"location_loss/{view}"])
+    right = [measures[f"discriminator_accuracy/{view}"] for view in ("drone", "satellite")]
+    assert measures["discriminator_accuracy"] == pytest.approx((2 * right[0] + 4 * right[1]) / 6)
+
+
+def test_the_length_of_each_networks_gradient_is_told() -> None:
+    training = make()
+    measures = training.step(*batch(), NOW)
+    for name, module in training.modules.items():
+        gradients = [parameter.grad for parameter in module.parameters() if parameter.grad is not None]
+        length = torch.cat([gradient.flatten() for gradient in gradients]).norm()
+        torch.testing.assert_close(measures[f"gradient_norm/{name}"], length, rtol=1e-3, atol=0.0)
+
+
+def test_in_bfloat16_weights_and_losses_stay_float32_and_the_step_is_nearly_the_same() -> None:
+    torch.manual_seed(0)
+    half = Training(TINY, Optimisation(), LOCATIONS, precision="bfloat16")
+    whole = make()
+    rough, exact = half.step(*batch(), NOW), whole.step(*batch(), NOW)
+    assert {measure.dtype for measure in rough.values()} == {torch.float32}
+    assert {parameter.dtype for parameter in half.learner.parameters()} == {torch.float32}
+    assert float(rough["location_loss"]) == pytest.approx(float(exact["location_loss"]), rel=0.05)
+    assert rough["location_loss"] != exact["location_loss"]
+    assert not Training(TINY, Optimisation(), LOCATIONS, precision="auto").bfloat16  # on a CPU
 
 
 def test_the_location_loss_falls_when_the_same_images_come_again_and_again() -> None:
