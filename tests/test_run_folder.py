@@ -105,9 +105,6 @@ def test_a_run_that_was_killed_goes_on_to_the_same_bits(
     assert (held.epoch, held.step) == {(0.0, 1): (1, 1), (60.0, 1): (1, 0), (60.0, 2): (2, 0)}[minutes, epochs]
     train(settings(tiny_shards, tmp_path, **changes))
     assert_same_run(tmp_path, undisturbed)
-    board = EventAccumulator(str(tmp_path / "tensorboard"))
-    board.Reload()
-    assert [event.step for event in board.Scalars("location_loss")] == [1, 2, 3]
 
 
 def test_a_process_killed_at_a_random_moment_and_run_again_ends_as_if_nothing_had_happened(
@@ -128,6 +125,9 @@ def test_a_process_killed_at_a_random_moment_and_run_again_ends_as_if_nothing_ha
     process.wait()
     subprocess.run(command(tmp_path / "killed"), check=True, **quiet)
     assert_same_run(tmp_path / "killed", tmp_path / "whole")
+    board = EventAccumulator(str(tmp_path / "killed" / "tensorboard"))
+    board.Reload()
+    assert [event.step for event in board.Scalars("location_loss")] == [1, 2, 3]
 
 
 def test_a_ray_worker_killed_is_replaced_and_the_run_goes_on_from_the_last_checkpoint(

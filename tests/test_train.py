@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from jobs.cli import Failure
 from jobs.recipes import Recipe, paper, smoke
 from jobs.run_folder import Run, read_checkpoint
 from jobs.train import Settings, refuse_unknown_recipe, train
@@ -79,9 +80,50 @@ def test_ray_train_takes_the_same_steps_as_this_process(tiny_shards: str, tmp_pa
     train(settings(tiny_shards, tmp_path / "here", tiny(1)))
     train(settings(tiny_shards, tmp_path / "ray", tiny(1), workers=1))
     here, there = weights(tmp_path / "here"), weights(tmp_path / "ray")
-    # Another number of threads may sum in another order.
-    assert all(torch.allclose(here[name].float(), there[name].float(), atol=1e-4) for name in here)
+    # Another number of threads may sum in another order, and AdamW makes whole steps of a last bit's sign.
+    assert all(torch.allclose(here[name].float(), there[name].float(), atol=1e-3, rtol=1e-3) for name in here)
+    [one], [other] = rows(tmp_path / "here"), rows(tmp_path / "ray")
+    assert one["location_loss"] == pytest.approx(other["location_loss"], rel=1e-4)
     assert [row["epoch"] for row in rows(tmp_path / "ray")] == [1]
+
+
+def test_synchronised_batchnorm_without_gpus_is_refused(tiny_shards: str, tmp_path: Path, ray_cluster: None) -> None:
+    recipe = replace(tiny(1), sync_bn=True)
+    with pytest.raises(InputError, match="2 workers have no GPUs, expected GPUs"):
+        train(settings(tiny_shards, tmp_path, recipe, workers=2))
+
+
+def test_what_a_ray_worker_refuses_comes_back_as_it_was_said_and_is_not_tried_again(
+    tiny_shards: str, tmp_path: Path, ray_cluster: None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rates = replace(tiny(1).optimisation, backbone_rate=1e30, head_rate=1e30, classifier_rate=1e30)
+    with pytest.raises(Failure, match="training diverged in epoch 1"):
+        train(settings(tiny_shards, tmp_path, replace(tiny(1), optimisation=rates), workers=1, checkpoint_minutes=60.0))
+    assert "lost a worker" not in capfd.readouterr().err
+    assert not (tmp_path / "last.pt").exists()
+
+
+def test_a_row_tells_each_loss_by_view_and_ring_gradients_and_the_view_gap_and_tensorboard_shows_it(
+    tiny_shards: str, tmp_path: Path
+) -> None:
+    train(settings(tiny_shards, tmp_path, replace(tiny(2), hold_out=0.5), probe_epochs=2))
+    first, second = rows(tmp_path)
+    wanted = {f"location_loss/{view}/ring{ring}" for view in ("drone", "satellite") for ring in (1, 2)}
+    wanted |= {f"{loss}/{view}" for loss in ("location_loss", "view_loss", "adversarial_loss", "discriminator_accuracy")
+               for view in ("drone", "satellite")}  # fmt: skip
+    wanted |= {f"gradient_norm/{network}" for network in ("encoder", "classifier", "discriminator")}
+    assert wanted <= set(first)
+    looked = {
+        "view_gap/accuracy",
+        "view_gap/distance",
+        "held_out/drone_to_satellite/r1",
+        "held_out/satellite_to_drone/ap",
+    }
+    assert not looked & set(first)
+    assert looked <= set(second)
+    board = EventAccumulator(str(tmp_path / "tensorboard"))
+    board.Reload()
+    assert wanted | looked <= set(board.Tags()["scalars"])
 
 
 def test_two_ray_workers_train_one_network(tiny_shards: str, tmp_path: Path, ray_cluster: None) -> None:
