@@ -1,7 +1,7 @@
 """How every job starts and ends: a command line derived from its settings, one sentence and exit code 2 on bad input."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import tyro
@@ -11,11 +11,11 @@ from pipeline.progress import console
 from pipeline.records import InputError
 
 
-def run(job: Callable[..., Any], check: Callable[[Sequence[str]], None] = lambda arguments: None) -> None:
+def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lambda arguments: arguments) -> None:
     """Parse the command line for `job` (its parameters, or its one settings dataclass) and run it.
 
-    `check` may refuse the raw arguments with a better sentence than the parser has. Exits 0 when the output is complete, 2
-    on a wrong call or unusable input, 1 on failure.
+    `reword` may say the arguments in the parser's words, or refuse them with a better sentence than the parser has. Exits
+    0 when the output is complete, 2 on a wrong call or unusable input, 1 on failure.
     """
     config = (
         tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes,
@@ -23,8 +23,7 @@ def run(job: Callable[..., Any], check: Callable[[Sequence[str]], None] = lambda
         tyro.conf.EnumChoicesFromValues,  # `--view drone`
     )  # fmt: skip
     try:
-        check(sys.argv[1:])
-        tyro.cli(job, config=config)
+        tyro.cli(job, args=reword(sys.argv[1:]), config=config)
     except (InputError, CheckpointError) as error:
         _say(str(error))
         sys.exit(2)

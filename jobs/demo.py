@@ -27,6 +27,7 @@ from pipeline.progress import console
 from pipeline.records import Split, View
 from pipeline.shards import PackingSettings, pack
 from pipeline.simulate import SimulationSettings, simulate
+from pipeline.sources.university1652 import University1652
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +68,7 @@ def demo(settings: Settings) -> list[dict[str, Any]]:
             )
         )
     with step(seconds, "2 pack", "images into webdataset shards"):
-        pack(PackingSettings(source="university1652", root=flights, out=shards))
+        pack(University1652(), PackingSettings(root=flights, out=shards))
     with step(seconds, "3 train", "PVDA from scratch by recipe smoke: small, quick, the same two-step method"):
         recipe = smoke(epochs=settings.epochs)
         checkpoint = train(TrainSettings(recipe=recipe, shards=shards, out=trained))

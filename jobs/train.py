@@ -5,7 +5,6 @@ RUN/tensorboard. Killed, it goes on from the last checkpoint when run again; whe
 """
 
 import threading
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import count
 from typing import TYPE_CHECKING, Any
@@ -212,10 +211,11 @@ def show(meter: Meter, told: dict[str, Any]) -> None:
         meter.advance(facts.pop("steps"), **facts)
 
 
-def refuse_unknown_recipe(arguments: Sequence[str]) -> None:
-    """Name the recipes where the first word is none of them."""
+def known_recipe(arguments: list[str]) -> list[str]:
+    """The arguments as they are; where the first word is no recipe, an InputError that names them."""
     if arguments and not arguments[0].startswith("-") and arguments[0] not in RECIPES:
         raise InputError(f"unknown recipe {arguments[0]!r}, expected one of: {', '.join(RECIPES)}; see train.py --help")
+    return arguments
 
 
 def main(settings: Settings) -> None:
@@ -224,4 +224,4 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    run(main, refuse_unknown_recipe)
+    run(main, known_recipe)

@@ -43,26 +43,39 @@ class GeoTag:
     heading_deg: float | None = None
     "Direction in which the camera looks, degrees clockwise from north."
     pitch_deg: float | None = None
-    "Angle of the optical axis below the horizon, degrees: -90 looks straight down."
+    "Angle of the optical axis above the horizon, degrees: -90 looks straight down."
+    footprint: tuple[tuple[float, float], ...] | None = None
+    "Corners (lat, lon) of the ground shown, from the image's upper left clockwise, where they are known."
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageRecord:
-    """One image as a source found it; nothing has been read of it yet but its path."""
+    """One image as a source found it; its pixels have not been read."""
 
     path: str
-    "Where the bytes are; a plain path or a URI."
+    "The file it is, or is a part of; a plain path or a URI."
+    part: str = ""
+    "Which part of the file, in its source's words; empty where it is the whole file."
     split: Split
     view: View
     location: str
     "The label: the folder's name, never an index."
     geotag: GeoTag | None = None
+    taken_at: str | None = None
+    "When, ISO 8601; without an offset it is the camera's own clock."
+    bytes: int | None = None
+    "Size of the file; None where the image is a part of one."
 
     @property
     def key(self) -> str:
         """Name of this image in the data set: `[a-z0-9_-]+`, derived from split, view, location and file name alone."""
-        stem = self.path.rsplit("/", 1)[-1].rsplit(".", 1)[0]
+        stem = self.part or self.path.rsplit("/", 1)[-1].rsplit(".", 1)[0]
         return make_key(self.split, self.view, self.location, stem)
+
+    @property
+    def name(self) -> str:
+        """What a person would look for: the path, and which part of it."""
+        return f"{self.path}#{self.part}" if self.part else self.path
 
 
 def make_key(split: Split, view: View, location: str, stem: str) -> str:

@@ -19,7 +19,8 @@ import webdataset
 from pipeline import cluster, storage
 from pipeline.progress import console, progress
 from pipeline.records import REJECTED_SCHEMA, ImageRecord, InputError, Rejection, Split, View
-from pipeline.sources import SOURCES
+from pipeline.sources import name_of
+from pipeline.sources.source import Source
 from pipeline.transforms import DecodeError, decode
 
 SCHEMA_VERSION = 1
@@ -30,8 +31,6 @@ MANIFEST, REJECTED = "manifest.json", "rejected.parquet"
 class PackingSettings:
     """Which imagery becomes shards, and where."""
 
-    source: str
-    "Layout of the imagery: university1652."
     root: str
     "Where the imagery is."
     out: str
@@ -42,8 +41,6 @@ class PackingSettings:
     "Refused images over all images; above it the job stops."
 
     def __post_init__(self) -> None:
-        if self.source not in SOURCES:
-            raise InputError(f"--source is {self.source!r}, expected one of: {', '.join(SOURCES)}")
         if self.samples_per_shard < 1:
             raise InputError(f"--samples-per-shard is {self.samples_per_shard}, expected at least 1")
         if not 0 <= self.max_bad_fraction <= 1:
@@ -118,7 +115,7 @@ def plan_shards(records: Iterable[ImageRecord], samples_per_shard: int) -> tuple
     return plans, rejected
 
 
-def write_shard(plan: ShardPlan, source: str, out: str) -> tuple[Shard, list[Rejection]]:
+def write_shard(plan: ShardPlan, source: Source, out: str) -> tuple[Shard, list[Rejection]]:
     """Write one tar atomically; images that cannot be decoded are left out and returned."""
     rejected, samples = [], 0
     with storage.atomic(storage.join(out, f"{plan.name}.tar")) as stream:
@@ -142,24 +139,22 @@ def write_shard(plan: ShardPlan, source: str, out: str) -> tuple[Shard, list[Rej
     return shard, rejected
 
 
-def read_sample(record: ImageRecord, source: str) -> dict[str, Any]:
+def read_sample(record: ImageRecord, source: Source) -> dict[str, Any]:
     """An image's bytes and JSON as a webdataset sample.
 
     Raises DecodeError when the bytes are no image.
     """
     try:
-        data = storage.read_bytes(record.path)
+        data = source.read(record)
     except OSError as error:
         raise DecodeError("unreadable file", str(error)) from None
     height, width = decode(data).shape[:2]
     said = {
         "key": record.key, "location": record.location, "view": record.view, "split": record.split,
         "geotag": None if record.geotag is None else asdict(record.geotag),
-        "source": source, "sha256": hashlib.sha256(data).hexdigest(), "width": width, "height": height,
+        "source": name_of(source), "sha256": hashlib.sha256(data).hexdigest(), "width": width, "height": height,
     }  # fmt: skip
-    ending = record.path.rsplit(".", 1)[-1].lower()
-    ending = {"jpeg": "jpg", "tiff": "tif"}.get(ending, ending)
-    return {"__key__": record.key, ending: data, "json": json.dumps(said, ensure_ascii=False).encode()}
+    return {"__key__": record.key, source.ending(record): data, "json": json.dumps(said, ensure_ascii=False).encode()}
 
 
 class _Hashed:
@@ -183,14 +178,15 @@ class _Hashed:
         """Whoever opened the stream closes it."""
 
 
-def pack(settings: PackingSettings) -> Manifest:
+def pack(source: Source, settings: PackingSettings) -> Manifest:
     """Pack a source's imagery; a finished set is left as it is.
 
     Raises InputError on unusable input, TooManyRejected when more than `max_bad_fraction` of the images are refused.
     """
     out = storage.absolute(settings.out)
     said = {
-        "source": settings.source,
+        "source": name_of(source),
+        **json.loads(json.dumps(asdict(source))),
         "root": storage.absolute(settings.root),
         "samples_per_shard": settings.samples_per_shard,
     }
@@ -205,7 +201,7 @@ def pack(settings: PackingSettings) -> Manifest:
         return manifest
     records: list[ImageRecord] = []
     rejected: list[Rejection] = []
-    for found in SOURCES[settings.source](settings.root):
+    for found in source.scan(settings.root):
         if isinstance(found, Rejection):
             rejected.append(found)
         else:
@@ -217,7 +213,7 @@ def pack(settings: PackingSettings) -> Manifest:
     cluster.connect()
     task = ray.remote(num_cpus=1)(write_shard)
     with progress(len(records), "packing") as meter:
-        calls = cluster.bounded(lambda plan: task.remote(plan, settings.source, out), plans, 2 * cluster.cpus())
+        calls = cluster.bounded(lambda plan: task.remote(plan, source, out), plans, 2 * cluster.cpus())
         for plan, (shard, refused) in calls:
             shards.append(shard)
             rejected += refused

@@ -46,12 +46,32 @@ def names(folder: str) -> list[str]:
     return sorted(name for name in found if not name.startswith("."))
 
 
-def walk(folder: str) -> list[str]:
-    """Paths, relative to the folder, of all files below it, sorted; hidden ones left out."""
+def walk(folder: str) -> dict[str, int]:
+    """Paths, relative to the folder, of all files below it, sorted, with their sizes in bytes; hidden ones left out.
+
+    Links are followed, but not in circles.
+    """
     filesystem, inner = locate(folder)
     root = inner.rstrip("/") + "/"
-    below = (path.removeprefix(root) for path in filesystem.find(inner))
-    return sorted(path for path in below if not any(part.startswith(".") for part in path.split("/")))
+    if isinstance(filesystem, LocalFileSystem):
+        found = dict(_walk_disk(inner, frozenset()))
+    else:
+        found = {path: entry["size"] for path, entry in filesystem.find(inner, detail=True).items()}
+    below = ((path.removeprefix(root), size) for path, size in found.items())
+    return {path: size for path, size in sorted(below) if not any(part.startswith(".") for part in path.split("/"))}
+
+
+def _walk_disk(folder: str, above: frozenset[str]) -> Iterator[tuple[str, int]]:
+    """All files below a folder of this machine; links whose target is gone have size 0. `above`: the folders on the way."""
+    real = os.path.realpath(folder)
+    if real in above:
+        return
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_dir():
+                yield from _walk_disk(entry.path, above | {real})
+            else:
+                yield entry.path, entry.stat().st_size if entry.is_file() else 0
 
 
 def is_folder(path: str) -> bool:

@@ -39,9 +39,10 @@ def tiny_world(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) -> P
 def tiny_shards(tmp_path_factory: pytest.TempPathFactory, tiny_world: Path) -> str:
     """That data set as shards of 8 images."""
     from pipeline.shards import PackingSettings, pack
+    from pipeline.sources.university1652 import University1652
 
     out = str(tmp_path_factory.mktemp("shards"))
-    pack(PackingSettings(source="university1652", root=str(tiny_world), out=out, samples_per_shard=8))
+    pack(University1652(), PackingSettings(root=str(tiny_world), out=out, samples_per_shard=8))
     return out
 
 

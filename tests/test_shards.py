@@ -18,11 +18,11 @@ from PIL import Image
 from pipeline import storage
 from pipeline.records import ImageRecord, InputError, Split, View
 from pipeline.shards import PackingSettings, TooManyRejected, pack, plan_shards, read_manifest
-from pipeline.sources import university1652
+from pipeline.sources.university1652 import University1652
 
 
 def settings(root: Path, out: Path, **changes: object) -> PackingSettings:
-    given = {"source": "university1652", "root": str(root), "out": str(out), "samples_per_shard": 8}
+    given = {"root": str(root), "out": str(out), "samples_per_shard": 8}
     return PackingSettings(**(given | changes))  # type: ignore[arg-type]
 
 
@@ -79,13 +79,13 @@ def test_packing_again_gives_the_same_bytes_and_a_finished_set_is_left_alone(
     tmp_path: Path, ray_cluster: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sample_set(tmp_path / "root")
-    first = pack(settings(tmp_path / "root", tmp_path / "a", samples_per_shard=3))
-    second = pack(settings(tmp_path / "root", tmp_path / "b", samples_per_shard=3))
+    first = pack(University1652(), settings(tmp_path / "root", tmp_path / "a", samples_per_shard=3))
+    second = pack(University1652(), settings(tmp_path / "root", tmp_path / "b", samples_per_shard=3))
     assert first.shards == second.shards
-    assert pack(settings(tmp_path / "root", tmp_path / "a", samples_per_shard=3)) == first
+    assert pack(University1652(), settings(tmp_path / "root", tmp_path / "a", samples_per_shard=3)) == first
     assert "nothing to do" in capsys.readouterr().err
     with pytest.raises(InputError, match="another samples_per_shard"):
-        pack(settings(tmp_path / "root", tmp_path / "a", samples_per_shard=4))
+        pack(University1652(), settings(tmp_path / "root", tmp_path / "a", samples_per_shard=4))
 
 
 def test_bad_files_are_refused_with_reasons_and_the_rest_is_packed(tmp_path: Path, ray_cluster: None) -> None:
@@ -99,7 +99,7 @@ def test_bad_files_are_refused_with_reasons_and_the_rest_is_packed(tmp_path: Pat
     (drone / "Thumbs.db").write_bytes(b"x")
     jpeg(root / "train/drone/stray.jpeg")
     jpeg(drone / "image-00.jpg")  # the key of image-00.jpeg
-    manifest = pack(settings(root, tmp_path / "out", max_bad_fraction=0.9))
+    manifest = pack(University1652(), settings(root, tmp_path / "out", max_bad_fraction=0.9))
     assert sum(shard.samples for shard in manifest.shards) == 8
     assert manifest.rejected == 6
     rows = pq.read_table(tmp_path / "out/rejected.parquet").to_pylist()
@@ -114,7 +114,7 @@ def test_too_many_bad_files_stop_the_job_and_no_manifest_is_left(tmp_path: Path,
     sample_set(tmp_path / "root")
     (tmp_path / "root/train/drone/0001/empty.jpeg").write_bytes(b"")
     with pytest.raises(TooManyRejected, match=r"1 of 9 images were refused.*empty file \(1\)"):
-        pack(settings(tmp_path / "root", tmp_path / "out"))
+        pack(University1652(), settings(tmp_path / "root", tmp_path / "out"))
     assert (tmp_path / "out/rejected.parquet").exists()
     with pytest.raises(InputError, match="not a finished set of shards"):
         read_manifest(str(tmp_path / "out"))
@@ -122,16 +122,16 @@ def test_too_many_bad_files_stop_the_job_and_no_manifest_is_left(tmp_path: Path,
 
 def test_a_missing_and_an_empty_folder_are_told_apart(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no folder"):
-        list(university1652.scan(str(tmp_path / "nowhere")))
+        list(University1652().scan(str(tmp_path / "nowhere")))
     with pytest.raises(InputError, match="no images below"):
-        list(university1652.scan(str(tmp_path)))
+        list(University1652().scan(str(tmp_path)))
 
 
 def test_street_images_come_when_asked_for(tmp_path: Path) -> None:
     sample_set(tmp_path)
     jpeg(tmp_path / "train/street/0001/1.jpg")
-    assert len(list(university1652.scan(str(tmp_path)))) == 8
-    assert len(list(university1652.scan(str(tmp_path), tuple(View)))) == 9
+    assert len(list(University1652().scan(str(tmp_path)))) == 8
+    assert len(list(University1652(views=tuple(View)).scan(str(tmp_path)))) == 9
 
 
 def test_a_damaged_manifest_is_refused_with_the_remedy(tmp_path: Path, tiny_shards: str) -> None:
@@ -165,7 +165,7 @@ def test_a_packed_png_keeps_its_kind(tmp_path: Path, ray_cluster: None) -> None:
     path = tmp_path / "root/train/satellite/0001/0001.PNG"
     path.parent.mkdir(parents=True)
     Image.fromarray(np.zeros((8, 9, 3), np.uint8)).save(path)
-    pack(settings(tmp_path / "root", tmp_path / "out"))
+    pack(University1652(), settings(tmp_path / "root", tmp_path / "out"))
     shutil.rmtree(tmp_path / "root")
     with tarfile.open(tmp_path / "out/train-satellite-000000.tar") as tar:
         png = tar.extractfile("train-satellite-0001-0001.png")

@@ -23,7 +23,7 @@ def test_what_is_written_is_read_back_and_listed(folder: str) -> None:
     assert storage.exists(path)
     assert storage.read_json(path) == {"é": [1, 2]}
     assert storage.names(storage.join(folder, "deep")) == ["a.json"]
-    assert storage.walk(folder) == ["deep/a.json"]
+    assert list(storage.walk(folder)) == ["deep/a.json"]
     assert storage.is_folder(folder)
 
 

@@ -22,6 +22,7 @@ from PIL import Image
 from pipeline import storage
 from pipeline.records import ImageRecord, InputError, Split, View
 from pipeline.shards import MANIFEST, Manifest, Shard, ShardPlan, write_shard
+from pipeline.sources.university1652 import University1652
 from pipeline.stream import (
     Batch,
     Reading,
@@ -68,7 +69,7 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> str:
                 view=view,
                 records=tuple(every[start : start + size]),
             )
-            written.append(write_shard(plan, "test", out)[0])
+            written.append(write_shard(plan, University1652(), out)[0])
     manifest = Manifest(shards=tuple(written), classes=CLASSES, packing={}, rejected=0)
     storage.write_json(storage.join(out, MANIFEST), asdict(manifest))
     return out

@@ -11,7 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from jobs.cli import Failure
 from jobs.recipes import Recipe, paper, smoke
 from jobs.run_folder import Run, read_checkpoint
-from jobs.train import Settings, refuse_unknown_recipe, train
+from jobs.train import Settings, known_recipe, train
 from jobs.training_loop import untrained
 from model.checkpoint import CheckpointError, build_encoder, loads
 from pipeline.records import InputError
@@ -159,8 +159,8 @@ def test_too_few_images_for_a_batch_are_told_before_anything_starts(tiny_shards:
 
 def test_an_unknown_recipe_is_answered_with_the_known_ones() -> None:
     with pytest.raises(InputError, match="unknown recipe 'papr', expected one of: paper, paper_384, lpn, "):
-        refuse_unknown_recipe(["papr", "--shards", "x"])
-    refuse_unknown_recipe(["--help"])
+        known_recipe(["papr", "--shards", "x"])
+    assert known_recipe(["--help"]) == ["--help"]
 
 
 def test_the_paper_recipe_is_the_papers() -> None:

@@ -1,9 +1,12 @@
-"""Imagery as found on disk -> ImageRecords; one file per layout."""
+"""Imagery as found -> ImageRecords; one file per layout."""
 
-from collections.abc import Callable, Iterator
+from pipeline.sources.source import Source
+from pipeline.sources.university1652 import University1652
 
-from pipeline.records import ImageRecord, Rejection
-from pipeline.sources import university1652
+SOURCES: dict[str, type[Source]] = {"university1652": University1652}
+"By the name that `--source` takes."
 
-SOURCES: dict[str, Callable[[str], Iterator[ImageRecord | Rejection]]] = {"university1652": university1652.scan}
-"By the name that `--source` takes: root folder -> its images, and what cannot be one."
+
+def name_of(source: Source) -> str:
+    """The name that `--source` takes for a source."""
+    return next(name for name, kind in SOURCES.items() if type(source) is kind)

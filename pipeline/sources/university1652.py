@@ -7,9 +7,11 @@
 import csv
 import io
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 from pipeline import storage
 from pipeline.records import GeoTag, ImageRecord, InputError, Rejection, Split, View
+from pipeline.sources.source import Source, is_image, not_an_image
 
 FOLDERS: dict[str, tuple[Split, View]] = {
     f"{phase}/{folder}": (split, view)
@@ -21,40 +23,42 @@ FOLDERS: dict[str, tuple[Split, View]] = {
     for view in View
     for folder in [f"{prefix}{view}"]
 }
-IMAGE_NAMES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
-VIEWS = (View.DRONE, View.SATELLITE)
-"The views that PVDA is trained and tested on; street and google are left out unless asked for."
 
 
-def scan(root: str, views: tuple[View, ...] = VIEWS) -> Iterator[ImageRecord | Rejection]:
-    """All images of the data set, in the order of their paths; nothing is opened.
+@dataclass(frozen=True, kw_only=True)
+class University1652(Source):
+    """University-1652, official layout."""
 
-    Raises InputError when `root` is no such data set.
-    """
-    if not storage.is_folder(root):
-        raise InputError(f"no folder {root}; expected University-1652's root, which holds train and test; check --root")
-    tags = read_geotags(root)
-    found = False
-    for folder, (split, view) in FOLDERS.items():
-        below = storage.join(root, folder)
-        if view not in views or not storage.is_folder(below):
-            continue
-        for path in storage.walk(below):
-            location, _, name = path.rpartition("/")
-            whole = storage.join(below, path)
-            if not location or "/" in location:
-                yield Rejection(path=whole, reason="wrong folder", found=f"{path} is not <location>/<image>")
-            elif not name.lower().endswith(IMAGE_NAMES):
-                yield Rejection(path=whole, reason="not an image's name", found=name)
-            else:
-                found = True
-                tag = tags.get(f"{folder}/{path}") or tags.get(location)
-                yield ImageRecord(path=whole, split=split, view=view, location=location, geotag=tag)
-    if not found:
-        raise InputError(
-            f"no images below {root}; expected train/{{satellite,drone}}/<location>/ and "
-            "test/{query,gallery}_{satellite,drone}/<location>/; check --root"
-        )
+    views: tuple[View, ...] = (View.DRONE, View.SATELLITE)
+    "Views that are taken. PVDA is trained and tested on these two; street and google are there for who asks for them."
+
+    def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
+        if not storage.is_folder(root):
+            raise InputError(
+                f"no folder {root}; expected University-1652's root, which holds train and test; check --root"
+            )
+        tags = read_geotags(root)
+        found = False
+        for folder, (split, view) in FOLDERS.items():
+            below = storage.join(root, folder)
+            if view not in self.views or not storage.is_folder(below):
+                continue
+            for path, size in storage.walk(below).items():
+                location, _, name = path.rpartition("/")
+                whole = storage.join(below, path)
+                if not location or "/" in location:
+                    yield Rejection(path=whole, reason="wrong folder", found=f"{path} is not <location>/<image>")
+                elif not is_image(name):
+                    yield not_an_image(whole)
+                else:
+                    found = True
+                    tag = tags.get(f"{folder}/{path}") or tags.get(location)
+                    yield ImageRecord(path=whole, split=split, view=view, location=location, geotag=tag, bytes=size)
+        if not found:
+            raise InputError(
+                f"no images below {root}; expected train/{{satellite,drone}}/<location>/ and "
+                "test/{query,gallery}_{satellite,drone}/<location>/; check --root"
+            )
 
 
 def read_geotags(root: str) -> dict[str, GeoTag]:
