@@ -32,9 +32,10 @@ from model.schedule import phase
 from model.training import Optimisation, Training
 from model.weights import load_backbone
 from pipeline.metrics import summarise
+from pipeline.packing import PackingSettings, pack
 from pipeline.ranking import Side, rank, side_of_array
 from pipeline.records import Split, View
-from pipeline.shards import PackingSettings, pack, read_manifest
+from pipeline.shards import read_manifest
 from pipeline.simulate import SimulationSettings, simulate
 from pipeline.sources.university1652 import University1652
 from pipeline.stream import Reading, TrainingStream, decoded

@@ -23,7 +23,9 @@ from model.losses import adversarial_terms, location_terms
 from model.schedule import Phase
 from pipeline import storage
 from pipeline.records import ImageRecord, Split, View
-from pipeline.shards import MANIFEST, Manifest, ShardPlan, write_shard
+from pipeline.shard_plan import ShardPlan
+from pipeline.shard_writing import write_shard
+from pipeline.shards import MANIFEST, Manifest
 from pipeline.sources.university1652 import University1652
 
 NOW = Phase(alpha=0.9, rate_scale=0.01)
@@ -46,7 +48,7 @@ def made_shards(folder: str, side: int, images: int) -> str:
             Image.fromarray(image.astype(np.uint8)).save(path, quality=90)
             records.append(ImageRecord(path=path, split=Split.TRAIN, view=view, location=f"{number:04d}"))
         plan = ShardPlan(name=f"train-{view}-000000", split=Split.TRAIN, view=view, records=tuple(records))
-        written.append(write_shard(plan, University1652(), folder)[0])
+        written.append(write_shard(plan, University1652(), folder, "").shard)
     classes = tuple(f"{number:04d}" for number in range(images))
     manifest = Manifest(shards=tuple(written), classes=classes, packing={}, rejected=0)
     storage.write_json(storage.join(folder, MANIFEST), asdict(manifest))

@@ -23,9 +23,9 @@ from pipeline.embed import EmbeddingSettings, embed_gallery
 from pipeline.evaluation import EvaluationSettings, evaluate
 from pipeline.features import open_table
 from pipeline.index import Index, IndexSettings, build_index
+from pipeline.packing import PackingSettings, pack
 from pipeline.progress import console
 from pipeline.records import Split, View
-from pipeline.shards import PackingSettings, pack
 from pipeline.simulate import SimulationSettings, simulate
 from pipeline.sources.university1652 import University1652
 

@@ -1,14 +1,23 @@
-"""Imagery -> shards: `make_shards.py --source university1652 --root DIR --out DIR`."""
+"""Imagery -> shards: `make_shards.py --source university1652 --root DIR --out DIR`.
 
+And of a finished set: `make_shards.py --verify --out DIR` checks every byte, `make_shards.py --export FILE --out DIR` writes
+its record table as Parquet or GeoJSON.
+"""
+
+import sys
 from typing import TYPE_CHECKING
 
 import tyro
 
 from jobs.cli import Failure, run
+from pipeline import shard_records, storage
+from pipeline.packing import PackingSettings, TooManyRejected, pack
+from pipeline.progress import console
 from pipeline.records import InputError
-from pipeline.shards import PackingSettings, TooManyRejected, pack
+from pipeline.shards import read_manifest
 from pipeline.sources import SOURCES
 from pipeline.sources.source import Source
+from pipeline.verification import verify as verify_shards
 
 if TYPE_CHECKING:
     SourceChoice = Source
@@ -25,7 +34,6 @@ def source_as_subcommand(arguments: list[str]) -> list[str]:
 
     Raises InputError where no such source is.
     """
-    rest = list(arguments)
     for place, word in enumerate(arguments):
         name, equals, value = word.partition("=")
         if name != "--source":
@@ -33,18 +41,57 @@ def source_as_subcommand(arguments: list[str]) -> list[str]:
         chosen = value if equals else "".join(arguments[place + 1 : place + 2])
         if chosen not in SOURCES:
             raise InputError(f"--source is {chosen!r}, expected one of: {', '.join(SOURCES)}")
-        del rest[place : place + (1 if equals else 2)]
-        return [chosen, *rest]
-    return rest
+        return [chosen, *arguments[:place], *arguments[place + (1 if equals else 2) :]]
+    return arguments
 
 
 def main(source: SourceChoice, packing: PackingSettings) -> None:
-    """Pack imagery into webdataset shards. Begin with `--source NAME`; `--source NAME --help` lists its flags."""
+    """Pack imagery into webdataset shards.
+
+    Begin with `--source NAME`; `--source NAME --help` lists its flags. `--verify --out DIR` checks a finished set,
+    `--export FILE --out DIR` writes its record table as .parquet or .geojson.
+    """
     try:
         pack(source, packing)
     except TooManyRejected as error:
         raise Failure(str(error)) from None
 
 
+def check(out: str, verify: bool) -> None:
+    """Check every tar, count and hash of a finished set of shards.
+
+    Args:
+        out: Folder or URI of the shards.
+        verify: Said to ask for this.
+    """
+    count, wrong = verify_shards(out)
+    for sentence in wrong:
+        console.print(sentence, markup=False)
+    if wrong:
+        raise Failure(
+            f"{out} is damaged in {len(wrong)} places; delete the tars that are named and run the command that packed "
+            "them again: it makes only what is missing"
+        )
+    console.print(f"{out}: all {count} shards are what was packed", markup=False)
+
+
+def export(out: str, export: str) -> None:
+    """Write the record table of a finished set of shards.
+
+    Args:
+        out: Folder or URI of the shards.
+        export: The file: .parquet, or .geojson with a point for each image whose place is known.
+    """
+    written, without = shard_records.export(storage.absolute(out), read_manifest(out), export)
+    console.print(
+        f"{export}: {written} images" + (f", {without} without a place left out" if without else ""), markup=False
+    )
+
+
 if __name__ == "__main__":
-    run(main, source_as_subcommand)
+    if "--verify" in sys.argv:
+        run(check)
+    elif any(word.partition("=")[0] == "--export" for word in sys.argv):
+        run(export)
+    else:
+        run(main, source_as_subcommand)

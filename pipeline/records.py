@@ -5,8 +5,6 @@ import re
 from dataclasses import dataclass
 from enum import StrEnum
 
-import pyarrow as pa
-
 
 class InputError(Exception):
     """Input that cannot be used. The message is one sentence for a person: what was found, what was expected, what
@@ -78,14 +76,20 @@ class ImageRecord:
         return f"{self.path}#{self.part}" if self.part else self.path
 
 
+LONGEST_KEY = 90
+"A tar header of the oldest kind holds names of 100 characters, ending included."
+
+
 def make_key(split: Split, view: View, location: str, stem: str) -> str:
     """Key of an image: stable under re-sharding, without dots (webdataset cuts a name at the first one).
 
-    Where a character had to be replaced, eight digits of the original name's hash keep two names apart.
+    Where a character had to be replaced or the end cut off, eight digits of the original name's hash keep two names apart.
     """
     named = f"{split}-{view}-{location}-{stem}"
     slug = re.sub(r"[^a-z0-9_-]", "_", named.lower())
-    return slug if slug == named else f"{slug}-{hashlib.sha256(named.encode()).hexdigest()[:8]}"
+    if slug == named and len(slug) <= LONGEST_KEY:
+        return slug
+    return f"{slug[: LONGEST_KEY - 9]}-{hashlib.sha256(named.encode('utf-8', 'surrogateescape')).hexdigest()[:8]}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +101,3 @@ class Rejection:
     "Short and countable: the same words for the same fault."
     found: str
     "What this file held, for the person who mends it."
-
-
-REJECTED_SCHEMA = pa.schema([("path", pa.string()), ("reason", pa.string()), ("found", pa.string())])

@@ -38,7 +38,7 @@ def tiny_world(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) -> P
 @pytest.fixture(scope="session")
 def tiny_shards(tmp_path_factory: pytest.TempPathFactory, tiny_world: Path) -> str:
     """That data set as shards of 8 images."""
-    from pipeline.shards import PackingSettings, pack
+    from pipeline.packing import PackingSettings, pack
     from pipeline.sources.university1652 import University1652
 
     out = str(tmp_path_factory.mktemp("shards"))

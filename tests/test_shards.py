@@ -16,8 +16,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pipeline import storage
+from pipeline.packing import PackingSettings, TooManyRejected, pack
 from pipeline.records import ImageRecord, InputError, Split, View
-from pipeline.shards import PackingSettings, TooManyRejected, pack, plan_shards, read_manifest
+from pipeline.shard_plan import ShardSize, plan_shards
+from pipeline.shards import read_manifest
 from pipeline.sources.university1652 import University1652
 
 
@@ -151,14 +153,14 @@ def test_a_damaged_manifest_is_refused_with_the_remedy(tmp_path: Path, tiny_shar
 )
 def test_a_plan_holds_every_image_once_in_shards_of_one_kind(images: list[tuple[Split, View, int]], size: int) -> None:
     records = [ImageRecord(path=f"/{n}.jpg", split=s, view=v, location="l") for s, v, n in images]
-    plans, twice = plan_shards(records, size)
+    plans, twice = plan_shards(records, ShardSize(samples_per_shard=size))
     assert not twice
     assert sorted(r.key for plan in plans for r in plan.records) == sorted(r.key for r in records)
     assert all(
         len(plan.records) <= size and {(r.split, r.view) for r in plan.records} == {(plan.split, plan.view)}
         for plan in plans
     )
-    assert plan_shards(reversed(records), size)[0] == plans
+    assert plan_shards(reversed(records), ShardSize(samples_per_shard=size))[0] == plans
 
 
 def test_a_packed_png_keeps_its_kind(tmp_path: Path, ray_cluster: None) -> None:

@@ -1,0 +1,286 @@
+"""Imagery -> shards: the stage. Tars are packed by Ray tasks, several at once; what is there already is left as it is.
+
+In: a source and a root. Out: tars, their record table, `rejected.parquet`, and last of all `manifest.json`. The same input
+gives the same bytes whatever the parallelism, and however often packing was killed and begun again.
+"""
+
+import json
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import ray
+
+from pipeline import cluster, rejects, storage
+from pipeline.duplicates import COLUMNS, find_duplicates
+from pipeline.extension import new_records, next_numbers
+from pipeline.progress import console, progress
+from pipeline.records import ImageRecord, InputError, Rejection, Split
+from pipeline.shard_plan import ShardPlan, ShardSize, plan_shards
+from pipeline.shard_records import FOLDER, Packed, read_packed, read_part
+from pipeline.shard_writing import UNREADABLE, Check, write_shard
+from pipeline.shards import MANIFEST, Manifest, read_manifest
+from pipeline.sources import name_of
+from pipeline.sources.source import Source
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackingSettings:
+    """Which imagery becomes shards, and where."""
+
+    root: str
+    "Where the imagery is."
+    out: str
+    "Folder or URI for the shards."
+    samples_per_shard: int = 1000
+    "Images per tar at most."
+    megabytes_per_shard: float | None = None
+    "Megabytes (1e6 bytes) of images per tar at most; None for any number."
+    max_bad_fraction: float = 0.01
+    "Refused images over all images; above it the job stops."
+    check: Check = "quick"
+    "How images are judged: quick, by their headers and ends, or full, by decoding them: finds every damage and takes long."
+    extend: bool = False
+    "Add the imagery to the finished set in `out`, as new tars."
+    workers: int | None = None
+    "Tars packed at once, each by a Ray task; None for as many as there are cores, 0 for one after the other in this process."
+
+    def __post_init__(self) -> None:
+        if self.samples_per_shard < 1:
+            raise InputError(f"--samples-per-shard is {self.samples_per_shard}, expected at least 1")
+        if self.megabytes_per_shard is not None and not self.megabytes_per_shard > 0:
+            raise InputError(f"--megabytes-per-shard is {self.megabytes_per_shard}, expected more than 0")
+        if not 0 <= self.max_bad_fraction <= 1:
+            raise InputError(f"--max-bad-fraction is {self.max_bad_fraction}, expected a fraction from 0 to 1")
+        if self.workers is not None and self.workers < 0:
+            raise InputError(f"--workers is {self.workers}, expected 0 (this process) or more")
+
+
+class TooManyRejected(RuntimeError):
+    """More images were refused than `max_bad_fraction` allows."""
+
+
+@dataclass
+class Haul:
+    """What a source gave, and what has been refused of it so far."""
+
+    records: list[ImageRecord]
+    rejected: list[Rejection]
+    found: int
+    "Images before any were sorted out."
+    known: int = 0
+    "Images that the set held already."
+
+
+def pack(source: Source, settings: PackingSettings) -> Manifest:
+    """Pack a source's imagery; a finished set is left as it is, an unfinished one is gone on with.
+
+    Raises InputError on unusable input, TooManyRejected when more than `max_bad_fraction` of the images are refused.
+    """
+    began, out, said = time.monotonic(), storage.absolute(settings.out), describe(source, settings)
+    before = finished(settings, said)
+    if before is not None and not settings.extend:
+        console.print(f"{settings.out} is complete: {len(before.shards)} shards; nothing to do", markup=False)
+        return before
+    haul = gather(source, settings.root)
+    if before is not None:
+        haul.records, refused, haul.known = new_records(haul.records, source, out, before)
+        haul.rejected += refused
+    size = ShardSize(
+        samples_per_shard=settings.samples_per_shard,
+        megabytes_per_shard=settings.megabytes_per_shard,
+        numbered_from={} if before is None else next_numbers(before),
+    )
+    plans, refused = plan_shards(haul.records, size)
+    haul.rejected += refused
+    old = frozenset() if before is None else frozenset(shard.name for shard in before.shards)
+    clear(out, old.union(plan.name for plan in plans))
+    scanned = time.monotonic()
+    packed = pack_plans(plans, source, settings, said, haul)
+    # Whether two images are the same is known when all have been read: the tars of the second ones are written again.
+    tables = (read_part(out, name, COLUMNS) for name in sorted(old.union(packed)))
+    doubles = find_duplicates(tables, settled=old) if packed else {}
+    again = [plan for plan in plans if plan.name in doubles]
+    packed |= pack_plans(again, source, settings, said, haul, doubles)
+    haul.rejected += [rejection for done in packed.values() for rejection in done.rejected]
+    judge(settings, haul.rejected, haul.found)
+    rejects.write(out, haul.rejected, keep=before is not None)
+    manifest = compose(before, said, packed, haul)
+    storage.write_json(storage.join(out, MANIFEST), asdict(manifest))
+    sum_up(settings, packed, haul, scanned - began, time.monotonic() - scanned)
+    return manifest
+
+
+def describe(source: Source, settings: PackingSettings) -> dict[str, Any]:
+    """What of the settings decides what is packed."""
+    flags = json.loads(json.dumps(asdict(source)))
+    packing = {name: getattr(settings, name) for name in ("samples_per_shard", "megabytes_per_shard", "check")}
+    return {"source": name_of(source), **flags, "root": storage.absolute(settings.root), **packing}
+
+
+def finished(settings: PackingSettings, said: dict[str, Any]) -> Manifest | None:
+    """The manifest of the set in `out`, where there is a whole one.
+
+    Raises InputError when it is another set than the settings ask for, or when there is nothing that could be extended.
+    """
+    out = settings.out
+    if not storage.exists(storage.join(out, MANIFEST)):
+        if settings.extend:
+            raise InputError(
+                f"{out} holds no finished set of shards; expected one to extend; pack it without --extend first"
+            )
+        return None
+    manifest = read_manifest(out)
+    if not settings.extend and manifest.packing != said:
+        changed = ", ".join(name for name in said if manifest.packing.get(name) != said[name])
+        raise InputError(
+            f"{out} holds shards packed with another {changed}; choose another --out, delete it, or add to it with --extend"
+        )
+    sizes = storage.walk(out)
+    damaged = [
+        shard.name
+        for shard in manifest.shards
+        if sizes.get(f"{shard.name}.tar") != shard.bytes or f"{FOLDER}/{shard.name}.parquet" not in sizes
+    ]
+    if not damaged:
+        return manifest
+    if settings.extend or manifest.added:
+        raise InputError(
+            f"{len(damaged)} shards of {out} are missing or have another size than its manifest says, {damaged[0]} first, and "
+            "it was extended, or is to be; put them back from a copy, or pack all anew to another --out"
+        )
+    console.print(f"{out}: {len(damaged)} shards are missing or have another size; they are packed again", markup=False)
+    return None
+
+
+def gather(source: Source, root: str) -> Haul:
+    """All that a source finds; what has a name that cannot be written down is refused here."""
+    records: list[ImageRecord] = []
+    rejected: list[Rejection] = []
+    for found in source.scan(root):
+        name = found.path if isinstance(found, Rejection) else f"{found.name}{found.location}"
+        if not _is_text(name):
+            told = found.path.encode("utf-8", "backslashreplace").decode()
+            rejected.append(Rejection(path=told, reason="name is not UTF-8", found=told.rsplit("/", 1)[-1]))
+        elif isinstance(found, Rejection):
+            rejected.append(found)
+        else:
+            records.append(found)
+    return Haul(records=records, rejected=rejected, found=len(records) + len(rejected))
+
+
+def _is_text(name: str) -> bool:
+    try:
+        name.encode()
+    except UnicodeEncodeError:  # bytes of a file's name that are no UTF-8 come as lone surrogates
+        return False
+    return True
+
+
+def clear(out: str, wanted: frozenset[str]) -> None:
+    """Take away tars that an unfinished packing with other settings left; they are known by their record parts."""
+    for name in storage.names(storage.join(out, FOLDER)):
+        stem = name.removesuffix(".parquet")
+        if stem not in wanted:
+            tar = storage.join(out, f"{stem}.tar")
+            if storage.exists(tar):
+                storage.remove(tar)
+            storage.remove(storage.join(out, FOLDER, name))
+
+
+def pack_plans(
+    plans: Sequence[ShardPlan],
+    source: Source,
+    settings: PackingSettings,
+    said: dict[str, Any],
+    haul: Haul,
+    doubles: Mapping[str, dict[str, str]] | None = None,
+) -> dict[str, Packed]:
+    """Each plan's tar, by name: as it is there already, or else packed now. With `doubles`, without these and in any case.
+
+    Raises TooManyRejected as soon as that is certain.
+    """
+    out, packed = storage.absolute(settings.out), {}
+    digests = {plan.name: plan.digest(said) for plan in plans}
+    if doubles is None:
+        sizes = storage.walk(out) if storage.is_folder(out) else {}
+        packed = {name: done for name in digests if (done := already(out, name, digests[name], sizes)) is not None}
+        if packed:
+            console.print(f"{len(packed)} of {len(plans)} shards are there already", markup=False)
+    todo = [plan for plan in plans if plan.name not in packed]
+    refused, megabytes, began = list(haul.rejected), 0.0, time.monotonic()
+    with progress(sum(len(plan.records) for plan in todo), "packing") as meter:
+        arguments = (
+            (plan, source, out, digests[plan.name], settings.check, (doubles or {}).get(plan.name)) for plan in todo
+        )
+        for done in write_all(arguments, settings.workers):
+            packed[done.shard.name] = done
+            refused += done.rejected
+            megabytes += done.shard.bytes / 1e6
+            rate = f"{megabytes / (time.monotonic() - began):.1f}"
+            meter.advance(done.shard.samples + len(done.rejected), refused=len(refused), megabytes_per_second=rate)
+            judge(settings, refused, haul.found)
+    return packed
+
+
+def already(out: str, name: str, digest: str, sizes: Mapping[str, int]) -> Packed | None:
+    """What became of this very plan, where it is done; images that could not be read get another chance."""
+    done = read_packed(out, name) if f"{FOLDER}/{name}.parquet" in sizes else None
+    if done is None or done.plan != digest or sizes.get(f"{name}.tar") != done.shard.bytes:
+        return None
+    return None if any(rejection.reason == UNREADABLE for rejection in done.rejected) else done
+
+
+def write_all(arguments: Iterable[tuple[Any, ...]], workers: int | None) -> Iterator[Packed]:
+    """`write_shard` for all arguments, as they are done."""
+    if workers == 0:
+        yield from (write_shard(*given) for given in arguments)
+        return
+    cluster.connect()
+    task = ray.remote(num_cpus=1)(write_shard)
+    window = workers or 2 * cluster.cpus()
+    yield from (done for _, done in cluster.bounded(lambda given: task.remote(*given), arguments, window))
+
+
+def judge(settings: PackingSettings, refused: Sequence[Rejection], found: int) -> None:
+    """Raise TooManyRejected, with the list written, if that many were refused. A known image is no bad one when extending."""
+    bad = [one for one in refused if not (settings.extend and one.reason == "duplicate")]
+    if len(bad) <= settings.max_bad_fraction * found:
+        return
+    rejects.write(settings.out, refused, keep=settings.extend)
+    raise TooManyRejected(
+        f"{len(bad)} of {found} images were refused, more than {settings.max_bad_fraction:.2%}: {rejects.commonest(bad)}; see "
+        f"{storage.join(settings.out, rejects.FILE)}, mend them or raise --max-bad-fraction"
+    )
+
+
+def compose(before: Manifest | None, said: dict[str, Any], packed: Mapping[str, Packed], haul: Haul) -> Manifest:
+    """The set as it is now. Classes that were there keep their numbers."""
+    shards = tuple(packed[name].shard for name in sorted(packed))
+    trained = {record.location for record in haul.records if record.split == Split.TRAIN}
+    if before is None:
+        return Manifest(shards=shards, classes=tuple(sorted(trained)), packing=said, rejected=len(haul.rejected))
+    return replace(
+        before,
+        shards=before.shards + shards,
+        classes=before.classes + tuple(sorted(trained.difference(before.classes))),
+        added=(*before.added, said),
+        rejected=before.rejected + len(haul.rejected),
+    )
+
+
+def sum_up(
+    settings: PackingSettings, packed: Mapping[str, Packed], haul: Haul, scanning: float, packing: float
+) -> None:
+    """Where the shards are, what is in them, how the time was spent."""
+    images, size = (sum(getattr(done.shard, name) for done in packed.values()) for name in ("samples", "bytes"))
+    refused = f"{len(haul.rejected)} refused"
+    if haul.rejected:
+        refused += f" ({rejects.commonest(haul.rejected)}; see {rejects.FILE})"
+    known = f"; {haul.known} were there already" if settings.extend else ""
+    console.print(
+        f"{settings.out}: {len(packed)} {'new ' if settings.extend else ''}shards, {images} images, {size / 1e6:.1f} MB, "
+        f"{refused}{known}; scanned in {scanning:.1f} s, packed in {packing:.1f} s",
+        markup=False,
+    )

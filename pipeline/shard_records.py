@@ -1,0 +1,128 @@
+"""The record table of a set of shards: `records/<shard>.parquet`, one row per image, all that is known of it but its bytes.
+
+In: rows that packing made. Out: Parquet parts, which tell packing what it has done already and extending what is there;
+and one table for other programs, as Parquet or GeoJSON.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline import storage
+from pipeline.records import ImageRecord, InputError, Rejection, Split, View
+from pipeline.shards import Manifest, Shard
+
+FOLDER = "records"
+SCHEMA = pa.schema(
+    [pa.field(name, pa.string(), nullable=False) for name in ("key", "location", "view", "split", "shard")]
+    + [(name, pa.float64()) for name in ("lat", "lon", "altitude_m", "heading_deg", "pitch_deg")]
+    + [("footprint", pa.list_(pa.list_(pa.float64(), 2))), ("taken_at", pa.string())]
+    + [pa.field(name, pa.string(), nullable=False) for name in ("source", "path", "part", "sha256")]
+    + [pa.field(name, pa.int64(), nullable=False) for name in ("bytes", "width", "height")]
+)
+FOOTER = b"pvda.packed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Packed:
+    """What became of one planned tar. It stands in the footer of the tar's record part."""
+
+    shard: Shard
+    plan: str
+    "Digest of the plan."
+    rejected: tuple[Rejection, ...]
+
+
+def row(record: ImageRecord, shard: str, facts: dict[str, Any], size: int) -> dict[str, Any]:
+    """One image as the table has it. `facts`: the JSON beside it in the tar."""
+    tag = asdict(record.geotag) if record.geotag else {}
+    known = {name: facts.get(name, tag.get(name)) for name in SCHEMA.names}
+    return known | {"shard": shard, "path": record.path, "part": record.part, "bytes": size}
+
+
+def write_part(out: str, packed: Packed, rows: list[dict[str, Any]]) -> None:
+    footer = {FOOTER: json.dumps(asdict(packed), sort_keys=True)}
+    table = pa.Table.from_pylist(rows, SCHEMA.with_metadata(footer))
+    with storage.atomic(_path(out, packed.shard.name)) as stream:
+        pq.write_table(table, stream)
+
+
+def read_packed(out: str, name: str) -> Packed | None:
+    """What became of a tar; None where its part is missing or cannot be read."""
+    try:
+        with storage.open_read(_path(out, name)) as stream:
+            said = json.loads(pq.read_schema(stream).metadata[FOOTER])
+        shard = said["shard"]
+        return Packed(
+            shard=Shard(**shard | {"split": Split(shard["split"]), "view": View(shard["view"])}),
+            plan=said["plan"],
+            rejected=tuple(Rejection(**rejection) for rejection in said["rejected"]),
+        )
+    except (OSError, pa.ArrowInvalid, KeyError, TypeError, ValueError):
+        return None
+
+
+def read_part(out: str, name: str, columns: list[str] | None = None) -> pa.Table:
+    """The rows of one shard.
+
+    Raises InputError when they cannot be read.
+    """
+    path = _path(out, name)
+    try:
+        with storage.open_read(path) as stream:
+            return pq.read_table(stream, columns=columns)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise InputError(
+            f"{path} cannot be read ({error}); expected the record table that packing wrote beside the tars; run "
+            "jobs/make_shards.py again as it was run first, which makes what is missing"
+        ) from None
+
+
+def export(shards: str, manifest: Manifest, file: str) -> tuple[int, int]:
+    """All records as one file: `.parquet`, or `.geojson` with a point for each image whose place is known.
+
+    Returns how many were written and how many have no place and are left out. Raises InputError for another ending.
+    """
+    if file.lower().endswith(".parquet"):
+        written = 0
+        with storage.atomic(file) as stream, pq.ParquetWriter(stream, SCHEMA) as writer:
+            for shard in manifest.shards:
+                table = read_part(shards, shard.name).cast(SCHEMA)
+                writer.write_table(table)
+                written += len(table)
+        return written, 0
+    if not file.lower().endswith((".geojson", ".json")):
+        raise InputError(f"--export is {file}, expected a name that ends in .parquet or .geojson")
+    written = without = 0
+    with storage.atomic(file) as stream:
+        stream.write(b'{"type": "FeatureCollection", "features": [')
+        for shard in manifest.shards:
+            for feature in _features(read_part(shards, shard.name)):
+                if feature is None:
+                    without += 1
+                    continue
+                stream.write(b",\n" if written else b"\n")
+                stream.write(json.dumps(feature, ensure_ascii=False).encode())
+                written += 1
+        stream.write(b"\n]}\n")
+    return written, without
+
+
+def _features(table: pa.Table) -> Iterator[dict[str, Any] | None]:
+    for known in table.to_pylist():
+        lat, lon, footprint = (known.pop(name) for name in ("lat", "lon", "footprint"))
+        if lat is None:
+            yield None
+            continue
+        if footprint:  # RFC 7946: longitude first, the ring closed and counter-clockwise seen from above
+            known["footprint"] = [[corner[1], corner[0]] for corner in footprint]
+        point = {"type": "Point", "coordinates": [lon, lat]}
+        yield {"type": "Feature", "id": known["key"], "geometry": point, "properties": known}
+
+
+def _path(out: str, name: str) -> str:
+    return storage.join(out, FOLDER, f"{name}.parquet")

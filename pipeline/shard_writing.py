@@ -1,0 +1,127 @@
+"""One planned shard -> one tar with the source's own bytes and a JSON per image, and its part of the record table.
+
+In: a plan and its source. Out: two files, each whole or not there; the same input gives the same bytes.
+"""
+
+import hashlib
+import json
+import tarfile
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import IO, Any, Literal
+
+from pipeline import shard_records, storage
+from pipeline.inspection import inspect
+from pipeline.records import ImageRecord, Rejection
+from pipeline.shard_plan import ShardPlan
+from pipeline.shard_records import Packed
+from pipeline.shards import Shard
+from pipeline.sources import name_of
+from pipeline.sources.source import Source
+from pipeline.stream import ahead
+from pipeline.transforms import DecodeError, decode
+
+Check = Literal["quick", "full"]
+"How an image is judged: by its headers and its end, or by decoding it."
+READERS, READ_AHEAD = 4, 16
+"Threads that read and judge images ahead of the tar, and how many images they may be ahead."
+UNREADABLE = "unreadable file"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Member:
+    """An image on its way into the tar."""
+
+    name: str
+    "Of the file in the tar."
+    data: bytes
+    facts: dict[str, Any]
+    "The JSON beside it."
+
+
+def write_shard(
+    plan: ShardPlan,
+    source: Source,
+    out: str,
+    digest: str,
+    check: Check = "quick",
+    doubles: Mapping[str, str] | None = None,
+) -> Packed:
+    """Write one tar and its record part; images that cannot be used are left out and told of.
+
+    `doubles`: keys to leave out, with the name of the image that has the same bytes.
+    """
+    left_out = doubles or {}
+
+    def prepare(record: ImageRecord) -> Member | Rejection:
+        if record.key in left_out:
+            return Rejection(path=record.name, reason="duplicate", found=f"same bytes as {left_out[record.key]}")
+        try:
+            return read_member(record, source, check)
+        except DecodeError as error:
+            return Rejection(path=record.name, reason=error.reason, found=error.found)
+
+    rejected, rows = [], []
+    with storage.atomic(storage.join(out, f"{plan.name}.tar")) as stream:
+        tar = TarStream(stream)
+        found = ahead(prepare, plan.records, READERS, READ_AHEAD)
+        for record, member in zip(plan.records, found, strict=True):
+            if isinstance(member, Rejection):
+                rejected.append(member)
+                continue
+            tar.add(member.name, member.data)
+            tar.add(f"{record.key}.json", json.dumps(member.facts, ensure_ascii=False).encode())
+            rows.append(shard_records.row(record, plan.name, member.facts, len(member.data)))
+        tar.close()
+    shard = Shard(
+        name=plan.name, split=plan.split, view=plan.view,
+        samples=len(rows), bytes=tar.bytes, sha256=tar.digest.hexdigest(),
+    )  # fmt: skip
+    packed = Packed(shard=shard, plan=digest, rejected=tuple(rejected))
+    shard_records.write_part(out, packed, rows)
+    return packed
+
+
+def read_member(record: ImageRecord, source: Source, check: Check) -> Member:
+    """An image's bytes, never encoded again, and what the tar says of them.
+
+    Raises DecodeError when they are no image, or cannot be read.
+    """
+    try:
+        data = source.read(record)
+    except OSError as error:
+        raise DecodeError(UNREADABLE, str(error)) from None
+    width, height = inspect(data)
+    if check == "full":
+        decode(data)
+    facts = {
+        "key": record.key, "location": record.location, "view": record.view, "split": record.split,
+        "geotag": None if record.geotag is None else asdict(record.geotag), "taken_at": record.taken_at,
+        "source": name_of(source), "sha256": hashlib.sha256(data).hexdigest(), "width": width, "height": height,
+    }  # fmt: skip
+    return Member(name=f"{record.key}.{source.ending(record)}", data=data, facts=facts)
+
+
+class TarStream:
+    """A tar that is written from front to back, counted and hashed on its way.
+
+    Fixed time, owner and mode: the same members give the same bytes.
+    """
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._stream, self.digest, self.bytes = stream, hashlib.sha256(), 0
+
+    def add(self, name: str, data: bytes) -> None:
+        header = tarfile.TarInfo(name)
+        header.size, header.uname, header.gname = len(data), "root", "root"
+        self._write(header.tobuf(tarfile.USTAR_FORMAT) + data + b"\0" * (-len(data) % tarfile.BLOCKSIZE))
+
+    def close(self) -> None:
+        """Two empty blocks end a tar; tar programs fill the last record, so that others do not complain."""
+        end = 2 * tarfile.BLOCKSIZE
+        self._write(b"\0" * (end + -(self.bytes + end) % tarfile.RECORDSIZE))
+
+    def _write(self, data: bytes) -> None:
+        self.digest.update(data)
+        self.bytes += len(data)
+        self._stream.write(data)
