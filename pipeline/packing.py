@@ -105,10 +105,12 @@ def pack(source: Source, settings: PackingSettings) -> Manifest:
     packed |= pack_plans(again, source, settings, said, haul, doubles)
     haul.rejected += [rejection for done in packed.values() for rejection in done.rejected]
     judge(settings, haul.rejected, haul.found)
-    rejects.write(out, haul.rejected, keep=before is not None)
-    manifest = compose(before, said, packed, haul)
+    refusals = rejects.write(out, haul.rejected, keep=before is not None)
+    full = {name: done for name, done in packed.items() if done.shard.samples}
+    clear(out, old.union(full))
+    manifest = compose(before, said, full, haul, refusals)
     storage.write_json(storage.join(out, MANIFEST), asdict(manifest))
-    sum_up(settings, packed, haul, scanned - began, time.monotonic() - scanned)
+    sum_up(settings, full, haul, scanned - began, time.monotonic() - scanned)
     return manifest
 
 
@@ -179,7 +181,7 @@ def _is_text(name: str) -> bool:
 
 
 def clear(out: str, wanted: frozenset[str]) -> None:
-    """Take away tars that an unfinished packing with other settings left; they are known by their record parts."""
+    """Take away our other tars, known by their record parts: empty ones, and those that other settings left."""
     for name in storage.names(storage.join(out, FOLDER)):
         stem = name.removesuffix(".parquet")
         if stem not in wanted:
@@ -255,18 +257,20 @@ def judge(settings: PackingSettings, refused: Sequence[Rejection], found: int) -
     )
 
 
-def compose(before: Manifest | None, said: dict[str, Any], packed: Mapping[str, Packed], haul: Haul) -> Manifest:
+def compose(
+    before: Manifest | None, said: dict[str, Any], packed: Mapping[str, Packed], haul: Haul, refusals: int
+) -> Manifest:
     """The set as it is now. Classes that were there keep their numbers."""
     shards = tuple(packed[name].shard for name in sorted(packed))
     trained = {record.location for record in haul.records if record.split == Split.TRAIN}
     if before is None:
-        return Manifest(shards=shards, classes=tuple(sorted(trained)), packing=said, rejected=len(haul.rejected))
+        return Manifest(shards=shards, classes=tuple(sorted(trained)), packing=said, rejected=refusals)
     return replace(
         before,
         shards=before.shards + shards,
         classes=before.classes + tuple(sorted(trained.difference(before.classes))),
-        added=(*before.added, said),
-        rejected=before.rejected + len(haul.rejected),
+        added=(*before.added, said) if packed else before.added,
+        rejected=refusals,
     )
 
 

@@ -16,8 +16,8 @@ FILE = "rejected.parquet"
 SCHEMA = pa.schema([("path", pa.string()), ("reason", pa.string()), ("found", pa.string())])
 
 
-def write(folder: str, rejected: Iterable[Rejection], keep: bool) -> None:
-    """Write the list, by path; `keep`: beside what it holds already."""
+def write(folder: str, rejected: Iterable[Rejection], keep: bool) -> int:
+    """Write the list, by path, and return its length; `keep`: beside what it holds already."""
     path = storage.join(folder, FILE)
     listed = {(rejection.path, rejection.reason, rejection.found) for rejection in rejected}
     if keep and storage.exists(path):
@@ -26,6 +26,7 @@ def write(folder: str, rejected: Iterable[Rejection], keep: bool) -> None:
     table = pa.Table.from_pylist([dict(zip(SCHEMA.names, row, strict=True)) for row in sorted(listed)], SCHEMA)
     with storage.atomic(path) as stream:
         pq.write_table(table, stream)
+    return len(table)
 
 
 def commonest(rejected: Iterable[Rejection]) -> str:

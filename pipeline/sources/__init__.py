@@ -8,5 +8,5 @@ SOURCES: dict[str, type[Source]] = {"university1652": University1652}
 
 
 def name_of(source: Source) -> str:
-    """The name that `--source` takes for a source."""
-    return next(name for name, kind in SOURCES.items() if type(source) is kind)
+    """The name that `--source` takes for a source; of one that is not listed, its class's name."""
+    return next((name for name, kind in SOURCES.items() if type(source) is kind), type(source).__name__)
