@@ -4,6 +4,8 @@ Shapes: H x W pixels.
 """
 
 import io
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,34 +41,42 @@ def decode(data: bytes) -> Pixels:
 
     Raises DecodeError.
     """
+    with refusing(data), Image.open(io.BytesIO(data)) as opened:  # reads the header only
+        if opened.format == "JPEG" and opened.mode in ("RGB", "L") and orientation_of(opened) == 1:
+            rgb: Pixels = simplejpeg.decode_jpeg(data, "RGB")
+            return rgb
+        opened.load()  # Pillow turns a TIFF upright here, and its tag is gone
+        orientation = orientation_of(opened)
+        image = opened if orientation == 1 else opened.transpose(UPRIGHT[orientation])
+        if image.mode.startswith("I"):  # 16 bits a pixel, which Pillow's convert would clip at 255
+            grey_HW = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)
+            return np.repeat(grey_HW[:, :, None], 3, axis=2)
+        if image.mode == "P":  # by way of RGBA: Pillow warns of every palette that holds transparency
+            image = image.convert("RGBA")
+        return np.asarray(image.convert("RGB"))
+
+
+@contextmanager
+def refusing(data: bytes) -> Iterator[None]:
+    """Whatever goes wrong over an image's bytes becomes a DecodeError with a countable reason."""
     if not data:
         raise DecodeError("empty file", "0 bytes")
     try:
-        with Image.open(io.BytesIO(data)) as opened:  # reads the header only
-            if opened.format == "JPEG" and opened.mode in ("RGB", "L") and _turn(opened) is None:
-                rgb: Pixels = simplejpeg.decode_jpeg(data, "RGB")
-                return rgb
-            opened.load()  # Pillow turns a TIFF upright here, and its tag is gone
-            turn = _turn(opened)
-            image = opened if turn is None else opened.transpose(turn)
-            if image.mode.startswith("I"):  # 16 bits a pixel, which Pillow's convert would clip at 255
-                grey_HW = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)
-                return np.repeat(grey_HW[:, :, None], 3, axis=2)
-            if image.mode == "P":  # by way of RGBA: Pillow warns of every palette that holds transparency
-                image = image.convert("RGBA")
-            return np.asarray(image.convert("RGB"))
+        yield
+    except (DecodeError, MemoryError):  # the latter is this machine's fault and not the image's
+        raise
     except UnidentifiedImageError:
         raise DecodeError("not an image", f"{len(data)} bytes that begin with {data[:8]!r}") from None
     except Image.DecompressionBombError as error:
         raise DecodeError("too many pixels", str(error)) from None
-    except MemoryError:
-        raise  # this machine's fault and not the image's
     except Exception as error:  # Pillow raises many kinds over damaged headers and metadata
         raise DecodeError("damaged image", f"{len(data)} bytes; {error}") from None
 
 
-def _turn(image: Image.Image) -> Image.Transpose | None:
-    return UPRIGHT.get(image.getexif().get(ORIENTATION_TAG, 1))
+def orientation_of(image: Image.Image) -> int:
+    """The EXIF orientation, 1 (as it stands) to 8; 1 too where the image says none or one without a meaning."""
+    said = image.getexif().get(ORIENTATION_TAG, 1)
+    return said if said in UPRIGHT else 1
 
 
 def resize(image_HW3: Pixels, size: int) -> Pixels:
