@@ -4,6 +4,8 @@ Shapes: H x W pixels.
 """
 
 import io
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,12 +20,15 @@ PREPROCESSING = "resize bicubic pillow, ImageNet normalisation"
 "Part of the fingerprint: tables made with another preprocessing do not mix."
 ORIENTATION_TAG = 0x0112
 UPRIGHT = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_270, 7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}  # fmt: skip
-"""What turns an image upright, by EXIF orientation. Not ImageOps.exif_transpose: it writes all other tags again, and fails
+    1: (slice(None), slice(None)),
+    2: (slice(None), slice(None, None, -1)),
+    3: (slice(None, None, -1), slice(None, None, -1)),
+    4: (slice(None, None, -1), slice(None)),
+}
+"""What turns pixels upright, by EXIF orientation. Not ImageOps.exif_transpose: it writes all other tags again, and fails
 where a camera gave one of them a type that is not its own."""
+EXCHANGED = {5: 1, 6: 2, 7: 3, 8: 4}
+"The orientations that are one of UPRIGHT's once rows and columns are exchanged."
 
 
 class DecodeError(ValueError):
@@ -39,34 +44,50 @@ def decode(data: bytes) -> Pixels:
 
     Raises DecodeError.
     """
+    with refusing(data), Image.open(io.BytesIO(data)) as opened:  # reads the header only
+        if opened.format in ("JPEG", "MPO") and opened.mode in ("RGB", "L"):  # MPO: a JPEG that others follow
+            return upright(simplejpeg.decode_jpeg(data, "RGB"), orientation_of(opened))
+        opened.load()  # Pillow turns a TIFF upright here, and its tag is gone
+        return upright(_rgb(opened), orientation_of(opened))
+
+
+def _rgb(image: Image.Image) -> Pixels:
+    if image.mode.startswith("I"):  # 16 bits a pixel, which Pillow's convert would clip at 255
+        grey_HW = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)
+        return np.repeat(grey_HW[:, :, None], 3, axis=2)
+    if image.mode == "P":  # by way of RGBA: Pillow warns of every palette that holds transparency
+        image = image.convert("RGBA")
+    return np.asarray(image.convert("RGB"))
+
+
+@contextmanager
+def refusing(data: bytes) -> Iterator[None]:
+    """Whatever goes wrong over an image's bytes becomes a DecodeError with a countable reason."""
     if not data:
         raise DecodeError("empty file", "0 bytes")
     try:
-        with Image.open(io.BytesIO(data)) as opened:  # reads the header only
-            if opened.format == "JPEG" and opened.mode in ("RGB", "L") and _turn(opened) is None:
-                rgb: Pixels = simplejpeg.decode_jpeg(data, "RGB")
-                return rgb
-            opened.load()  # Pillow turns a TIFF upright here, and its tag is gone
-            turn = _turn(opened)
-            image = opened if turn is None else opened.transpose(turn)
-            if image.mode.startswith("I"):  # 16 bits a pixel, which Pillow's convert would clip at 255
-                grey_HW = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)
-                return np.repeat(grey_HW[:, :, None], 3, axis=2)
-            if image.mode == "P":  # by way of RGBA: Pillow warns of every palette that holds transparency
-                image = image.convert("RGBA")
-            return np.asarray(image.convert("RGB"))
+        yield
+    except (DecodeError, MemoryError):  # the latter is this machine's fault and not the image's
+        raise
     except UnidentifiedImageError:
         raise DecodeError("not an image", f"{len(data)} bytes that begin with {data[:8]!r}") from None
     except Image.DecompressionBombError as error:
         raise DecodeError("too many pixels", str(error)) from None
-    except MemoryError:
-        raise  # this machine's fault and not the image's
     except Exception as error:  # Pillow raises many kinds over damaged headers and metadata
         raise DecodeError("damaged image", f"{len(data)} bytes; {error}") from None
 
 
-def _turn(image: Image.Image) -> Image.Transpose | None:
-    return UPRIGHT.get(image.getexif().get(ORIENTATION_TAG, 1))
+def orientation_of(image: Image.Image) -> int:
+    """The EXIF orientation, 1 (as it stands) to 8; 1 too where the image says none or one without a meaning."""
+    said = image.getexif().get(ORIENTATION_TAG, 1)
+    return said if said in UPRIGHT or said in EXCHANGED else 1
+
+
+def upright(image_HW3: Pixels, orientation: int) -> Pixels:
+    """Pixels as an image with that EXIF orientation holds them -> upright, one block of memory."""
+    if orientation in EXCHANGED:
+        image_HW3, orientation = image_HW3.swapaxes(0, 1), EXCHANGED[orientation]
+    return np.ascontiguousarray(image_HW3[UPRIGHT[orientation]])
 
 
 def resize(image_HW3: Pixels, size: int) -> Pixels:

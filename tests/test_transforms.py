@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import Image, ImageOps
 
 from pipeline.records import View
 from pipeline.transforms import Augmentation, DecodeError, Pixels, augment, decode, resize
@@ -109,6 +109,29 @@ def test_a_photo_from_a_camera_held_sideways_comes_upright(orientation: int) -> 
     found_HW3 = decode(encoded(Image.fromarray(large_HW3), "JPEG", quality=95, exif=exif(orientation)))
     expected_HW3 = np.array(UPRIGHT[orientation], np.int64)
     assert np.abs(found_HW3[8::16, 8::16] - expected_HW3).max() <= 2
+
+
+@pytest.mark.parametrize("orientation", UPRIGHT)
+@pytest.mark.parametrize(
+    ("mode", "form", "options"),
+    [
+        ("RGB", "JPEG", {}),
+        ("RGB", "JPEG", {"progressive": True}),
+        ("L", "JPEG", {}),
+        ("CMYK", "JPEG", {}),
+        ("RGB", "MPO", {"save_all": True, "append_images": [PHOTO.resize((20, 20))]}),  # a JPEG that another follows
+    ],
+)
+def test_a_turned_photo_has_the_pixels_that_pillow_gives(
+    orientation: int, mode: str, form: str, options: dict[str, object]
+) -> None:
+    data = encoded(PHOTO.convert(mode), form, exif=exif(orientation), **options)
+    with Image.open(io.BytesIO(data)) as image:
+        assert image.format == form
+        expected_HW3 = np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+    found_HW3 = decode(data)
+    assert np.array_equal(found_HW3, expected_HW3)
+    assert found_HW3.flags.c_contiguous
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 255])
