@@ -28,6 +28,18 @@ READERS, READ_AHEAD = 4, 16
 UNREADABLE = "unreadable file"
 
 
+def _template() -> bytes:
+    info = tarfile.TarInfo("")
+    info.uname = info.gname = "root"
+    block = info.tobuf(tarfile.USTAR_FORMAT)
+    return block[:124] + bytes(12) + block[136:148] + bytes(8) + block[156:]  # without size and checksum
+
+
+TEMPLATE = _template()
+CHECKSUM = sum(TEMPLATE) + 8 * ord(" ")
+"Of the template; the checksum counts its own eight characters as blanks."
+
+
 @dataclass(frozen=True, kw_only=True)
 class Member:
     """An image on its way into the tar."""
@@ -102,6 +114,16 @@ def read_member(record: ImageRecord, source: Source, check: Check) -> Member:
     return Member(name=f"{record.key}.{source.ending(record)}", data=data, facts=facts)
 
 
+def header(name: str, size: int) -> bytes:
+    """The tar header of a file: 512 bytes, ustar, fixed time, owner and mode.
+
+    `name`: ASCII, at most 100 characters; `size`: bytes, below 8 GiB. tarfile makes the same, at a tenth of the speed.
+    """
+    named, sized = name.encode("ascii"), b"%011o\0" % size
+    checksum = b"%06o\0 " % (CHECKSUM + sum(named) + sum(sized))
+    return b"".join((named.ljust(100, b"\0"), TEMPLATE[100:124], sized, TEMPLATE[136:148], checksum, TEMPLATE[156:]))
+
+
 class TarStream:
     """A tar that is written from front to back, counted and hashed on its way.
 
@@ -112,14 +134,15 @@ class TarStream:
         self._stream, self.digest, self.bytes = stream, hashlib.sha256(), 0
 
     def add(self, name: str, data: bytes) -> None:
-        header = tarfile.TarInfo(name)
-        header.size, header.uname, header.gname = len(data), "root", "root"
-        self._write(header.tobuf(tarfile.USTAR_FORMAT) + data + b"\0" * (-len(data) % tarfile.BLOCKSIZE))
+        self._write(header(name, len(data)))
+        self._write(data)
+        if rest := -len(data) % tarfile.BLOCKSIZE:
+            self._write(bytes(rest))
 
     def close(self) -> None:
         """Two empty blocks end a tar; tar programs fill the last record, so that others do not complain."""
         end = 2 * tarfile.BLOCKSIZE
-        self._write(b"\0" * (end + -(self.bytes + end) % tarfile.RECORDSIZE))
+        self._write(bytes(end + -(self.bytes + end) % tarfile.RECORDSIZE))
 
     def _write(self, data: bytes) -> None:
         self.digest.update(data)

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import tarfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -26,7 +27,7 @@ from pipeline.packing import PackingSettings, TooManyRejected, pack
 from pipeline.records import GeoTag, ImageRecord, InputError, Rejection, Split, View, make_key
 from pipeline.shard_plan import ShardPlan, ShardSize, plan_shards
 from pipeline.shard_records import Packed, read_part
-from pipeline.shard_writing import write_shard
+from pipeline.shard_writing import header, write_shard
 from pipeline.shards import read_manifest
 from pipeline.sources.university1652 import University1652
 from pipeline.stream import read_shard
@@ -381,3 +382,10 @@ def test_records_to_shards_to_records_is_the_identity(
             assert sample.data == storage.read_bytes(row["path"])
             back.append(recorded(sample.facts, row))
     assert sorted(back, key=lambda record: record.path) == sorted(records, key=lambda record: record.path)
+
+
+@given(st.text("abcdefghijklmnopqrstuvwxyz0123456789_-.", min_size=1, max_size=100), st.integers(0, 2**33 - 1))
+def test_headers_are_those_that_tarfile_makes(name: str, size: int) -> None:
+    info = tarfile.TarInfo(name)
+    info.size, info.uname, info.gname = size, "root", "root"
+    assert header(name, size) == info.tobuf(tarfile.USTAR_FORMAT)
