@@ -41,4 +41,4 @@ class Failure(RuntimeError):
 
 def _say(sentence: str) -> None:
     console.print("error:", style="bold red", end=" ")
-    console.print(sentence, markup=False)
+    console.print(sentence)

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+from rich.text import Text
+
 from jobs.cli import run
 from jobs.embed_gallery import network_of
 from jobs.evaluate import print_table
@@ -122,7 +124,7 @@ def ask(index: str, table: str) -> str:
 @contextmanager
 def step(seconds: dict[str, float], name: str, what: str) -> Iterator[None]:
     """Say what begins, and keep how long it took."""
-    console.rule(f"[bold]{name}[/] {what}", align="left")
+    console.rule(Text.assemble((name, "bold"), " ", what), align="left")
     start = time.monotonic()
     yield
     seconds[name] = time.monotonic() - start

@@ -66,13 +66,13 @@ def check(out: str, verify: bool) -> None:
     """
     count, wrong = verify_shards(out)
     for sentence in wrong:
-        console.print(sentence, markup=False)
+        console.print(sentence)
     if wrong:
         raise Failure(
             f"{out} is damaged in {len(wrong)} places; delete the tars that are named and run the command that packed "
             "them again: it makes only what is missing"
         )
-    console.print(f"{out}: all {count} shards are what was packed", markup=False)
+    console.print(f"{out}: all {count} shards are what was packed")
 
 
 def export(out: str, export: str) -> None:
@@ -83,9 +83,7 @@ def export(out: str, export: str) -> None:
         export: The file: .parquet, or .geojson with a point for each image whose place is known.
     """
     written, without = shard_records.export(storage.absolute(out), read_manifest(out), export)
-    console.print(
-        f"{export}: {written} images" + (f", {without} without a place left out" if without else ""), markup=False
-    )
+    console.print(f"{export}: {written} images" + (f", {without} without a place left out" if without else ""))
 
 
 if __name__ == "__main__":

@@ -87,11 +87,11 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
             "empty folder; choose another --out"
         )
     if earlier and earlier["shown"] == shown:
-        _say(f"{settings.out} is complete: the same features were evaluated before; nothing to do")
+        console.print(f"{settings.out} is complete: the same features were evaluated before; nothing to do")
     elif earlier:
         _write_report(settings, report.read_findings(settings.out), extras)
         storage.write_json(storage.join(settings.out, INPUTS), {"ranked": ranked, "shown": shown})
-        _say(f"{settings.out}: ranked before; wrote report.html anew")
+        console.print(f"{settings.out}: ranked before; wrote report.html anew")
     else:
         _evaluate(settings, queries, gallery, tasks, {"ranked": ranked, "shown": shown}, extras)
     rows: list[dict[str, Any]] = storage.read_json(storage.join(settings.out, METRICS))
@@ -160,7 +160,7 @@ def _evaluate(
     storage.write_json(storage.join(settings.out, INPUTS), inputs)
     storage.write_json(storage.join(settings.out, METRICS), rows)
     parts = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.items())
-    _say(f"{storage.join(settings.out, METRICS)}: {time.monotonic() - begin:.1f} s ({parts})")
+    console.print(f"{storage.join(settings.out, METRICS)}: {time.monotonic() - begin:.1f} s ({parts})")
 
 
 def _write_report(settings: EvaluationSettings, findings: report.Findings, extras: report.Extras) -> None:
@@ -178,10 +178,6 @@ def _earlier(out: str) -> dict[str, Any] | None:
         )
     said: dict[str, Any] = storage.read_json(storage.join(out, INPUTS))
     return said
-
-
-def _say(remark: str) -> None:
-    console.print(remark, markup=False, soft_wrap=True)  # paths are not markup, and stay whole for whoever copies them
 
 
 def _held(table: FeatureTable, split: Split) -> str:

@@ -81,7 +81,7 @@ def pack(source: Source, settings: PackingSettings) -> Manifest:
     began, out, said = time.monotonic(), storage.absolute(settings.out), describe(source, settings)
     before = finished(settings, said)
     if before is not None and not settings.extend:
-        console.print(f"{settings.out} is complete: {len(before.shards)} shards; nothing to do", markup=False)
+        console.print(f"{settings.out} is complete: {len(before.shards)} shards; nothing to do")
         return before
     haul = gather(source, settings.root)
     if before is not None:
@@ -152,7 +152,7 @@ def finished(settings: PackingSettings, said: dict[str, Any]) -> Manifest | None
             f"{len(damaged)} shards of {out} are missing or have another size than its manifest says, {damaged[0]} first, and "
             "it was extended, or is to be; put them back from a copy, or pack all anew to another --out"
         )
-    console.print(f"{out}: {len(damaged)} shards are missing or have another size; they are packed again", markup=False)
+    console.print(f"{out}: {len(damaged)} shards are missing or have another size; they are packed again")
     return None
 
 
@@ -209,7 +209,7 @@ def pack_plans(
         sizes = storage.walk(out) if storage.is_folder(out) else {}
         packed = {name: done for name in digests if (done := already(out, name, digests[name], sizes)) is not None}
         if packed:
-            console.print(f"{len(packed)} of {len(plans)} shards are there already", markup=False)
+            console.print(f"{len(packed)} of {len(plans)} shards are there already")
     todo = [plan for plan in plans if plan.name not in packed]
     refused, megabytes, began = list(haul.rejected), 0.0, time.monotonic()
     with progress(sum(len(plan.records) for plan in todo), "packing") as meter:
@@ -286,5 +286,4 @@ def sum_up(
     console.print(
         f"{settings.out}: {len(packed)} {'new ' if settings.extend else ''}shards, {images} images, {size / 1e6:.1f} MB, "
         f"{refused}{known}; scanned in {scanning:.1f} s, packed in {packing:.1f} s",
-        markup=False,
     )

@@ -78,7 +78,7 @@ def simulate(settings: SimulationSettings) -> Path:
     textures, passed_over = usable_textures(storage.absolute(settings.textures)) if settings.textures else ([], 0)
     described = _describe(settings, textures)
     if _is_complete(root, described):
-        console.print(f"{root} is complete already; nothing to do", soft_wrap=True)
+        console.print(f"{root} is complete already; nothing to do")
         return root
     jobs = plan(settings, str(root), textures)
     if passed_over:
@@ -91,7 +91,7 @@ def simulate(settings: SimulationSettings) -> Path:
     storage.write_json(str(root / "simulation.json"), described)
     shutil.rmtree(root / ".parts")
     share = ", ".join(f"{step} {seconds:.1f} s" for step, seconds in spent.items())
-    console.print(f"{root}: {len(jobs)} locations ({share or 'all were there'}, over all cores)", soft_wrap=True)
+    console.print(f"{root}: {len(jobs)} locations ({share or 'all were there'}, over all cores)")
     return root
 
 
