@@ -13,7 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 SECONDS_BETWEEN_LINES = 5.0
 
 console = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
-"""Where progress and remarks go; results go to standard output. Paths are not markup, and stay whole for whoever copies them."""
+"""Where progress and remarks go; results go to standard output. Paths are no markup, and stay whole for whoever copies
+them."""
 
 
 class Meter(Protocol):
