@@ -58,6 +58,8 @@ class ImageRecord:
     view: View
     location: str
     "The label: the folder's name, never an index."
+    variant: str = ""
+    "What tells apart images of one name in one location, such as the height they were taken from."
     geotag: GeoTag | None = None
     taken_at: str | None = None
     "When, ISO 8601; without an offset it is the camera's own clock."
@@ -66,9 +68,9 @@ class ImageRecord:
 
     @property
     def key(self) -> str:
-        """Name of this image in the data set: `[a-z0-9_-]+`, derived from split, view, location and file name alone."""
+        """Name of this image in the data set: `[a-z0-9_-]+`, derived from split, view, location, variant and file name."""
         stem = self.part or self.path.rsplit("/", 1)[-1].rsplit(".", 1)[0]
-        return make_key(self.split, self.view, self.location, stem)
+        return make_key(self.split, self.view, self.location, f"{self.variant}-{stem}" if self.variant else stem)
 
     @property
     def name(self) -> str:

@@ -18,3 +18,15 @@ def test_keys_are_safe_and_no_two_names_share_one(first: str, second: str) -> No
     keys = [make_key(Split.QUERY, View.SATELLITE, "l", name) for name in (first, second)]
     assert all(set(key) <= set("abcdefghijklmnopqrstuvwxyz0123456789_-") for key in keys)
     assert (keys[0] == keys[1]) == (first == second)
+
+
+def test_a_variant_tells_apart_images_of_one_name_in_one_location() -> None:
+    records = [
+        ImageRecord(path="a/0.jpg", split=Split.QUERY, view=View.DRONE, location="0008", variant=variant)
+        for variant in ("", "150", "300")
+    ]
+    assert [record.key for record in records] == [
+        "query-drone-0008-0",
+        "query-drone-0008-150-0",
+        "query-drone-0008-300-0",
+    ]

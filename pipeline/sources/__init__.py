@@ -1,9 +1,19 @@
 """Imagery as found -> ImageRecords; one file per layout."""
 
+from pipeline.sources.denseuav import DenseUAV
+from pipeline.sources.gta_uav import GtaUav
 from pipeline.sources.source import Source
+from pipeline.sources.sues200 import Sues200
 from pipeline.sources.university1652 import University1652
+from pipeline.sources.visloc import VisLoc
 
-SOURCES: dict[str, type[Source]] = {"university1652": University1652}
+SOURCES: dict[str, type[Source]] = {
+    "university1652": University1652,
+    "sues200": Sues200,
+    "denseuav": DenseUAV,
+    "gta-uav": GtaUav,
+    "visloc": VisLoc,
+}
 "By the name that `--source` takes."
 
 

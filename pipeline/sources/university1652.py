@@ -1,28 +1,25 @@
 """University-1652 as its authors lay it out on disk -> ImageRecords. The simulator writes the same layout.
 
-`train/{satellite,drone,street,google}/<location>/` and `test/{query,gallery}_{satellite,drone,street}/<location>/`. Where
-`locations.csv` and `poses.csv` lie at the root, as the simulator writes them, geotags are taken from there.
+`train/{satellite,drone,street,google}/<location>/` and `test/{query,gallery}_{satellite,drone,street}/<location>/`.
+Geotags come apart from the images: the authors give out one `<location>.kml` per building, which `kml` takes, and where
+`locations.csv` and `poses.csv` lie at the root, as the simulator writes them, they are taken from there.
 """
 
-import csv
-import io
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pipeline import storage
-from pipeline.records import GeoTag, ImageRecord, InputError, Rejection, Split, View
-from pipeline.sources.source import Source, is_image, not_an_image
+from pipeline.records import GeoTag, ImageRecord, Rejection, View
+from pipeline.sources.folders import checked, images_by_location, split_folders
+from pipeline.sources.kml import read_kmls
+from pipeline.sources.source import Source
+from pipeline.sources.tables import Unreadable, number, place, read_rows, unreadable_tag
 
-FOLDERS: dict[str, tuple[Split, View]] = {
-    f"{phase}/{folder}": (split, view)
-    for phase, split, prefix in (
-        ("train", Split.TRAIN, ""),
-        ("test", Split.QUERY, "query_"),
-        ("test", Split.GALLERY, "gallery_"),
-    )
-    for view in View
-    for folder in [f"{prefix}{view}"]
-}
+LAYOUT = (
+    "University-1652's root, which holds train/{satellite,drone}/<location>/ and "
+    "test/{query,gallery}_{satellite,drone}/<location>/"
+)
+POSE = ("altitude_m", "heading_deg", "pitch_deg")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,52 +28,59 @@ class University1652(Source):
 
     views: tuple[View, ...] = (View.DRONE, View.SATELLITE)
     "Views that are taken. PVDA is trained and tested on these two; street and google are there for who asks for them."
+    kml: str = ""
+    "Folder with the buildings' KML files, `<location>.kml`, as its authors give them out; empty: no geotags from there."
 
     def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
-        if not storage.is_folder(root):
-            raise InputError(
-                f"no folder {root}; expected University-1652's root, which holds train and test; check --root"
-            )
-        tags = read_geotags(root)
-        found = False
-        for folder, (split, view) in FOLDERS.items():
-            below = storage.join(root, folder)
-            if view not in self.views or not storage.is_folder(below):
-                continue
-            for path, size in storage.walk(below).items():
-                location, _, name = path.rpartition("/")
-                whole = storage.join(below, path)
-                if not location or "/" in location:
-                    yield Rejection(path=whole, reason="wrong folder", found=f"{path} is not <location>/<image>")
-                elif not is_image(name):
-                    yield not_an_image(whole)
+        return checked(self._scan(root), root, LAYOUT)
+
+    def _scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
+        tags, rejected = read_geotags(root)
+        yield from rejected
+        if self.kml:
+            places, rejected = read_kmls(self.kml)
+            yield from rejected
+            tags |= places
+        for place_of in split_folders([view for view in View if view in self.views]):
+            folder = f"{place_of.phase}/{place_of.folder}"
+            for item in images_by_location(storage.join(root, folder)):
+                if isinstance(item, Rejection):
+                    yield item
+                    continue
+                yield ImageRecord(
+                    path=item.path,
+                    split=place_of.split,
+                    view=place_of.view,
+                    location=item.location,
+                    geotag=tags.get(f"{folder}/{item.location}/{item.name}") or tags.get(item.location),
+                    bytes=item.bytes,
+                )
+
+
+def read_geotags(root: str) -> tuple[dict[str, GeoTag], list[Rejection]]:
+    """Geotags by location, and with the camera's pose by path, from the two tables at the root, where they are.
+
+    Raises InputError when one of them is no such table.
+    """
+    tags: dict[str, GeoTag] = {}
+    rejected = []
+    for table, columns in (("locations.csv", ("location", "lat", "lon")), ("poses.csv", ("path", "location", *POSE))):
+        path = storage.join(root, table)
+        if not storage.exists(path):
+            continue
+        for line, row in read_rows(path, columns):
+            try:
+                if "path" not in columns:
+                    lat, lon = place(row["lat"], row["lon"])
+                    tags[row["location"]] = GeoTag(lat=lat, lon=lon)
+                elif row["location"] in tags:
+                    altitude, heading, pitch = (number(row[name]) for name in POSE)
+                    where = tags[row["location"]]
+                    tags[row["path"]] = GeoTag(
+                        lat=where.lat, lon=where.lon, altitude_m=altitude, heading_deg=heading, pitch_deg=pitch
+                    )
                 else:
-                    found = True
-                    tag = tags.get(f"{folder}/{path}") or tags.get(location)
-                    yield ImageRecord(path=whole, split=split, view=view, location=location, geotag=tag, bytes=size)
-        if not found:
-            raise InputError(
-                f"no images below {root}; expected train/{{satellite,drone}}/<location>/ and "
-                "test/{query,gallery}_{satellite,drone}/<location>/; check --root"
-            )
-
-
-def read_geotags(root: str) -> dict[str, GeoTag]:
-    """Geotags by location, and with the camera's pose by path, from the two tables at the root, where they are."""
-    places = {row["location"]: (float(row["lat"]), float(row["lon"])) for row in _rows(root, "locations.csv")}
-    tags = {location: GeoTag(lat=lat, lon=lon) for location, (lat, lon) in places.items()}
-    for row in _rows(root, "poses.csv"):
-        lat, lon = places[row["location"]]
-        altitude, heading, pitch = (float(row[name]) for name in ("altitude_m", "heading_deg", "pitch_deg"))
-        tags[row["path"]] = GeoTag(lat=lat, lon=lon, altitude_m=altitude, heading_deg=heading, pitch_deg=pitch)
-    return tags
-
-
-def _rows(root: str, name: str) -> Iterator[dict[str, str]]:
-    path = storage.join(root, name)
-    if not storage.exists(path):
-        return
-    try:
-        yield from csv.DictReader(io.StringIO(storage.read_bytes(path).decode()))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path} cannot be read as a table ({error}); mend it or take it away") from None
+                    raise Unreadable(f"location {row['location']!r} has no line in locations.csv")
+            except Unreadable as error:
+                rejected.append(unreadable_tag(path, line, ",".join(row.values()), error))
+    return tags, rejected

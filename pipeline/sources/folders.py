@@ -1,0 +1,78 @@
+"""Folders that hold one folder of images per location -> what is in them.
+
+In: a folder on some storage. Out: its images with the location that each lies in, and a Rejection for whatever lies
+elsewhere or is no image by its name.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from pipeline import storage
+from pipeline.records import ImageRecord, InputError, Rejection, Split, View
+from pipeline.sources.source import is_image, not_an_image
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitFolder:
+    """Where one split's images of one view are: `<phase>/<folder>`."""
+
+    phase: str
+    folder: str
+    split: Split
+    view: View
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacedImage:
+    """An image in its location's folder."""
+
+    path: str
+    name: str
+    "Of the file, with its ending."
+    location: str
+    bytes: int
+
+
+def split_folders(views: Iterable[View], train: str = "train", test: str = "test") -> list[SplitFolder]:
+    """Folders as University-1652 names them and others after it: `train/drone`, `test/query_drone`, `test/gallery_drone`."""
+    phases = ((train, Split.TRAIN, ""), (test, Split.QUERY, "query_"), (test, Split.GALLERY, "gallery_"))
+    return [
+        SplitFolder(phase=phase, folder=f"{prefix}{view}", split=split, view=view)
+        for phase, split, prefix in phases
+        for view in views
+    ]
+
+
+def images_by_location(folder: str) -> Iterator[PlacedImage | Rejection]:
+    """All images at `<folder>/<location>/<image>`, ordered by path; an absent folder has none."""
+    if not storage.is_folder(folder):
+        return
+    for path, size in storage.walk(folder).items():
+        location, _, name = path.rpartition("/")
+        whole = storage.join(folder, path)
+        if not location or "/" in location:
+            yield wrong_folder(whole, f"{path} is not <location>/<image>")
+        elif not is_image(name):
+            yield not_an_image(whole)
+        else:
+            yield PlacedImage(path=whole, name=name, location=location, bytes=size)
+
+
+def wrong_folder(path: str, found: str) -> Rejection:
+    """A file that lies where the layout has none."""
+    return Rejection(path=path, reason="wrong folder", found=found)
+
+
+def checked(found: Iterable[ImageRecord | Rejection], root: str, layout: str) -> Iterator[ImageRecord | Rejection]:
+    """What a scan found, passed on. `layout` says in words what was expected at `root`.
+
+    Raises InputError when `root` is no folder, and at the end when not one image was found.
+    """
+    if not storage.is_folder(root):
+        raise InputError(f"no folder {root}; expected {layout}; check --root")
+    some = False
+    for item in found:
+        some = some or isinstance(item, ImageRecord)
+        yield item
+    if not some:
+        raise InputError(f"no images below {root}; expected {layout}; check --root")

@@ -1,0 +1,153 @@
+"""UAV-VisLoc's satellite maps -> where they lie on the earth, and the tiles that are cut from them.
+
+In: `satellite_coordinates_range.csv`, which gives the upper left and lower right corner of each map, and the maps,
+`<NN>/satellite<NN>.tif`. One of them is too large for one file and comes as `satellite<NN>_<row>-<column>.tif`, which share the
+corners of the whole. Out: maps, tiles, and a Rejection for whatever cannot be placed. Headers are read, no pixels.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from pipeline import storage
+from pipeline.records import GeoTag, InputError, Rejection
+from pipeline.sources.cutting import Window, grid, raster_size
+from pipeline.sources.tables import Unreadable, place, read_rows, unreadable_tag
+
+RANGE_TABLES = ("satellite_coordinates_range.csv", "satellite_ coordinates_range.csv")
+"The second, with a blank, is how the authors' archive spells it."
+CORNERS = ("LT_lat_map", "LT_lon_map", "RB_lat_map", "RB_lon_map")
+PART_OF_MAP = re.compile(r"(?P<whole>.+)_(?P<row>\d+)-(?P<column>\d+)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Corners:
+    """A rectangle of the earth, degrees."""
+
+    top: float
+    left: float
+    bottom: float
+    right: float
+
+    def __post_init__(self) -> None:
+        if not (self.top > self.bottom and self.right > self.left):
+            raise Unreadable("the lower right corner is not south-east of the upper left one")
+
+    def inside(self, y: float, x: float, y_end: float, x_end: float) -> "Corners":
+        """The rectangle between two fractions of the height and of the width."""
+        tall, wide = self.bottom - self.top, self.right - self.left
+        return Corners(
+            top=self.top + y * tall,
+            bottom=self.top + y_end * tall,
+            left=self.left + x * wide,
+            right=self.left + x_end * wide,
+        )
+
+    def holds(self, lat: float, lon: float) -> bool:
+        return self.bottom <= lat <= self.top and self.left <= lon <= self.right
+
+    def tag(self) -> GeoTag:
+        return GeoTag(
+            lat=(self.top + self.bottom) / 2,
+            lon=(self.left + self.right) / 2,
+            footprint=(
+                (self.top, self.left), (self.top, self.right), (self.bottom, self.right), (self.bottom, self.left)
+            ),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class SatelliteMap:
+    """One file of a map, placed."""
+
+    path: str
+    name: str
+    "The flight's, such as 01; of a part 09_01-02."
+    width: int
+    height: int
+    corners: Corners
+
+    def tiles(self, pixels: int, overlap: float) -> Iterator[tuple[str, Window, GeoTag]]:
+        """Name, such as 01-0003-0012 for row 3 and column 12, window and geotag of each tile."""
+        for (row, column), window in grid(self.width, self.height, pixels, overlap).items():
+            ends = (window.y + window.height) / self.height, (window.x + window.width) / self.width
+            where = self.corners.inside(window.y / self.height, window.x / self.width, *ends)
+            yield f"{self.name}-{row:04d}-{column:04d}", window, where.tag()
+
+
+def map_name(name: str) -> str:
+    """`satellite03.tif`, or `03.tif` as the authors' example has it -> `03`."""
+    return name.strip().lower().rsplit(".", 1)[0].removeprefix("satellite")
+
+
+def read_corners(root: str) -> tuple[dict[str, Corners], list[Rejection]]:
+    """Corners by the map's name.
+
+    Raises InputError when there is no such table.
+    """
+    path = next((path for table in RANGE_TABLES if storage.exists(path := storage.join(root, table))), None)
+    if path is None:
+        raise InputError(f"no {RANGE_TABLES[0]} in {root}; expected UAV-VisLoc's root, which holds it; check --root")
+    corners, rejected = {}, []
+    for line, row in read_rows(path, ("mapname", *CORNERS)):
+        try:
+            top, left = place(row["LT_lat_map"], row["LT_lon_map"])
+            bottom, right = place(row["RB_lat_map"], row["RB_lon_map"])
+            corners[map_name(row["mapname"])] = Corners(top=top, left=left, bottom=bottom, right=right)
+        except Unreadable as error:
+            rejected.append(unreadable_tag(path, line, ",".join(row.values()), error))
+    return corners, rejected
+
+
+def read_maps(folder: str, corners: dict[str, Corners]) -> tuple[list[SatelliteMap], list[Rejection]]:
+    """The maps in a flight's folder, ordered by name."""
+    maps: list[SatelliteMap] = []
+    parts: dict[str, dict[tuple[int, int], tuple[str, int, int]]] = {}
+    rejected = []
+    for file in storage.names(folder):
+        if not re.fullmatch(r"satellite.*\.tiff?", file, re.IGNORECASE):
+            continue
+        path, name = storage.join(folder, file), map_name(file)
+        part = PART_OF_MAP.fullmatch(name)
+        if name not in corners and not (part and part["whole"] in corners):
+            rejected.append(Rejection(path=path, reason="map without corners", found=f"no readable line names {file}"))
+            continue
+        try:
+            width, height = raster_size(path)
+        except OSError as error:
+            rejected.append(Rejection(path=path, reason="unreadable map", found=str(error)))
+            continue
+        if name in corners:
+            maps.append(SatelliteMap(path=path, name=name, width=width, height=height, corners=corners[name]))
+        elif part:
+            cell = int(part["row"]), int(part["column"])
+            parts.setdefault(part["whole"], {})[cell] = (path, width, height)
+    for whole, cells in parts.items():
+        try:
+            maps += _placed_parts(whole, cells, corners[whole])
+        except Unreadable as error:
+            rejected += [
+                Rejection(path=path, reason="incomplete map", found=str(error)) for path, _, _ in cells.values()
+            ]
+    return sorted(maps, key=lambda found: found.name), rejected
+
+
+def _placed_parts(
+    whole: str, cells: dict[tuple[int, int], tuple[str, int, int]], corners: Corners
+) -> Iterator[SatelliteMap]:
+    """Parts by row and column, from 1, each at its place in the whole. Raises Unreadable where they do not fill it."""
+    rows, columns = max(row for row, _ in cells), max(column for _, column in cells)
+    wanted = {(row, column) for row in range(1, rows + 1) for column in range(1, columns + 1)}
+    if set(cells) != wanted:
+        raise Unreadable(f"{len(cells)} parts in {rows} rows and {columns} columns, expected one for each")
+    heights = [cells[row, 1][2] for row in range(1, rows + 1)]
+    widths = [cells[1, column][1] for column in range(1, columns + 1)]
+    if any(cells[row, column][1:] != (widths[column - 1], heights[row - 1]) for row, column in wanted):
+        raise Unreadable("parts of one row differ in height, or parts of one column in width")
+    tall, wide = sum(heights), sum(widths)
+    for row, column in sorted(cells):
+        path, width, height = cells[row, column]
+        y, x = sum(heights[: row - 1]), sum(widths[: column - 1])
+        where = corners.inside(y / tall, x / wide, (y + height) / tall, (x + width) / wide)
+        name = f"{whole}_{row:02d}-{column:02d}"
+        yield SatelliteMap(path=path, name=name, width=width, height=height, corners=where)
