@@ -18,7 +18,7 @@ from pipeline.shards import Manifest, Shard
 
 FOLDER = "records"
 SCHEMA = pa.schema(
-    [pa.field(name, pa.string(), nullable=False) for name in ("key", "location", "view", "split", "shard")]
+    [pa.field(name, pa.string(), nullable=False) for name in ("key", "location", "view", "split", "variant", "shard")]
     + [(name, pa.float64()) for name in ("lat", "lon", "altitude_m", "heading_deg", "pitch_deg")]
     + [("footprint", pa.list_(pa.list_(pa.float64(), 2))), ("taken_at", pa.string())]
     + [pa.field(name, pa.string(), nullable=False) for name in ("source", "path", "part", "sha256")]

@@ -108,6 +108,7 @@ def read_member(record: ImageRecord, source: Source, check: Check) -> Member:
         decode(data)
     facts = {
         "key": record.key, "location": record.location, "view": record.view, "split": record.split,
+        "variant": record.variant,
         "geotag": None if record.geotag is None else asdict(record.geotag), "taken_at": record.taken_at,
         "source": name_of(source), "sha256": hashlib.sha256(data).hexdigest(), "width": width, "height": height,
     }  # fmt: skip

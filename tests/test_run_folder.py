@@ -135,9 +135,10 @@ def test_a_ray_worker_killed_is_replaced_and_the_run_goes_on_from_the_last_check
 ) -> None:
     recipe = replace(tiny(), schedule=replace(tiny().schedule, epochs=12))
     victims: list[int] = []
+    out = tmp_path / "killed"
 
     def murder() -> None:
-        while not (tmp_path / "last.pt").exists():
+        while not (out / "last.pt").exists():
             time.sleep(0.01)
         for process in Path("/proc").glob("[0-9]*"):
             if b"RayTrainWorker" in (process / "cmdline").read_bytes() and os.getpid() in ancestors(int(process.name)):
@@ -146,11 +147,13 @@ def test_a_ray_worker_killed_is_replaced_and_the_run_goes_on_from_the_last_check
 
     killer = threading.Thread(target=murder)
     killer.start()
-    train(settings(tiny_shards, tmp_path, recipe=recipe, workers=1))
+    train(settings(tiny_shards, out, recipe=recipe, workers=1))
     killer.join()
     assert len(victims) == 1
     assert "lost a worker" in capfd.readouterr().err
-    assert [row["epoch"] for row in rows(tmp_path)] == list(range(1, 13))
+    assert [row["epoch"] for row in rows(out)] == list(range(1, 13))
+    train(settings(tiny_shards, tmp_path / "whole", recipe=recipe, workers=1))
+    assert_same_run(out, tmp_path / "whole")
 
 
 def ancestors(process: int) -> list[int]:
