@@ -1,9 +1,10 @@
 """Imagery as found -> ImageRecords; one file per layout."""
 
+from pipeline.sources.geotiff import GeoTiff
 from pipeline.sources.source import Source
 from pipeline.sources.university1652 import University1652
 
-SOURCES: dict[str, type[Source]] = {"university1652": University1652}
+SOURCES: dict[str, type[Source]] = {"university1652": University1652, "geotiff": GeoTiff}
 "By the name that `--source` takes."
 
 
