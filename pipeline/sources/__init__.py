@@ -3,8 +3,9 @@
 from pipeline.sources.geotiff import GeoTiff
 from pipeline.sources.source import Source
 from pipeline.sources.university1652 import University1652
+from pipeline.sources.xyz import Xyz
 
-SOURCES: dict[str, type[Source]] = {"university1652": University1652, "geotiff": GeoTiff}
+SOURCES: dict[str, type[Source]] = {"university1652": University1652, "geotiff": GeoTiff, "xyz": Xyz}
 "By the name that `--source` takes."
 
 
