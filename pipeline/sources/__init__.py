@@ -1,11 +1,15 @@
 """Imagery as found -> ImageRecords; one file per layout."""
 
 from pipeline.sources.denseuav import DenseUAV
+from pipeline.sources.geotiff import GeoTiff
 from pipeline.sources.gta_uav import GtaUav
+from pipeline.sources.photos import Photos
 from pipeline.sources.source import Source
 from pipeline.sources.sues200 import Sues200
+from pipeline.sources.table import Table
 from pipeline.sources.university1652 import University1652
 from pipeline.sources.visloc import VisLoc
+from pipeline.sources.xyz import Xyz
 
 SOURCES: dict[str, type[Source]] = {
     "university1652": University1652,
@@ -13,6 +17,10 @@ SOURCES: dict[str, type[Source]] = {
     "denseuav": DenseUAV,
     "gta-uav": GtaUav,
     "visloc": VisLoc,
+    "photos": Photos,
+    "geotiff": GeoTiff,
+    "xyz": Xyz,
+    "table": Table,
 }
 "By the name that `--source` takes."
 

@@ -1,0 +1,127 @@
+"""Opened mosaics, and their windows as pictures. In: the path of a GeoTIFF, a window. Out: 8-bit RGB, the share of nodata.
+
+A GDAL data set may be used by one thread at a time, and not by a process forked from its own: each process and thread
+opens its own, once. Shapes: B bands, H x W pixels.
+"""
+
+import os
+import threading
+from collections import OrderedDict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import rasterio
+from PIL import Image
+from rasterio.enums import Resampling
+from rasterio.windows import Window as RasterWindow
+
+from pipeline import storage
+from pipeline.sources.colours import Colours, colours_of, to_8bit
+from pipeline.sources.tiles import Window
+from pipeline.transforms import Pixels
+
+HELD = 8  # data sets kept open per thread: tiles come in the order of their keys' hashes, from all mosaics in turn
+PILLOW = {
+    Resampling.average: Image.Resampling.BOX,
+    Resampling.bilinear: Image.Resampling.BILINEAR,
+    Resampling.cubic: Image.Resampling.BICUBIC,
+}
+_held = threading.local()
+
+
+def opened(path: str) -> Any:
+    """This process's and thread's data set of a GeoTIFF; do not close it.
+
+    Raises rasterio.errors.RasterioIOError when the file is none.
+    """
+    key = (os.getpid(), path, _version(path))
+    if not hasattr(_held, "datasets"):
+        _held.datasets = OrderedDict()
+    datasets: OrderedDict[Any, Any] = _held.datasets
+    if key not in datasets:
+        datasets[key] = _open(path)
+    datasets.move_to_end(key)
+    while len(datasets) > HELD:
+        datasets.popitem(last=False)[1].close()
+    return datasets[key]
+
+
+def _version(path: str) -> tuple[int, ...]:
+    """What changes when a local file is written again: a kept data set of it would show a mixture of both."""
+    if not storage.is_local(path):
+        return ()
+    try:
+        said = os.stat(storage.locate(path)[1])
+    except OSError:
+        return ()  # opening it says what is wrong
+    return said.st_mtime_ns, said.st_size
+
+
+def _open(path: str) -> Any:
+    # One driver: what a file's content would have others read (URLs, other files) is not for imagery from elsewhere.
+    filesystem, inner = storage.locate(path)
+    if storage.is_local(path):
+        return rasterio.open(Path(inner), driver="GTiff")
+    return rasterio.open(path, driver="GTiff", opener=filesystem)
+
+
+def colours(path: str, stretch: tuple[float, float] | None) -> Colours:
+    """How a mosaic's bands become RGB; found once per process, the same in all."""
+    return _colours(path, _version(path), stretch)
+
+
+@lru_cache(maxsize=256)
+def _colours(path: str, version: tuple[int, ...], stretch: tuple[float, float] | None) -> Colours:
+    return colours_of(opened(path), stretch)
+
+
+def nodata_share(path: str, window: Window, shown: Colours) -> float:
+    """The share of a window's pixels that hold no image, from 0 to 1: every pixel is looked at, at full resolution."""
+    with rasterio.Env():  # outside of one, GDAL prints its errors
+        valid_HW = _valid(opened(path), _raster(window), shown, (window.height, window.width), Resampling.nearest)
+    return 1 - float(valid_HW.mean())
+
+
+def picture(path: str, window: Window, size: tuple[int, int], resampling: Resampling, shown: Colours) -> Pixels:
+    """A window as (H, W, 3) RGB of `size` (width, height), black where it holds no image.
+
+    Where `size` is smaller GDAL reads the nearest finer overview. Raises rasterio.errors.RasterioIOError.
+    """
+    width, height = size
+    with rasterio.Env():
+        dataset, where = opened(path), _raster(window)
+        if shown.palette_N3 is not None:  # the mean of two indices is no colour: full resolution, shrunk as colours
+            index_HW = np.minimum(dataset.read(shown.bands[0], window=where), len(shown.palette_N3) - 1)
+            image = Image.fromarray(shown.palette_N3[index_HW])
+            if image.size != size:
+                image = image.resize(size, PILLOW[resampling])
+            rgb_HW3 = np.array(image)
+        else:
+            shape = (len(shown.bands), height, width)
+            values_BHW = dataset.read(list(shown.bands), window=where, out_shape=shape, resampling=resampling)
+            grey_or_rgb_HWB = np.moveaxis(to_8bit(values_BHW, shown.stretch), 0, -1)
+            rgb_HW3 = np.array(np.broadcast_to(grey_or_rgb_HWB, (height, width, 3)), order="C")
+        if shown.gaps:
+            rgb_HW3[~_valid(dataset, where, shown, (height, width), resampling)] = 0
+    return rgb_HW3
+
+
+def _valid(
+    dataset: Any, where: RasterWindow, shown: Colours, shape: tuple[int, int], resampling: Resampling
+) -> npt.NDArray[np.bool_]:
+    """(H, W), true where a mask, alpha or nodata value leaves any of the shown bands, and it is a finite number."""
+    bands = list(shown.bands[:1] if shown.one_mask else shown.bands)
+    masks_BHW = dataset.read_masks(bands, window=where, out_shape=(len(bands), *shape), resampling=resampling)
+    valid_HW: npt.NDArray[np.bool_] = (masks_BHW > 0).any(axis=0)
+    if np.issubdtype(np.dtype(dataset.dtypes[0]), np.floating):
+        bands = list(shown.bands)
+        values_BHW = dataset.read(bands, window=where, out_shape=(len(bands), *shape), resampling=resampling)
+        valid_HW &= np.isfinite(values_BHW).any(axis=0)
+    return valid_HW
+
+
+def _raster(window: Window) -> RasterWindow:
+    return RasterWindow(window.x, window.y, window.width, window.height)

@@ -1,0 +1,115 @@
+"""Tiles of web maps -> ImageRecords. In: folders `<zoom>/<x>/<y>.png` (jpg, webp), or an MBTiles file. Out: a record per tile.
+
+Each record carries where its tile lies, and the tile's own bytes are packed as they are.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from pipeline import storage
+from pipeline.progress import console
+from pipeline.records import ImageRecord, InputError, Rejection, Split, View
+from pipeline.sources import mbtiles
+from pipeline.sources.source import Source, is_image, not_an_image
+from pipeline.sources.web_mercator import DEEPEST, flipped, geotag, is_on_grid
+
+TILE = re.compile(r"(\d{1,2})/(\d{1,10})/(\d{1,10})\.(png|jpe?g|webp)", re.IGNORECASE | re.ASCII)
+LAYOUT = "<zoom>/<x>/<y>.png, .jpg or .webp"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Xyz(Source):
+    """Tiles of web maps: z/x/y folders or an MBTiles file."""
+
+    zoom: int | None = None
+    "Zoom whose tiles are taken; None: the deepest that is there."
+    tms: bool = False
+    "Whether a folder's rows count from the south, as TMS does. An MBTiles file says so itself."
+    view: View = View.SATELLITE
+    "From where the map is seen."
+    split: Split = Split.GALLERY
+    "The part of the data set that the tiles become."
+
+    def __post_init__(self) -> None:
+        if self.zoom is not None and not 0 <= self.zoom <= DEEPEST:
+            raise InputError(f"--zoom is {self.zoom}, expected a number from 0 to {DEEPEST}")
+
+    def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
+        if root.lower().endswith(".mbtiles") and storage.exists(root) and not storage.is_folder(root):
+            return self._scan_file(root)
+        if storage.is_folder(root):
+            return self._scan_folder(root)
+        raise InputError(f"no folder and no .mbtiles file at {root}; expected {LAYOUT} or MBTiles; check --root")
+
+    def read(self, record: ImageRecord) -> bytes:
+        """The tile's own bytes. Raises OSError."""
+        return mbtiles.tile_bytes(record.path, *_numbers(record.part)) if record.part else super().read(record)
+
+    def ending(self, record: ImageRecord) -> str:
+        return mbtiles.tile_kind(record.path, *_numbers(record.part)) if record.part else super().ending(record)
+
+    def _scan_file(self, root: str) -> Iterator[ImageRecord | Rejection]:
+        zoom = self._choose(root, mbtiles.zooms(root))
+        for tile in mbtiles.stored(root, zoom):
+            part = f"{zoom}-{tile.x}-{tile.y}"
+            if not is_on_grid(zoom, tile.x, tile.y):
+                yield _outside(f"{root}#{part}", zoom, tile.x, tile.y)
+            elif not tile.kind:
+                found = f"a tile that begins with {tile.start!r}"
+                yield Rejection(path=f"{root}#{part}", reason="not an image", found=found)
+            else:
+                yield self._record(root, part, zoom, tile.x, tile.y, None)
+
+    def _scan_folder(self, root: str) -> Iterator[ImageRecord | Rejection]:
+        files = storage.walk(root)
+        found = {path: TILE.fullmatch(path) for path in files}
+        there = {int(said[1]) for said in found.values() if said and int(said[1]) <= DEEPEST}
+        if not there and any(path.lower().endswith(mbtiles.VECTOR) for path in files):
+            raise InputError(f"{root} holds vector tiles, which show no pixels; expected {LAYOUT}")
+        zoom = self._choose(root, sorted(there))
+        for path, size in files.items():
+            said, whole = found[path], storage.join(root, path)
+            if not said or int(said[1]) > DEEPEST:
+                if is_image(path):
+                    yield Rejection(path=whole, reason="wrong folder", found=f"{path} is not {LAYOUT}")
+                elif "/" in path:  # beside the zooms lie a viewer's pages and descriptions
+                    yield not_an_image(whole)
+                continue
+            x, y = int(said[2]), int(said[3])
+            if int(said[1]) != zoom:
+                continue
+            if not is_on_grid(zoom, x, y):
+                yield _outside(whole, zoom, x, y)
+            else:
+                yield self._record(whole, "", zoom, x, flipped(zoom, y) if self.tms else y, size)
+
+    def _choose(self, root: str, there: list[int]) -> int:
+        """The zoom to take. Raises InputError where there is no tile of it."""
+        if not there:
+            raise InputError(f"no tiles in {root}; expected {LAYOUT} or MBTiles; check --root")
+        zoom = there[-1] if self.zoom is None else self.zoom
+        if zoom not in there:
+            raise InputError(
+                f"no tiles of zoom {zoom} in {root}; it holds zooms {', '.join(map(str, there))}; choose one"
+            )
+        if self.zoom is None and len(there) > 1:
+            others = ", ".join(map(str, there[:-1]))
+            console.print(f"{root}: taking zoom {zoom}, the deepest; --zoom takes another of {others}", markup=False)
+        return zoom
+
+    def _record(self, path: str, part: str, zoom: int, x: int, y: int, size: int | None) -> ImageRecord:
+        """`y` from the north: a place has one name whatever its file counts from."""
+        return ImageRecord(
+            path=path, part=part, split=self.split, view=self.view,
+            location=f"{zoom}-{x}-{y}", geotag=geotag(zoom, x, y), bytes=size,
+        )  # fmt: skip
+
+
+def _numbers(part: str) -> tuple[int, int, int]:
+    zoom, x, y = map(int, part.split("-"))
+    return zoom, x, y
+
+
+def _outside(path: str, zoom: int, x: int, y: int) -> Rejection:
+    return Rejection(path=path, reason="outside of the map", found=f"{x}, {y}; zoom {zoom} has 0 to {2**zoom - 1}")
