@@ -1,9 +1,10 @@
 """Imagery as found -> ImageRecords; one file per layout."""
 
+from pipeline.sources.photos import Photos
 from pipeline.sources.source import Source
 from pipeline.sources.university1652 import University1652
 
-SOURCES: dict[str, type[Source]] = {"university1652": University1652}
+SOURCES: dict[str, type[Source]] = {"university1652": University1652, "photos": Photos}
 "By the name that `--source` takes."
 
 
