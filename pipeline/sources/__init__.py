@@ -2,9 +2,10 @@
 
 from pipeline.sources.photos import Photos
 from pipeline.sources.source import Source
+from pipeline.sources.table import Table
 from pipeline.sources.university1652 import University1652
 
-SOURCES: dict[str, type[Source]] = {"university1652": University1652, "photos": Photos}
+SOURCES: dict[str, type[Source]] = {"university1652": University1652, "photos": Photos, "table": Table}
 "By the name that `--source` takes."
 
 
