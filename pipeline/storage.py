@@ -85,6 +85,13 @@ def read_bytes(path: str) -> bytes:
     return data
 
 
+def read_head(path: str, size: int) -> bytes:
+    """The first `size` bytes of a file, or all of it where it is shorter; of a remote file no more is fetched."""
+    filesystem, inner = locate(path)
+    data: bytes = filesystem.cat_file(inner, start=0, end=size)
+    return data
+
+
 def read_json(path: str) -> Any:
     return json.loads(read_bytes(path))
 

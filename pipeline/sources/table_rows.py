@@ -1,0 +1,136 @@
+"""A CSV, Parquet or GeoJSON file -> numbered rows with our column names, values as they stand there.
+
+In: a file on any storage. Out: (row number from 1, {column: value}) in the file's order. Cells are not judged here, only the
+file and its columns are.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline import storage
+from pipeline.records import InputError
+from pipeline.sources.geojson_shapes import shape_of
+
+REQUIRED = "path"
+COLUMNS = (REQUIRED, "view", "split", "location", "lat", "lon", "altitude_m", "heading_deg", "pitch_deg", "taken_at")
+ALIASES = {"latitude": "lat", "longitude": "lon", "lng": "lon"}
+NUMBERS = ("lat", "lon", "altitude_m", "heading_deg", "pitch_deg")
+SHAPE = "shape"
+"Under this name a GeoJSON row holds its geometry, a Shape."
+BROKEN = "broken"
+"Under this name a row of CSV that has more or fewer cells than the header says how many."
+DELIMITERS = ",;\t"
+BATCH = 10_000  # rows of Parquet at once
+
+Row = dict[str, Any]
+
+
+def read_rows(path: str) -> Iterator[tuple[int, Row]]:
+    """The rows of a table. Row 1 is the first below a CSV's header.
+
+    Columns besides ours are left out; names are matched without regard to case. Raises InputError where the file is no table of
+    images.
+    """
+    readers = {"csv": _csv, "tsv": _csv, "parquet": _parquet, "geojson": _geojson, "json": _geojson}
+    kinds = f".{', .'.join(readers)}"
+    if storage.is_folder(path):
+        raise InputError(f"{path} is a folder, expected a table of images ({kinds}); give --root the file itself")
+    if not storage.exists(path):
+        raise InputError(f"no file {path}; expected a table of images ({kinds}); check --root")
+    ending = path.rpartition("/")[2].rpartition(".")[2].lower()
+    if ending not in readers:
+        raise InputError(f"{path} is no table by its name, expected {kinds}; write the table as one of these")
+    return enumerate(readers[ending](path), 1)
+
+
+def _columns(path: str, found: Iterable[str]) -> dict[str, str]:
+    """The file's names of our columns -> our names."""
+    names = list(found)
+    ours: dict[str, str] = {}
+    for name in names:
+        plain = name.strip().lower()
+        column = ALIASES.get(plain, plain)
+        if column not in COLUMNS:
+            continue
+        if column in ours.values():
+            raise InputError(f"{path} has two columns for {column}: {', '.join(names)}; expected one; take one away")
+        ours[name] = column
+    half = {"lat", "lon"} & set(ours.values())
+    missing = [name for name in (REQUIRED, *({"lat", "lon"} if len(half) == 1 else ())) if name not in ours.values()]
+    if missing:
+        raise InputError(
+            f"{path} has no column {missing[0]} but {', '.join(names) or 'none'}; expected {REQUIRED} and any of "
+            f"{', '.join(COLUMNS[1:])}; add it or rename one"
+        )
+    return ours
+
+
+def _csv(path: str) -> Iterator[Row]:
+    """Every cell as text: a location called 0001 stays so."""
+    with storage.open_read(path) as stream, io.TextIOWrapper(stream, "utf-8-sig", newline="") as text:
+        try:
+            header = text.readline()
+            delimiter = max(DELIMITERS, key=header.count)  # the first of them in a table of one column
+            lines = csv.reader(text, delimiter=delimiter)
+            names = next(csv.reader([header], delimiter=delimiter), [])
+            ours = _columns(path, names)
+            for cells in lines:
+                if not cells:
+                    continue  # an empty line
+                row: Row = {ours[name]: cell for name, cell in zip(names, cells, strict=False) if name in ours}
+                if len(cells) != len(names):  # an unquoted comma in a name shifts all that follows
+                    row[BROKEN] = f"{len(cells)} cells below {len(names)} columns"
+                if delimiter != ",":  # a spreadsheet of half of the world: 50,1
+                    row |= {name: row[name].replace(",", ".") for name in NUMBERS if name in row}
+                yield row
+        except UnicodeDecodeError as error:
+            raise InputError(
+                f"{path} is not UTF-8 (byte {error.object[error.start]:#04x}); expected UTF-8 with or without BOM; save it "
+                "again as UTF-8, or `iconv -f latin1 -t utf8` it"
+            ) from None
+        except csv.Error as error:
+            raise InputError(f"{path} cannot be read as CSV ({error}); expected a header and a row per image") from None
+
+
+def _parquet(path: str) -> Iterator[Row]:
+    with storage.open_read(path) as stream:
+        try:
+            table = pq.ParquetFile(stream)
+            ours = _columns(path, table.schema_arrow.names)
+            for batch in table.iter_batches(BATCH, columns=list(ours)):
+                for row in batch.to_pylist():
+                    yield {ours[name]: value for name, value in row.items()}
+        except (pa.ArrowException, OSError) as error:
+            raise InputError(
+                f"{path} cannot be read as Parquet ({error}); expected a Parquet file; write it again"
+            ) from None
+
+
+def _geojson(path: str) -> Iterator[Row]:
+    """Features' properties and, under SHAPE, what their geometries say; a geometry goes before properties lat and lon."""
+    try:
+        said = json.loads(storage.read_bytes(path).decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"{path} cannot be read as JSON ({error}); expected GeoJSON in UTF-8; write it again"
+        ) from None
+    features = said.get("features") if isinstance(said, dict) and said.get("type") == "FeatureCollection" else None
+    if not isinstance(features, list):
+        raise InputError(f"{path} holds no FeatureCollection; expected GeoJSON with a feature per image")
+    system = str(said.get("crs") or "CRS84")
+    if "CRS84" not in system and "4326" not in system:
+        raise InputError(f"{path} has coordinates in {system}; expected longitude and latitude, WGS84; reproject it")
+    features = [feature if isinstance(feature, dict) else {} for feature in features]
+    told = [given if isinstance(given := feature.get("properties"), dict) else {} for feature in features]
+    names = dict.fromkeys(name for properties in told for name in properties)
+    ours = _columns(path, names) if features else {}
+    for feature, properties in zip(features, told, strict=True):
+        row = {ours[name]: value for name, value in properties.items() if name in ours}
+        shape = shape_of(feature.get("geometry"))
+        yield row | ({} if shape is None else {SHAPE: shape})
