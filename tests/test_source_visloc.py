@@ -3,7 +3,6 @@
 import io
 import pickle
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import rasterio
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
 from pipeline.records import GeoTag, ImageRecord, InputError, Rejection
-from pipeline.sources.cutting import Window, grid, starts
+from pipeline.sources.tiles import window_of
 from pipeline.sources.visloc import VisLoc
-from pipeline.transforms import DecodeError
 
 RANGES = "mapname,LT_lat_map,LT_lon_map,RB_lat_map,RB_lon_map,region\n"
 PHOTOS = "num,filename,date,lat,lon,height,Omega,Kappa,Phi1,Phi2\n"
@@ -96,16 +92,16 @@ def test_a_tile_is_the_maps_pixels_and_knows_its_centre_and_corners(tmp_path: Pa
     assert sorted(tiles) == [f"01-000{row}-000{column}" for row in range(2) for column in range(3)]
     found = tiles["01-0001-0002"]
     assert (found.key, found.split, found.part) == (
-        "gallery-satellite-01-0001-0002-40-20-20-20",
+        "gallery-satellite-01-0001-0002-x0000040-y0000020-w20-h20",
         "gallery",
-        "40-20-20-20",
+        "x0000040-y0000020-w20-h20",
     )
     assert found.geotag is not None
     assert (found.geotag.lat, found.geotag.lon) == pytest.approx((30.01, 120.05))
     assert found.geotag.footprint is not None
     assert np.allclose(found.geotag.footprint, [(30.02, 120.04), (30.02, 120.06), (30.0, 120.06), (30.0, 120.04)])
     for record in tiles.values():
-        window = Window.of_part(record.part)
+        window = window_of(record.part)
         expected = MAP_HWC[window.y : window.y + 20, window.x : window.x + 20]
         assert np.array_equal(pixels(source.read(record)), expected)
         assert source.ending(record) == "png"
@@ -115,14 +111,14 @@ def test_a_tile_is_the_maps_pixels_and_knows_its_centre_and_corners(tmp_path: Pa
 def test_overlapping_tiles_cover_the_edge_with_whole_tiles(tmp_path: Path) -> None:
     records, _ = scanned(miniature(tmp_path), tile(tile_pixels=30, overlap=0.5))
     windows = [record.part for record in records if record.part]
-    assert windows == [f"{x}-{y}-30-30" for y in (0, 10) for x in (0, 15, 30)]
+    assert windows == [f"x{x:07d}-y{y:07d}-w30-h30" for y in (0, 10) for x in (0, 15, 30)]
 
 
 def test_a_map_smaller_than_a_tile_is_one_tile(tmp_path: Path) -> None:
     source = tile(tile_pixels=1024)
     records, _ = scanned(miniature(tmp_path), source)
     tiles = [record for record in records if record.part]
-    assert [record.part for record in tiles] == ["0-0-60-40"]
+    assert [record.part for record in tiles] == ["x0000000-y0000000-w60-h40"]
     assert np.array_equal(pixels(source.read(tiles[0])), MAP_HWC)
     assert {record.location for record in records} == {"01-0000-0000"}
 
@@ -146,7 +142,9 @@ def test_grey_maps_and_maps_with_transparency_are_read_too(tmp_path: Path, bands
     four = np.dstack([MAP_HWC, np.full((40, 60), 255, np.uint8)])
     tiff(root / "01/satellite01.tif", four[:, :, :bands])
     records, _ = scanned(root, tile())
-    expected = MAP_HWC[20:40, 40:60, 0] if bands == 1 else MAP_HWC[20:40, 40:60]
+    expected = MAP_HWC[20:40, 40:60]
+    if bands == 1:
+        expected = np.repeat(expected[:, :, :1], 3, axis=2)
     assert np.array_equal(pixels(tile().read(records[-1])), expected)
 
 
@@ -158,12 +156,15 @@ def test_a_map_that_does_not_say_itself_where_it_lies_is_read_without_a_warning(
     assert np.array_equal(pixels(tile().read(records[-1])), MAP_HWC[20:40, 40:60])
 
 
-def test_a_map_of_16_bits_is_refused_when_it_is_read(tmp_path: Path) -> None:
+def test_a_map_of_16_bits_is_stretched_as_a_whole(tmp_path: Path) -> None:
     root = miniature(tmp_path)
-    tiff(root / "01/satellite01.tif", MAP_HWC.astype(np.uint16))
+    ramp = np.dstack([np.tile(np.arange(60, dtype=np.uint16) * 100 + 1000, (40, 1))] * 3)
+    tiff(root / "01/satellite01.tif", ramp)
     records, _ = scanned(root, tile())
-    with pytest.raises(DecodeError, match="not 8 bits a band"):
-        tile().read(records[-1])
+    tiles = [pixels(tile().read(record)) for record in records if record.part]
+    assert tiles[0][0, 0, 0] == 0
+    assert tiles[2][0, -1, 0] == 255
+    assert np.array_equal(tiles[0], tiles[3])  # one row below
 
 
 def test_flights_for_training_keep_the_tiles_that_a_photo_shows(tmp_path: Path) -> None:
@@ -302,24 +303,6 @@ def test_a_source_that_has_read_can_still_be_sent_to_workers_and_read_in_threads
     sent = pickle.loads(pickle.dumps(source))
     with ThreadPoolExecutor(4) as pool:
         for record, data in zip(tiles, pool.map(sent.read, tiles), strict=True):
-            window = Window.of_part(record.part)
+            window = window_of(record.part)
             expected = MAP_HWC[window.y : window.y + window.height, window.x : window.x + window.width]
             assert np.array_equal(pixels(data), expected)
-
-
-@given(st.integers(1, 500), st.integers(1, 600), st.floats(0, 0.99))
-def test_tiles_cover_a_line_from_end_to_end_without_a_gap(length: int, side: int, overlap: float) -> None:
-    found = starts(length, side, overlap)
-    assert found[0] == 0
-    assert found == sorted(set(found))
-    assert found[-1] + min(side, length) == length
-    assert all(after - before <= side for before, after in pairwise(found))
-
-
-@given(st.integers(1, 90), st.integers(1, 90), st.integers(5, 60))
-def test_a_grid_covers_every_pixel(width: int, height: int, side: int) -> None:
-    seen = np.zeros((height, width), bool)
-    for window in grid(width, height, side, 0.25).values():
-        seen[window.y : window.y + window.height, window.x : window.x + window.width] = True
-        assert (window.width, window.height) == (min(side, width), min(side, height))
-    assert seen.all()

@@ -3,32 +3,27 @@
 Tiles are told from coordinates and masks alone; their pixels are cut out, and encoded, when they are read.
 """
 
-import io
 import os
-import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import simplejpeg
-from PIL import Image
 from rasterio.enums import Resampling
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import RasterioError
 
 from pipeline import storage
 from pipeline.progress import console, progress
 from pipeline.records import ImageRecord, InputError, Rejection, Split, View
 from pipeline.sources.colours import Colours
 from pipeline.sources.georeference import Georeference, named_crs
-from pipeline.sources.mosaic import colours, nodata_share, opened, picture
+from pipeline.sources.mosaic import Encoding, colours, encoded, first_cause, nodata_share, opened
 from pipeline.sources.source import Source
 from pipeline.sources.tiles import Tile, plan_tiles, window_of
-from pipeline.transforms import DecodeError, Pixels
+from pipeline.transforms import DecodeError
 
 TILE_PIXELS = 512  # where no size is asked for
-JPEG_QUALITY = 95  # with full colour resolution: what is lost cannot be seen, a tenth of PNG's size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +46,7 @@ class GeoTiff(Source):
     "Values that become black and white. None: 8-bit as it is, else the 2nd and 98th percentile of the whole mosaic."
     crs: str | None = None
     "Coordinate system, such as EPSG:32633, of files that name none."
-    encoding: Literal["jpg", "png"] = "jpg"
+    encoding: Encoding = "jpg"
     "Of the tiles: jpg of quality 95 with full colour resolution, or png without loss."
     view: View = View.SATELLITE
     "From where the mosaic is seen."
@@ -90,33 +85,22 @@ class GeoTiff(Source):
             except _Refused as refused:
                 yield Rejection(path=path, reason=refused.reason, found=refused.found)
             except RasterioError as error:
-                yield Rejection(path=path, reason="damaged image", found=_first_cause(error))
+                yield Rejection(path=path, reason="damaged image", found=first_cause(error))
 
     def read(self, record: ImageRecord) -> bytes:
         """The tile, encoded; the same bytes each time. Raises DecodeError."""
         window = window_of(record.part)
         size = (window.width, window.height)
-        try:
-            if self.output_pixels is not None:  # the same scale for the smaller tile of a smaller mosaic
-                dataset = opened(record.path)
-                whole = self._tile_size(dataset, self._georeference(dataset))
-                width, height = (self.output_pixels * part / side for part, side in zip(size, whole, strict=True))
-                size = (max(1, round(width)), max(1, round(height)))
-            shown = colours(record.path, self.stretch)
-            return encode(picture(record.path, window, size, Resampling[self.resampling], shown), self.encoding)
-        except RasterioError as error:
-            raise DecodeError("damaged image", _first_cause(error)) from None
-        except _Refused as refused:  # another file than the one that was scanned
-            raise DecodeError(refused.reason, refused.found) from None
+        if self.output_pixels is not None:  # the same scale for the smaller tile of a smaller mosaic
+            size = self._output_size(record.path, size, self.output_pixels)
+        return encoded(record.path, window, self.encoding, size, Resampling[self.resampling], self.stretch)
 
     def ending(self, record: ImageRecord) -> str:
         return self.encoding
 
     def _tiles(self, path: str, name: str) -> Iterator[ImageRecord]:
         """The tiles of one mosaic. Raises _Refused, RasterioError."""
-        with warnings.catch_warnings():  # a file without coordinates is refused, or has them from --crs
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            dataset = opened(path)
+        dataset = opened(path)
         if np.issubdtype(np.dtype(dataset.dtypes[0]), np.complexfloating):
             raise _Refused("not a picture", f"{dataset.dtypes[0]} values; expected integers or floats")
         place = self._georeference(dataset)
@@ -132,7 +116,6 @@ class GeoTiff(Source):
         console.print(
             f"{name}: {dataset.width} x {dataset.height} px of {across:.3g} x {down:.3g} m, {place.name}, {shown.said}, "
             f"{len(placed):,} tiles of {first.width} x {first.height} px{left_out}",
-            markup=False,
         )
         for tile, tag in placed:
             yield ImageRecord(
@@ -160,6 +143,18 @@ class GeoTiff(Source):
             return (self.tile_pixels or TILE_PIXELS,) * 2
         across, down = place.ground_pixel((dataset.width / 2, dataset.height / 2))
         return max(1, round(self.tile_m / across)), max(1, round(self.tile_m / down))
+
+    def _output_size(self, path: str, size: tuple[int, int], side_out: int) -> tuple[int, int]:
+        """(width, height) in which a window of `size` is written, a whole tile with `side_out`. Raises DecodeError."""
+        try:
+            dataset = opened(path)
+            whole = self._tile_size(dataset, self._georeference(dataset))
+        except RasterioError as error:
+            raise DecodeError("damaged image", first_cause(error)) from None
+        except _Refused as refused:  # another file than the one that was scanned
+            raise DecodeError(refused.reason, refused.found) from None
+        width, height = (side_out * part / side for part, side in zip(size, whole, strict=True))
+        return max(1, round(width)), max(1, round(height))
 
     def _without_nodata(self, path: str, tiles: list[Tile], shown: Colours) -> list[Tile]:
         """The tiles that hold enough of an image. Masks are read only where the mosaic has any, in threads."""
@@ -199,20 +194,3 @@ def mosaics(root: str) -> Iterator[tuple[str, str]]:
         yield root, root.rsplit("/", 1)[-1].rsplit(".", 1)[0]
     else:
         raise InputError(f"nothing at {root}; expected a GeoTIFF mosaic, or a folder of them; check --root")
-
-
-def encode(image_HW3: Pixels, encoding: Literal["jpg", "png"]) -> bytes:
-    """RGB as an image file; the same pixels give the same bytes."""
-    if encoding == "jpg":
-        jpeg: bytes = simplejpeg.encode_jpeg(image_HW3, quality=JPEG_QUALITY, colorspace="RGB", colorsubsampling="444")
-        return jpeg
-    stream = io.BytesIO()
-    Image.fromarray(image_HW3).save(stream, "PNG")
-    return stream.getvalue()
-
-
-def _first_cause(error: BaseException) -> str:
-    """What GDAL said first; rasterio's own words above it say that something was said."""
-    while error.__cause__ is not None:
-        error = error.__cause__
-    return str(error)

@@ -1,28 +1,35 @@
-"""Opened mosaics, and their windows as pictures. In: the path of a GeoTIFF, a window. Out: 8-bit RGB, the share of nodata.
+"""Opened mosaics, and their windows as pictures. In: the path of a TIFF, a window. Out: 8-bit RGB or an image file of it,
+the share of nodata.
 
 A GDAL data set may be used by one thread at a time, and not by a process forked from its own: each process and thread
 opens its own, once. Shapes: B bands, H x W pixels.
 """
 
+import io
 import os
 import threading
+import warnings
 from collections import OrderedDict
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import rasterio
+import simplejpeg
 from PIL import Image
 from rasterio.enums import Resampling
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window as RasterWindow
 
 from pipeline import storage
 from pipeline.sources.colours import Colours, colours_of, to_8bit
 from pipeline.sources.tiles import Window
-from pipeline.transforms import Pixels
+from pipeline.transforms import DecodeError, Pixels
 
+Encoding = Literal["jpg", "png"]
+JPEG_QUALITY = 95  # with full colour resolution: what is lost cannot be seen, a tenth of PNG's size
 HELD = 8  # data sets kept open per thread: tiles come in the order of their keys' hashes, from all mosaics in turn
 PILLOW = {
     Resampling.average: Image.Resampling.BOX,
@@ -30,6 +37,7 @@ PILLOW = {
     Resampling.cubic: Image.Resampling.BICUBIC,
 }
 _held = threading.local()
+_opening = threading.Lock()  # the filters of warnings belong to the whole process
 
 
 def opened(path: str) -> Any:
@@ -63,9 +71,11 @@ def _version(path: str) -> tuple[int, ...]:
 def _open(path: str) -> Any:
     # One driver: what a file's content would have others read (URLs, other files) is not for imagery from elsewhere.
     filesystem, inner = storage.locate(path)
-    if storage.is_local(path):
-        return rasterio.open(Path(inner), driver="GTiff")
-    return rasterio.open(path, driver="GTiff", opener=filesystem)
+    with _opening, warnings.catch_warnings():  # whoever needs coordinates looks for them
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        if storage.is_local(path):
+            return rasterio.open(Path(inner), driver="GTiff")
+        return rasterio.open(path, driver="GTiff", opener=filesystem)
 
 
 def colours(path: str, stretch: tuple[float, float] | None) -> Colours:
@@ -107,6 +117,42 @@ def picture(path: str, window: Window, size: tuple[int, int], resampling: Resamp
         if shown.gaps:
             rgb_HW3[~_valid(dataset, where, shown, (height, width), resampling)] = 0
     return rgb_HW3
+
+
+def encoded(
+    path: str,
+    window: Window,
+    encoding: Encoding,
+    size: tuple[int, int] | None = None,
+    resampling: Resampling = Resampling.average,
+    stretch: tuple[float, float] | None = None,
+) -> bytes:
+    """A window as an image file of `size`, by default its own; the same bytes each time.
+
+    Raises DecodeError where the mosaic cannot be read.
+    """
+    try:
+        own = (window.width, window.height)
+        return encode(picture(path, window, size or own, resampling, colours(path, stretch)), encoding)
+    except RasterioError as error:
+        raise DecodeError("damaged image", first_cause(error)) from None
+
+
+def encode(image_HW3: Pixels, encoding: Encoding) -> bytes:
+    """RGB as an image file; the same pixels give the same bytes."""
+    if encoding == "jpg":
+        jpeg: bytes = simplejpeg.encode_jpeg(image_HW3, quality=JPEG_QUALITY, colorspace="RGB", colorsubsampling="444")
+        return jpeg
+    stream = io.BytesIO()
+    Image.fromarray(image_HW3).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def first_cause(error: BaseException) -> str:
+    """What GDAL said first; rasterio's own words above it say that something was said."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return str(error)
 
 
 def _valid(

@@ -15,10 +15,11 @@ import numpy as np
 
 from pipeline import storage
 from pipeline.records import GeoTag, ImageRecord, InputError, Rejection, Split, View
-from pipeline.sources.cutting import Encoding, Window, read_window
 from pipeline.sources.folders import checked, wrong_folder
+from pipeline.sources.mosaic import Encoding, encoded
 from pipeline.sources.source import Source, is_image, not_an_image
 from pipeline.sources.tables import Unreadable, optional_number, place, read_rows, unreadable_tag
+from pipeline.sources.tiles import window_of
 from pipeline.sources.visloc_maps import Corners, read_corners, read_maps
 
 LAYOUT = "UAV-VisLoc's root, which holds satellite_coordinates_range.csv and <NN>/{drone/,satellite<NN>.tif,<NN>.csv}"
@@ -47,7 +48,7 @@ class VisLoc(Source):
     def read(self, record: ImageRecord) -> bytes:
         if not record.part:
             return super().read(record)
-        return read_window(record.path, Window.of_part(record.part), self.encoding)
+        return encoded(record.path, window_of(record.part), self.encoding)
 
     def ending(self, record: ImageRecord) -> str:
         return self.encoding if record.part else super().ending(record)

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 from pipeline import storage
 from pipeline.records import GeoTag, InputError, Rejection
-from pipeline.sources.cutting import Window, grid, raster_size
+from pipeline.sources.mosaic import opened
 from pipeline.sources.tables import Unreadable, place, read_rows, unreadable_tag
+from pipeline.sources.tiles import Window, plan_tiles
 
 RANGE_TABLES = ("satellite_coordinates_range.csv", "satellite_ coordinates_range.csv")
 "The second, with a blank, is how the authors' archive spells it."
@@ -69,10 +70,11 @@ class SatelliteMap:
 
     def tiles(self, pixels: int, overlap: float) -> Iterator[tuple[str, Window, GeoTag]]:
         """Name, such as 01-0003-0012 for row 3 and column 12, window and geotag of each tile."""
-        for (row, column), window in grid(self.width, self.height, pixels, overlap).items():
+        for tile in plan_tiles((self.width, self.height), (pixels, pixels), overlap):
+            window = tile.window
             ends = (window.y + window.height) / self.height, (window.x + window.width) / self.width
             where = self.corners.inside(window.y / self.height, window.x / self.width, *ends)
-            yield f"{self.name}-{row:04d}-{column:04d}", window, where.tag()
+            yield f"{self.name}-{tile.row:04d}-{tile.column:04d}", window, where.tag()
 
 
 def map_name(name: str) -> str:
@@ -113,7 +115,7 @@ def read_maps(folder: str, corners: dict[str, Corners]) -> tuple[list[SatelliteM
             rejected.append(Rejection(path=path, reason="map without corners", found=f"no readable line names {file}"))
             continue
         try:
-            width, height = raster_size(path)
+            width, height = opened(path).shape[::-1]
         except OSError as error:
             rejected.append(Rejection(path=path, reason="unreadable map", found=str(error)))
             continue
