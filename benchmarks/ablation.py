@@ -8,7 +8,7 @@ again, it goes on after the last finished run.
     python benchmarks/ablation.py --textures IMAGES --out DIR
 
 `--other-sensor` gives all satellite images another camera's look: a gap between the views that the adversary could close.
-`--alpha-scale` and `--discriminator-rate` vary what the paper fixes.
+`--alpha-scale`, `--discriminator-rate` and `--joint-bn` vary what the paper and LPN fix.
 """
 
 import argparse
@@ -48,7 +48,7 @@ IMAGE = 64
 PAPER_PERIOD = 140
 PROBED = 256
 "Images of each view that the probe for the views' gap is shown."
-VARIED = ("period", "alpha_scale", "discriminator_rate", "other_sensor")
+VARIED = ("period", "alpha_scale", "discriminator_rate", "other_sensor", "joint_bn")
 "Arguments that a row of the results is for, beside recipe and seed."
 
 
@@ -153,7 +153,9 @@ def run(recipe: Recipe, shards: str, backbone: dict[str, Tensor] | None, watch: 
         batch_size=recipe.batch_size, image_size=IMAGE, augmentation=recipe.augmentation, seed=recipe.seed, threads=2
     )
     stream = TrainingStream(shards, reading)
-    training = Training(recipe.network, recipe.optimisation, len(stream.classes), adversary=recipe.adversary)
+    training = Training(
+        recipe.network, recipe.optimisation, len(stream.classes), adversary=recipe.adversary, joint_bn=recipe.joint_bn
+    )
     if backbone is not None:
         load_backbone(training.learner.encoder.backbone, backbone, "the backbone from towns")
     for epoch in range(recipe.schedule.epochs):
@@ -179,6 +181,7 @@ def main() -> None:
     parser.add_argument("--recipes", nargs="*", default=list(COMPARED))
     parser.add_argument("--discriminator-rate", type=float, default=0.002, help="D's learning rate [paper: 0.002]")
     parser.add_argument("--other-sensor", action="store_true", help="satellite images look as another camera's")
+    parser.add_argument("--joint-bn", action="store_true", help="the encoder sees both views in one batch")
     given = parser.parse_args()
     out: Path = given.out.absolute()
     towns = flights(out, "towns", train_locations=300, test_locations=1, distractors=0, views=12)
@@ -207,7 +210,8 @@ def main() -> None:
             known = {"recipe": name, "seed": seed} | varied
             if any(known.items() <= row.items() for row in rows):
                 continue
-            recipe = replace(scaled(name, given.period, given.alpha_scale, given.discriminator_rate), seed=seed)
+            recipe = scaled(name, given.period, given.alpha_scale, given.discriminator_rate)
+            recipe = replace(recipe, seed=seed, joint_bn=given.joint_bn)
             began, curve = time.monotonic(), []
 
             def watch(training: Training, epoch: int, sums: dict[str, float]) -> None:

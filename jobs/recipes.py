@@ -30,6 +30,9 @@ class Recipe:
     "Of the networks' products: float32, bfloat16 by autocast, or auto: bfloat16 on CUDA, float32 on a CPU [chosen]."
     sync_bn: bool = False
     "Whether BatchNorm's statistics are those of all workers' images; GPUs only [chosen: each worker's own]."
+    joint_bn: bool = False
+    """Whether the encoder sees both views in one batch, so that BatchNorm's statistics are common to them [LPN: a view's own;
+    where the views' sensors differ much, those leave the network untested in training as it will be used]."""
     hold_out: float = 0.0
     "Share of the training locations that is not trained on but looked at every `probe_epochs` [chosen: none]."
 

@@ -177,7 +177,8 @@ def fresh(run: Run, place: Place, locations: int) -> Training:
     training = Training(
         recipe.network, recipe.optimisation, locations,
         adversary=recipe.adversary, device=place.device, distribute=place.distribute, precision=recipe.precision,
-        sync_bn=recipe.sync_bn and place.world > 1, compile_for=recipe.batch_size if run.compile else None,
+        sync_bn=recipe.sync_bn and place.world > 1, joint_bn=recipe.joint_bn,
+        compile_for=recipe.batch_size if run.compile else None,
     )  # fmt: skip
     if run.weights is not None:
         load_backbone(training.learner.encoder.backbone, read_state_dict(run.weights), run.weights)

@@ -45,16 +45,23 @@ class Optimisation:
 class Learner(nn.Module):
     """Encoder and classifier as one module: one forward pass an iteration, which is what DDP wants to see.
 
-    The encoder runs once per view, so that BatchNorm's statistics are a view's own [LPN].
+    The encoder runs once per view, so that BatchNorm's statistics are a view's own [LPN]; with `joint_bn` once on both, so
+    that they are common. Only common ones are what the encoder will be tested with, its running means.
     """
 
-    def __init__(self, config: PVDAConfig, locations: int) -> None:
+    def __init__(self, config: PVDAConfig, locations: int, joint_bn: bool = False) -> None:
         super().__init__()
+        self.joint_bn = joint_bn
         self.encoder = FeatureEncoder(config)
         self.classifier = LocationClassifier(config, locations)
 
     def forward(self, images1_B3HW: Tensor, images2_B3HW: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """UAV and satellite images -> maps of each (B, C, H, W), location logits of each (B, P, L)."""
+        if self.joint_bn:
+            count = len(images1_B3HW)
+            maps_BCHW, g_BPD = self.encoder(torch.cat([images1_B3HW, images2_B3HW]))
+            logits_BPL = self.classifier(g_BPD)
+            return maps_BCHW[:count], maps_BCHW[count:], logits_BPL[:count], logits_BPL[count:]
         maps1_BCHW, g1_BPD = self.encoder(images1_B3HW)
         maps2_BCHW, g2_BPD = self.encoder(images2_B3HW)
         return maps1_BCHW, maps2_BCHW, self.classifier(g1_BPD), self.classifier(g2_BPD)
@@ -64,7 +71,8 @@ class Training:
     """Networks and optimisers of one run, and the iteration that moves them.
 
     `distribute` wraps each trained module (DDP over several workers); `adversary=False` leaves the discriminator out,
-    which is LPN. With `sync_bn` BatchNorm's statistics are those of all workers' images. In `bfloat16` the networks'
+    which is LPN. With `sync_bn` BatchNorm's statistics are those of all workers' images, with `joint_bn` the encoder's are
+    those of both views. In `bfloat16` the networks'
     products are computed so, under autocast, and weights, losses and updates stay float32; `auto` does it on CUDA.
     With `compile_for` images of each view a step the networks are compiled; `not_compiled` says why they are not.
     """
@@ -79,12 +87,13 @@ class Training:
         device: torch.device | str = "cpu",
         precision: Precision = "float32",
         sync_bn: bool = False,
+        joint_bn: bool = False,
         compile_for: int | None = None,
         distribute: Callable[[nn.Module], nn.Module] = lambda module: module,
     ) -> None:
         self.device = torch.device(device)
         self.bfloat16 = precision == "bfloat16" or (precision == "auto" and self.device.type == "cuda")
-        self.learner = _placed(Learner(config, locations), self.device, sync_bn)
+        self.learner = _placed(Learner(config, locations, joint_bn), self.device, sync_bn)
         self.discriminator: ViewDiscriminator | None = None
         if adversary:
             discriminator = ViewDiscriminator(config, self.learner.encoder.backbone.channels)
