@@ -331,14 +331,13 @@ def test_a_run_of_one_adversary_does_not_take_the_state_of_none() -> None:
 
 
 def test_joint_batchnorm_is_the_encoder_on_both_views_at_once() -> None:
-    config = PVDAConfig(depth=18, width=0.25, image_size=64, part_dim=16, dropout=0.0, discriminator_channels=16)
     torch.manual_seed(0)
-    learner = Learner(config, 3, joint_bn=True)
+    learner = Learner(TINY, 3, joint_bn=True)
     images_B3HW = torch.randint(0, 256, (5, 3, 64, 64), dtype=torch.uint8)
     maps1, maps2, logits1, logits2 = learner(images_B3HW[:2], images_B3HW[2:])
     maps_BCHW, g_BPD = learner.encoder(images_B3HW)
     assert torch.equal(torch.cat([maps1, maps2]), maps_BCHW)
     assert torch.allclose(torch.cat([logits1, logits2]), learner.classifier(g_BPD))
-    apart = Learner(config, 3)
+    apart = Learner(TINY, 3)
     apart.load_state_dict(learner.state_dict())
     assert not torch.allclose(apart(images_B3HW[:2], images_B3HW[2:])[0], maps1, atol=1e-3)
