@@ -32,7 +32,7 @@ else:  # subcommands of the command line: each source has flags of its own
 def source_as_subcommand(arguments: list[str]) -> list[str]:
     """`--source NAME`, which the parser knows as the subcommand NAME.
 
-    Raises InputError where no such source is.
+    Raises InputError where no such source is, or none is named.
     """
     for place, word in enumerate(arguments):
         name, equals, value = word.partition("=")
@@ -42,6 +42,8 @@ def source_as_subcommand(arguments: list[str]) -> list[str]:
         if chosen not in SOURCES:
             raise InputError(f"--source is {chosen!r}, expected one of: {', '.join(SOURCES)}")
         return [chosen, *arguments[:place], *arguments[place + (1 if equals else 2) :]]
+    if arguments and not {*SOURCES, "--help", "-h"} & set(arguments):
+        raise InputError(f"--source is missing, expected one of: {', '.join(SOURCES)}; see make_shards.py --help")
     return arguments
 
 
