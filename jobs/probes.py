@@ -80,7 +80,7 @@ def pictures(stream: TrainingStream, view: View) -> Iterator[tuple[Sample, Pixel
     chosen = (s for s in samples if s.facts["location"] in held_out) if held_out else islice(samples, GAP_IMAGES)
 
     def prepare(sample: Sample) -> tuple[Sample, Pixels]:
-        return sample, resize(decode(sample.data), reading.image_size)
+        return sample, resize(decode(sample.data), reading.image_size, reading.resizer)
 
     return ahead(prepare, chosen, reading.threads, 2 * BATCH)
 

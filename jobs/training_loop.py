@@ -162,6 +162,7 @@ def open_stream(run: Run, place: Place) -> TrainingStream:
     reading = Reading(
         batch_size=recipe.batch_size,
         image_size=recipe.network.image_size,
+        resizer=recipe.resizer,
         augmentation=recipe.augmentation,
         seed=recipe.seed,
         threads=max(1, torch.get_num_threads()),

@@ -21,7 +21,7 @@ from pipeline.progress import console, progress
 from pipeline.records import InputError, Rejection, Split, View
 from pipeline.shards import Manifest, Shard, read_manifest
 from pipeline.stream import Sample, decoded, stack
-from pipeline.transforms import DecodeError, Pixels
+from pipeline.transforms import DecodeError, Pixels, Resizer
 
 Encoder = Callable[[npt.NDArray[np.uint8]], Floats]
 "Images as bytes (B, 3, H, W) -> unit vectors (B, D), float32."
@@ -67,6 +67,8 @@ class Network:
     "Of weights, config and preprocessing."
     image_size: int
     "Side in pixels of the images that it takes."
+    resizer: Resizer = "torch"
+    "Whose bicubic brings them to it."
     factory: Callable[[int], Encoder]
     "Called once on each worker, with the number of threads that it may use."
 
@@ -82,7 +84,7 @@ def is_done(path: str, fingerprint: str, shard: Shard) -> bool:
     if footer.fingerprint != fingerprint:
         raise InputError(
             f"{path} was made by network {footer.fingerprint[:12]}, this checkpoint is {fingerprint[:12]}; choose another "
-            "--out, or delete the old table"
+            "--out, the --resizer that it was made with, or delete the old table"
         )
     return footer.shard_sha256 == shard.sha256 and footer.rows + len(footer.rejected) == shard.samples
 
@@ -96,8 +98,9 @@ class ShardEmbedder:
 
     def embed(self, shard: Shard) -> tuple[Shard, dict[str, float]]:
         """Embed one shard and write its part; returns where the seconds went."""
-        settings, seconds = self.settings, defaultdict[str, float](float)
-        ready = decoded(settings.shards, shard.name, self.network.image_size, self.threads, 2 * settings.batch_size)
+        settings, network, seconds = self.settings, self.network, defaultdict[str, float](float)
+        depth = 2 * settings.batch_size
+        ready = decoded(settings.shards, shard.name, network.image_size, self.threads, depth, network.resizer)
         samples: list[Sample] = []
         rejected: list[Rejection] = []
         blocks: list[Floats] = []

@@ -20,7 +20,7 @@ from pipeline import storage
 from pipeline.hold_out import held_out, without
 from pipeline.records import InputError, Split, View
 from pipeline.shards import Manifest, Shard, read_manifest
-from pipeline.transforms import Augmentation, DecodeError, Pixels, augment, decode, resize
+from pipeline.transforms import Augmentation, DecodeError, Pixels, Resizer, augment, decode, resize
 
 In = TypeVar("In")
 Out = TypeVar("Out")
@@ -148,6 +148,8 @@ class Reading:
     "Images of each view per step and worker [LPN lineage: 8]."
     image_size: int = 256
     "Side in pixels that the network is given."
+    resizer: Resizer = "torch"
+    "Whose bicubic brings images to that size."
     augmentation: Augmentation = field(default_factory=Augmentation)
     seed: int = 0
     shuffle_buffer: int = 4096
@@ -207,7 +209,8 @@ class TrainingStream:
             position, sample = numbered
             # A generator for each image: what becomes of it does not depend on which thread had it.
             rng = np.random.default_rng([reading.seed, epoch, number, self.rank, position])
-            return sample, augment(decode(sample.data), view, reading.image_size, reading.augmentation, rng)
+            image_HW3 = decode(sample.data)
+            return sample, augment(image_HW3, view, reading.image_size, reading.augmentation, rng, reading.resizer)
 
         numbered = islice(enumerate(samples), skip * reading.batch_size, None)
         prepared = ahead(prepare, numbered, reading.threads, 4 * reading.batch_size)
@@ -227,13 +230,13 @@ def stack(images_HW3: Sequence[Pixels]) -> npt.NDArray[np.uint8]:
 
 
 def decoded(
-    shards: str, name: str, image_size: int, threads: int, depth: int
+    shards: str, name: str, image_size: int, threads: int, depth: int, resizer: Resizer = "torch"
 ) -> Iterator[tuple[Sample, Pixels | DecodeError]]:
     """The images of one shard in order, decoded and resized by threads; what cannot be decoded comes as its error."""
 
     def prepare(sample: Sample) -> tuple[Sample, Pixels | DecodeError]:
         try:
-            return sample, resize(decode(sample.data), image_size)
+            return sample, resize(decode(sample.data), image_size, resizer)
         except DecodeError as error:
             return sample, error
 

@@ -13,7 +13,7 @@ from jobs.recipes import Recipe, paper, smoke
 from jobs.run_folder import Run, read_checkpoint
 from jobs.train import Settings, known_recipe, train
 from jobs.training_loop import untrained
-from model.checkpoint import CheckpointError, build_encoder, loads
+from model.checkpoint import CheckpointError, build_encoder, dumps, loads
 from pipeline.records import InputError
 
 
@@ -74,6 +74,17 @@ def test_a_finished_run_is_left_alone_and_another_recipe_refused(
     assert "nothing to do" in capsys.readouterr().err
     with pytest.raises(InputError, match="with another schedule; choose another --out"):
         train(settings(tiny_shards, tmp_path, tiny(3)))
+
+
+def test_a_run_from_before_the_resizer_was_a_setting_goes_on_with_pillows(tiny_shards: str, tmp_path: Path) -> None:
+    path = Path(train(settings(tiny_shards, tmp_path, replace(tiny(1), resizer="pillow"))))
+    held = loads(path.read_bytes())
+    path.write_bytes(
+        dumps(replace(held, recipe={name: held.recipe[name] for name in held.recipe if name != "resizer"}))
+    )
+    train(settings(tiny_shards, tmp_path, replace(tiny(1), resizer="pillow")))  # nothing to do
+    with pytest.raises(InputError, match="with another resizer"):
+        train(settings(tiny_shards, tmp_path, tiny(1)))
 
 
 def test_ray_train_takes_the_same_steps_as_this_process(tiny_shards: str, tmp_path: Path, ray_cluster: None) -> None:
