@@ -37,7 +37,7 @@ from pipeline.records import Split, View
 from pipeline.shards import PackingSettings, pack, read_manifest
 from pipeline.simulate import SimulationSettings, simulate
 from pipeline.sources.university1652 import University1652
-from pipeline.stream import Reading, TrainingStream, decoded
+from pipeline.stream import Reading, TrainingStream, decoded, read_shard
 from pipeline.transforms import Augmentation
 
 Watch = Callable[[Training, int, dict[str, float]], None]
@@ -106,7 +106,7 @@ class TestSet:
                 samples = [
                     pair
                     for shard in read_manifest(shards).of(split, view)
-                    for pair in decoded(shards, shard.name, IMAGE, 2, 64)
+                    for pair in decoded(read_shard(shards, shard.name), IMAGE, 2, 64)
                 ]
                 pixels = np.stack([image for _, image in samples if isinstance(image, np.ndarray)])
                 self.images[split, view] = torch.from_numpy(pixels.transpose(0, 3, 1, 2))

@@ -20,7 +20,7 @@ from pipeline.features import Floats, PartFooter, PartRows, read_footer, write_p
 from pipeline.progress import console, progress
 from pipeline.records import InputError, Rejection, Split, View
 from pipeline.shards import Manifest, Shard, read_manifest
-from pipeline.stream import Sample, decoded, stack
+from pipeline.stream import Sample, decoded, read_shard, stack
 from pipeline.transforms import DecodeError, Pixels, Resizer
 
 Encoder = Callable[[npt.NDArray[np.uint8]], Floats]
@@ -100,7 +100,8 @@ class ShardEmbedder:
         """Embed one shard and write its part; returns where the seconds went."""
         settings, network, seconds = self.settings, self.network, defaultdict[str, float](float)
         depth = 2 * settings.batch_size
-        ready = decoded(settings.shards, shard.name, network.image_size, self.threads, depth, network.resizer)
+        read = read_shard(settings.shards, shard.name)
+        ready = decoded(read, network.image_size, self.threads, depth, network.resizer)
         samples: list[Sample] = []
         rejected: list[Rejection] = []
         blocks: list[Floats] = []

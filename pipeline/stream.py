@@ -38,6 +38,10 @@ class Sample:
     "The JSON beside it."
 
 
+Opened = tuple[Sample, Pixels | DecodeError]
+"A sample and its pixels, or why there are none."
+
+
 @dataclass(frozen=True, kw_only=True)
 class Batch:
     """Images of one view."""
@@ -47,6 +51,8 @@ class Batch:
     "Class numbers, as the manifest's classes are in order."
     view: View
     keys: tuple[str, ...]
+    damaged: tuple[str, ...] = ()
+    "Keys of images that could not be decoded; the first image of the batch that could stands in their places."
 
 
 def read_shard(shards: str, name: str) -> Iterator[Sample]:
@@ -205,22 +211,33 @@ class TrainingStream:
         order_rng = np.random.default_rng([reading.seed, epoch, number, self.rank])
         samples = shuffled(read_spans(self.shards, spans, self.held_out), reading.shuffle_buffer, order_rng)
 
-        def prepare(numbered: tuple[int, Sample]) -> tuple[Sample, Pixels]:
+        def prepare(numbered: tuple[int, Sample]) -> Opened:
             position, sample = numbered
             # A generator for each image: what becomes of it does not depend on which thread had it.
             rng = np.random.default_rng([reading.seed, epoch, number, self.rank, position])
-            image_HW3 = decode(sample.data)
+            try:
+                image_HW3 = decode(sample.data)
+            except DecodeError as error:
+                return sample, error
             return sample, augment(image_HW3, view, reading.image_size, reading.augmentation, rng, reading.resizer)
 
         numbered = islice(enumerate(samples), skip * reading.batch_size, None)
         prepared = ahead(prepare, numbered, reading.threads, 4 * reading.batch_size)
         while group := list(islice(prepared, reading.batch_size)):
-            labels = [self.classes[sample.facts["location"]] for sample, _ in group]
+            whole, damaged = sound(group)
+            if not whole:
+                raise InputError(
+                    f"not one of {len(group)} {view} images of a batch from {self.shards} can be decoded ({damaged[0]} and "
+                    "on), expected at least one; pack these shards again"
+                )
+            # A batch keeps its size, and what stands in is a function of the data alone.
+            chosen = [(sample, image) if not isinstance(image, DecodeError) else whole[0] for sample, image in group]
             yield Batch(
-                images_B3HW=stack([image for _, image in group]),
-                location_B=np.asarray(labels, np.int64),
+                images_B3HW=stack([image for _, image in chosen]),
+                location_B=np.asarray([self.classes[sample.facts["location"]] for sample, _ in chosen], np.int64),
                 view=view,
-                keys=tuple(sample.key for sample, _ in group),
+                keys=tuple(sample.key for sample, _ in chosen),
+                damaged=tuple(damaged),
             )
 
 
@@ -230,17 +247,29 @@ def stack(images_HW3: Sequence[Pixels]) -> npt.NDArray[np.uint8]:
 
 
 def decoded(
-    shards: str, name: str, image_size: int, threads: int, depth: int, resizer: Resizer = "torch"
-) -> Iterator[tuple[Sample, Pixels | DecodeError]]:
-    """The images of one shard in order, decoded and resized by threads; what cannot be decoded comes as its error."""
+    samples: Iterable[Sample], image_size: int, threads: int, depth: int, resizer: Resizer = "torch"
+) -> Iterator[Opened]:
+    """The samples' images in order, decoded and resized by threads; what cannot be decoded comes as its error."""
 
-    def prepare(sample: Sample) -> tuple[Sample, Pixels | DecodeError]:
+    def prepare(sample: Sample) -> Opened:
         try:
             return sample, resize(decode(sample.data), image_size, resizer)
         except DecodeError as error:
             return sample, error
 
-    yield from ahead(prepare, read_shard(shards, name), threads, depth)
+    return ahead(prepare, samples, threads, depth)
+
+
+def sound(images: Iterable[Opened]) -> tuple[list[tuple[Sample, Pixels]], list[str]]:
+    """The images that could be decoded, and the keys of the others."""
+    whole: list[tuple[Sample, Pixels]] = []
+    damaged: list[str] = []
+    for sample, image in images:
+        if isinstance(image, DecodeError):
+            damaged.append(sample.key)
+        else:
+            whole.append((sample, image))
+    return whole, damaged
 
 
 def fetch(shards: str, keys: Iterable[str]) -> dict[str, bytes]:
