@@ -34,10 +34,11 @@ from model.weights import load_backbone
 from pipeline.metrics import summarise
 from pipeline.ranking import Side, rank, side_of_array
 from pipeline.records import Split, View
+from pipeline.samples import read_shard
 from pipeline.shards import PackingSettings, pack, read_manifest
 from pipeline.simulate import SimulationSettings, simulate
 from pipeline.sources.university1652 import University1652
-from pipeline.stream import Reading, TrainingStream, decoded, read_shard
+from pipeline.stream import Reading, TrainingStream, decoded
 from pipeline.transforms import Augmentation
 
 Watch = Callable[[Training, int, dict[str, float]], None]

@@ -19,7 +19,8 @@ from pipeline.features import Floats
 from pipeline.metrics import summarise
 from pipeline.ranking import Side, rank, side_of_array
 from pipeline.records import InputError, Split, View
-from pipeline.stream import Opened, TrainingStream, decoded, read_shard, sound, stack
+from pipeline.samples import read_shard
+from pipeline.stream import Opened, TrainingStream, decoded, sound, stack
 
 GAP_IMAGES = 256
 "Of each view, for the view gap; half of them fit the probe, the other half is asked."

@@ -17,10 +17,12 @@ from ray.util import ActorPool
 
 from pipeline import cluster, storage
 from pipeline.features import Floats, PartFooter, PartRows, read_footer, write_part
+from pipeline.foreign import open_manifest
 from pipeline.progress import console, progress
 from pipeline.records import InputError, Rejection, Split, View
-from pipeline.shards import Manifest, Shard, read_manifest
-from pipeline.stream import Sample, decoded, read_shard, stack
+from pipeline.samples import Sample, read_shard
+from pipeline.shards import Manifest, Shard
+from pipeline.stream import decoded, stack
 from pipeline.transforms import DecodeError, Pixels, Resizer
 
 Encoder = Callable[[npt.NDArray[np.uint8]], Floats]
@@ -36,9 +38,9 @@ class EmbeddingSettings:
     out: str
     "Folder or URI of the feature table."
     split: Split | None = None
-    "Only this split."
+    "Only this split; of shards that others made, which have no manifest, what they are."
     view: View | None = None
-    "Only this view."
+    "Only this view; likewise."
     batch_size: int = 32
     "Images per forward pass."
     dtype: str = "float32"
@@ -100,7 +102,7 @@ class ShardEmbedder:
         """Embed one shard and write its part; returns where the seconds went."""
         settings, network, seconds = self.settings, self.network, defaultdict[str, float](float)
         depth = 2 * settings.batch_size
-        read = read_shard(settings.shards, shard.name)
+        read = read_shard(settings.shards, shard.name, shard.split, shard.view)
         ready = decoded(read, network.image_size, self.threads, depth, network.resizer)
         samples: list[Sample] = []
         rejected: list[Rejection] = []
@@ -151,7 +153,7 @@ def embed_gallery(settings: EmbeddingSettings, network: Network) -> int:
 
     `settings` must name paths that a worker can open (absolute, or URIs). Raises InputError on unusable input.
     """
-    manifest: Manifest = read_manifest(settings.shards)
+    manifest: Manifest = open_manifest(settings.shards, settings.split, settings.view)
     wanted = [shard for shard in manifest.of(settings.split, settings.view) if shard.samples]
     if not wanted:
         held = ", ".join(sorted({f"{shard.split} {shard.view}" for shard in manifest.shards})) or "nothing"

@@ -4,7 +4,6 @@ In: a set of shards. Out: batches of images as bytes (B, 3, H, W) with their lab
 of the seed, the epoch and the rank, so a run that is continued sees what it would have seen.
 """
 
-import json
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,28 +13,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from webdataset.tariterators import group_by_keys, tar_file_expander
 
-from pipeline import storage
 from pipeline.hold_out import held_out, without
 from pipeline.records import InputError, Split, View
+from pipeline.samples import Sample, read_shard
 from pipeline.shards import Manifest, Shard, read_manifest
 from pipeline.transforms import Augmentation, DecodeError, Pixels, Resizer, augment, decode, resize
 
 In = TypeVar("In")
 Out = TypeVar("Out")
 Item = TypeVar("Item")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sample:
-    """One image as a shard holds it."""
-
-    key: str
-    data: bytes
-    "The encoded image."
-    facts: dict[str, Any]
-    "The JSON beside it."
 
 
 Opened = tuple[Sample, Pixels | DecodeError]
@@ -53,15 +40,6 @@ class Batch:
     keys: tuple[str, ...]
     damaged: tuple[str, ...] = ()
     "Keys of images that could not be decoded; the first image of the batch that could stands in their places."
-
-
-def read_shard(shards: str, name: str) -> Iterator[Sample]:
-    """The samples of one tar in their order."""
-    path = storage.join(shards, f"{name}.tar")
-    with storage.open_read(path) as stream:
-        for sample in group_by_keys(tar_file_expander([{"url": path, "stream": stream}])):
-            [ending] = [name for name in sample if not name.startswith("__") and name != "json"]
-            yield Sample(key=sample["__key__"], data=sample[ending], facts=json.loads(sample["json"]))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,18 +22,17 @@ from PIL import Image
 
 from pipeline import storage
 from pipeline.records import ImageRecord, InputError, Split, View
+from pipeline.samples import Sample, read_shard
 from pipeline.shards import MANIFEST, Manifest, Shard, ShardPlan, write_shard
 from pipeline.sources.university1652 import University1652
 from pipeline.stream import (
     Batch,
     Reading,
-    Sample,
     TrainingStream,
     ahead,
     decoded,
     fetch,
     plan_pass,
-    read_shard,
     read_spans,
     ready,
     shuffled,

@@ -15,7 +15,7 @@ from jobs.train import Settings, known_recipe, train
 from jobs.training_loop import Place, train_worker, untrained
 from model.checkpoint import CheckpointError, build_encoder, dumps, loads
 from pipeline.records import InputError
-from pipeline.stream import read_shard
+from pipeline.samples import read_shard
 from pipeline.transforms import DecodeError, Pixels, decode
 
 
