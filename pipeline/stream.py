@@ -14,10 +14,12 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from pipeline import storage
 from pipeline.hold_out import held_out, without
 from pipeline.records import InputError, Split, View
 from pipeline.samples import Sample, read_shard
 from pipeline.shards import Manifest, Shard, read_manifest
+from pipeline.tars import IMAGES, read_tar
 from pipeline.transforms import Augmentation, DecodeError, Pixels, Resizer, augment, decode, resize
 
 In = TypeVar("In")
@@ -257,5 +259,6 @@ def fetch(shards: str, keys: Iterable[str]) -> dict[str, bytes]:
     for shard in read_manifest(shards).shards:
         prefix = f"{shard.split}-{shard.view}-"
         if any(key.startswith(prefix) for key in wanted):
-            found |= {sample.key: sample.data for sample in read_shard(shards, shard.name) if sample.key in wanted}
+            members = read_tar(storage.join(shards, f"{shard.name}.tar"), IMAGES)
+            found |= {key: next(iter(images.values())) for key, images in members if key in wanted}
     return found
