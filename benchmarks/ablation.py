@@ -35,6 +35,7 @@ from pipeline.metrics import summarise
 from pipeline.packing import PackingSettings, pack
 from pipeline.ranking import Side, rank, side_of_array
 from pipeline.records import Split, View
+from pipeline.samples import read_shard
 from pipeline.shards import read_manifest
 from pipeline.simulate import SimulationSettings, simulate
 from pipeline.sources.university1652 import University1652
@@ -107,7 +108,7 @@ class TestSet:
                 samples = [
                     pair
                     for shard in read_manifest(shards).of(split, view)
-                    for pair in decoded(shards, shard.name, IMAGE, 2, 64)
+                    for pair in decoded(read_shard(shards, shard.name), IMAGE, 2, 64)
                 ]
                 pixels = np.stack([image for _, image in samples if isinstance(image, np.ndarray)])
                 self.images[split, view] = torch.from_numpy(pixels.transpose(0, 3, 1, 2))

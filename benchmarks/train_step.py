@@ -14,11 +14,10 @@ from dataclasses import asdict, replace
 import numpy as np
 import torch
 from PIL import Image
-from torch import Tensor
 
 from jobs.recipes import Recipe, paper, smoke
 from jobs.run_folder import Run
-from jobs.training_loop import Place, Worker
+from jobs.training_loop import Place, Tensors, Worker
 from model.losses import adversarial_terms, location_terms
 from model.schedule import Phase
 from pipeline import storage
@@ -29,7 +28,6 @@ from pipeline.shards import MANIFEST, Manifest
 from pipeline.sources.university1652 import University1652
 
 NOW = Phase(alpha=0.9, rate_scale=0.01)
-Resident = tuple[list[Tensor], list[Tensor]]
 ROUNDS = 3
 "Streamed and resident steps take turns, so that whatever else the machine does meets both."
 
@@ -75,7 +73,7 @@ def streamed(worker: Worker, epoch: int, steps: int) -> tuple[float, float]:
     return (finished(worker.training.device) - began) / steps, waited / steps
 
 
-def resident(worker: Worker, batch: Resident, steps: int) -> float:
+def resident(worker: Worker, batch: Tensors, steps: int) -> float:
     """Seconds of a step on a batch that is on the device."""
     began = finished(worker.training.device)
     for _ in range(steps):
@@ -83,12 +81,12 @@ def resident(worker: Worker, batch: Resident, steps: int) -> float:
     return (finished(worker.training.device) - began) / steps
 
 
-def step(worker: Worker, batch: Resident) -> None:
-    images, labels = batch
+def step(worker: Worker, batch: Tensors) -> None:
+    images, labels, _ = batch
     worker.training.step(images[0], labels[0], images[1], labels[1], NOW)
 
 
-def parts(worker: Worker, batch: Resident, steps: int) -> dict[str, float]:
+def parts(worker: Worker, batch: Tensors, steps: int) -> dict[str, float]:
     """Seconds of each part of a step: the same computations, one after the other and each waited for."""
     training, spent = worker.training, defaultdict[str, float](float)
 
@@ -101,7 +99,7 @@ def parts(worker: Worker, batch: Resident, steps: int) -> dict[str, float]:
     def autocast() -> torch.autocast:
         return torch.autocast(training.device.type, torch.bfloat16, enabled=training.bfloat16)
 
-    images, labels = batch
+    images, labels, _ = batch
     discriminator = training.discriminator
     assert discriminator is not None
     for _ in range(steps):

@@ -14,7 +14,7 @@ from pipeline import storage
 from pipeline.embed import EmbeddingSettings, Encoder, Network, embed_gallery
 from pipeline.features import Floats
 from pipeline.records import InputError
-from pipeline.transforms import PREPROCESSING
+from pipeline.transforms import Resizer, preprocessing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +25,8 @@ class Settings(EmbeddingSettings):
     "A last.pt of jobs/train.py, or what jobs/import_weights.py wrote."
     mirror: bool = True
     "Whether the embeddings of an image and its mirror image are summed [LPN]."
+    resizer: Resizer = "torch"
+    "Whose bicubic resizes the images: torch's, or pillow's, which is faster on CPUs without AVX2; tables do not mix."
 
 
 def make_encoder(data: bytes, mirror: bool, threads: int) -> Encoder:
@@ -41,16 +43,16 @@ def make_encoder(data: bytes, mirror: bool, threads: int) -> Encoder:
     return encode
 
 
-def network_of(data: bytes, name: str, mirror: bool = True) -> Network:
+def network_of(data: bytes, name: str, mirror: bool = True, resizer: Resizer = "torch") -> Network:
     """What the embedder needs to know of a checkpoint.
 
     Raises CheckpointError when the bytes are none.
     """
     checkpoint = loads(data, name)
-    preprocessing = f"{PREPROCESSING}, mirror {mirror}"
     return Network(
-        fingerprint=fingerprint(checkpoint, preprocessing),
+        fingerprint=fingerprint(checkpoint, f"{preprocessing(resizer)}, mirror {mirror}"),
         image_size=checkpoint.network.image_size,
+        resizer=resizer,
         factory=partial(make_encoder, data, mirror),
     )
 
@@ -63,7 +65,8 @@ def main(settings: Settings) -> None:
         )
     given = {field.name: getattr(settings, field.name) for field in fields(EmbeddingSettings)}
     given |= {"shards": storage.absolute(settings.shards), "out": storage.absolute(settings.out)}
-    network = network_of(storage.read_bytes(settings.checkpoint), settings.checkpoint, settings.mirror)
+    data = storage.read_bytes(settings.checkpoint)
+    network = network_of(data, settings.checkpoint, settings.mirror, settings.resizer)
     embed_gallery(EmbeddingSettings(**given), network)
 
 

@@ -18,9 +18,9 @@ from model.pvda import FeatureEncoder
 from pipeline.features import Floats
 from pipeline.metrics import summarise
 from pipeline.ranking import Side, rank, side_of_array
-from pipeline.records import Split, View
-from pipeline.stream import Sample, TrainingStream, ahead, read_shard, stack
-from pipeline.transforms import Pixels, decode, resize
+from pipeline.records import InputError, Split, View
+from pipeline.samples import read_shard
+from pipeline.stream import Opened, TrainingStream, decoded, sound, stack
 
 GAP_IMAGES = 256
 "Of each view, for the view gap; half of them fit the probe, the other half is asked."
@@ -42,7 +42,8 @@ class Seen:
 def look(encoder: FeatureEncoder, stream: TrainingStream) -> dict[str, float]:
     """The view gap and, where locations are held out, how well these are found in either direction.
 
-    The held-out locations' images are all looked at; without any, the first training images, in the shards' order.
+    The held-out locations' images are all looked at; without any, the first training images, in the shards' order. What
+    cannot be decoded is left out; where that leaves no image of a view, an InputError is raised.
     """
     drone, satellite = (see(encoder, stream, view) for view in (View.DRONE, View.SATELLITE))
     found = view_gap(drone.pooled_NC, satellite.pooled_NC)
@@ -65,24 +66,27 @@ def see(encoder: FeatureEncoder, stream: TrainingStream, view: View) -> Seen:
     encoder.eval()
     with torch.no_grad():
         while group := list(islice(images, BATCH)):
-            maps_BCHW, g_BPD = encoder(torch.from_numpy(stack([image for _, image in group])).to(device))
-            locations += [sample.facts["location"] for sample, _ in group]
+            whole, _ = sound(group)
+            if not whole:
+                continue
+            maps_BCHW, g_BPD = encoder(torch.from_numpy(stack([image for _, image in whole])).to(device))
+            locations += [sample.facts["location"] for sample, _ in whole]
             pooled.append(maps_BCHW.mean((2, 3)).float().cpu().numpy())
             embeddings.append(unit_embedding(g_BPD.float()).cpu().numpy())
     encoder.train(was_training)
+    if not locations:
+        raise InputError(
+            f"not one {view} image of {stream.shards} that the probes look at can be decoded, expected some; pack again"
+        )
     return Seen(locations=locations, pooled_NC=np.concatenate(pooled), embedding_NE=np.concatenate(embeddings))
 
 
-def pictures(stream: TrainingStream, view: View) -> Iterator[tuple[Sample, Pixels]]:
+def pictures(stream: TrainingStream, view: View) -> Iterator[Opened]:
     """The images that are looked at, as they are when tested: resized and nothing else."""
     reading, held_out = stream.reading, stream.held_out
     samples = (s for shard in stream.manifest.of(Split.TRAIN, view) for s in read_shard(stream.shards, shard.name))
     chosen = (s for s in samples if s.facts["location"] in held_out) if held_out else islice(samples, GAP_IMAGES)
-
-    def prepare(sample: Sample) -> tuple[Sample, Pixels]:
-        return sample, resize(decode(sample.data), reading.image_size)
-
-    return ahead(prepare, chosen, reading.threads, 2 * BATCH)
+    return decoded(chosen, reading.image_size, reading.threads, 2 * BATCH, reading.resizer)
 
 
 def side(seen: Seen) -> Side:

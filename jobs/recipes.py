@@ -7,7 +7,7 @@ from model.pvda import PVDAConfig
 from model.schedule import Schedule
 from model.training import Optimisation, Precision
 from pipeline.records import InputError
-from pipeline.transforms import Augmentation
+from pipeline.transforms import Augmentation, Resizer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,6 +20,8 @@ class Recipe:
     optimisation: Optimisation = field(default_factory=Optimisation)
     schedule: Schedule = field(default_factory=Schedule)
     augmentation: Augmentation = field(default_factory=Augmentation)
+    resizer: Resizer = "torch"
+    "Whose bicubic resizes the images: torch's, or pillow's, which is faster on CPUs without AVX2 [chosen]."
     adversary: bool = True
     "Whether there is a view discriminator; without it PVDA is LPN."
     batch_size: int = 8

@@ -18,6 +18,8 @@ from pipeline import storage
 from pipeline.records import InputError
 
 CHECKPOINT, CURVES = "last.pt", "metrics.jsonl"
+BEFORE = {"resizer": "pillow"}
+"What a recipe did before it had that setting: a checkpoint from then goes on where the setting says the same."
 OLDER = re.compile(r"checkpoint-(\d+)-(\d+)\.pt")
 
 
@@ -99,8 +101,8 @@ def read_checkpoint(run: Run) -> Checkpoint | None:
 
 def refuse_other_recipe(run: Run, held: Checkpoint, path: str) -> None:
     # Through JSON, as the checkpoint has it: tuples become lists.
-    recipe = json.loads(json.dumps(asdict(run.recipe)))
-    changed = sorted(name for name in recipe | held.recipe if held.recipe.get(name) != recipe.get(name))
+    recipe, trained = json.loads(json.dumps(asdict(run.recipe))), BEFORE | held.recipe
+    changed = sorted(name for name in recipe | trained if trained.get(name) != recipe.get(name))
     if changed:
         raise InputError(
             f"{path} was trained by recipe {held.recipe.get('name')} with another {', '.join(changed)}; choose another --out, "

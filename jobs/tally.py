@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 import torch
 from torch import Tensor
 
-SECONDS = "seconds"
+SECONDS, DAMAGED = "seconds", "damaged_images"
 
 
 class NotFinite(ArithmeticError):
@@ -24,6 +24,8 @@ class Tally:
         held = dict(running or {})
         self.steps = steps
         "That were added."
+        self.damaged = int(held.pop(DAMAGED, 0))
+        "Images that could not be decoded, of those that this worker drew."
         self._before = float(held.pop(SECONDS, 0.0))
         self._began = time.monotonic()
         self._names = list(held)
@@ -59,7 +61,10 @@ class Tally:
             return {}
         # Copies: saved as views, each scalar would carry the whole vector along.
         sums = {name: total.clone() for name, total in zip(self._names, self._sums.cpu().unbind(), strict=True)}
-        return sums | {SECONDS: torch.tensor(self.seconds, dtype=torch.float64)}
+        return sums | {
+            SECONDS: torch.tensor(self.seconds, dtype=torch.float64),
+            DAMAGED: torch.tensor(self.damaged, dtype=torch.int64),
+        }
 
 
 def worst(means: Iterable[tuple[str, float]]) -> str | None:

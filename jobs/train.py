@@ -21,7 +21,7 @@ from jobs.cli import Failure, run
 from jobs.config_table import show_config
 from jobs.recipes import RECIPES, Recipe
 from jobs.run_folder import CHECKPOINT, Conduct, Run, find_checkpoint
-from jobs.training_loop import Found, Place, open_stream, train_worker
+from jobs.training_loop import Damage, Found, Place, open_stream, train_worker
 from model.checkpoint import CheckpointError
 from model.pvda import FeatureEncoder
 from model.weights import load_backbone, read_state_dict
@@ -173,7 +173,7 @@ def ray_worker(config: dict[str, Any]) -> None:
         torch.cuda.set_device(device)
     place = Place(rank=rank, world=world, device=str(device))
     if world > 1:
-        place = replace(place, distribute=distribute, share=share)
+        place = replace(place, distribute=distribute, share=share, gather=gather)
     try:
         train_worker(config["run"], place, told.put if rank == 0 else lambda facts: None)
     except (Failure, InputError, CheckpointError) as error:
@@ -192,6 +192,13 @@ def share(found: Found) -> Found:
     held = [found]
     torch.distributed.broadcast_object_list(held, src=0)
     return held[0]
+
+
+def gather(damage: Damage) -> list[Damage]:
+    """What each worker found, by rank."""
+    held: list[Damage] = [(0, None)] * torch.distributed.get_world_size()
+    torch.distributed.all_gather_object(held, damage)
+    return held
 
 
 def listen(told: Queue, meter: Meter, refused: list[Exception]) -> None:

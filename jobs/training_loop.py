@@ -16,20 +16,24 @@ from torch import Tensor, nn
 from jobs.cli import Failure
 from jobs.probes import look
 from jobs.run_folder import CHECKPOINT, Keeper, Run, find_checkpoint
-from jobs.tally import NotFinite, Tally
+from jobs.tally import DAMAGED, NotFinite, Tally
 from model.checkpoint import Checkpoint, dumps
 from model.schedule import phase
 from model.training import Training
 from model.weights import load_backbone, read_state_dict
 from pipeline import storage
-from pipeline.stream import Batch, Reading, TrainingStream, ready
+from pipeline.ahead import ready
+from pipeline.stream import Batch, Reading, TrainingStream
 
 SECONDS_BETWEEN_REPORTS = 1.0
 BATCHES_READY = 2
 "Pairs of batches that wait for the step; decoding runs further ahead."
+Tensors = tuple[list[Tensor], list[Tensor], tuple[str, ...]]
 Report = Callable[[dict[str, Any]], None]
 "Takes what a worker tells while it runs: `steps` done since the last time and facts to show, or a `note`."
 Found = tuple[str, Checkpoint] | None
+Damage = tuple[int, str | None]
+"How many images could not be decoded, and the key of the first."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +46,8 @@ class Place:
     distribute: Callable[[nn.Module], nn.Module] = lambda module: module
     share: Callable[[Found], Found] = lambda found: found
     "Gives every worker what rank 0 has: all go on from one checkpoint, whatever each of them sees of the storage."
+    gather: Callable[[Damage], list[Damage]] = lambda damage: [damage]
+    "Gives every worker what each of them has, by rank."
 
 
 def train_worker(run: Run, place: Place, report: Report) -> None:
@@ -80,13 +86,17 @@ class Worker:
             held = self.found[1]
             self.training.load_state(held.state)
             self.history, self.tally = list(held.history), Tally(held.step, held.running)
+            if place.rank > 0:  # the checkpoint's count is rank 0's
+                self.tally.damaged = 0
 
     def epoch(self, epoch: int, keeper: Keeper | None) -> dict[str, Any]:
         """The steps of one pass over the satellite view that are still to do; returns the epoch's row of metrics.jsonl."""
-        recipe, steps = self.run.recipe, self.stream.steps
+        recipe, steps, first = self.run.recipe, self.stream.steps, None
         told_at, told_steps = time.monotonic(), self.tally.steps
-        for images, labels in self.batches(epoch):
+        for images, labels, damaged in self.batches(epoch):
             step = self.tally.steps
+            self.tally.damaged += len(damaged)
+            first = first or next(iter(damaged), None)
             now = phase(recipe.schedule, epoch + step / steps)
             # Dropout's random numbers are a function of seed, epoch, step and rank, however often a run was resumed.
             seeds = np.random.SeedSequence([recipe.seed, epoch, step, self.place.rank])
@@ -98,11 +108,25 @@ class Worker:
                 told_at, told_steps = time.monotonic(), self.tally.steps
             if keeper is not None and step + 1 < steps:
                 keeper.step_over(self.checkpoint)
+        damage = self._damage(epoch, first)
         return {
             "epoch": epoch + 1, "step": (epoch + 1) * steps, "alpha": now.alpha,
             "learning_rate_scale": now.rate_scale, "learning_rates": self.training.rates,
             **self.means(), "images_per_second": self.speed, "seconds": self.tally.seconds,
+            DAMAGED: damage,
         }  # fmt: skip
+
+    def _damage(self, epoch: int, first: str | None) -> int:
+        """Images of all workers that could not be decoded in this epoch; said once where there are any."""
+        told = self.place.gather((self.tally.damaged, first))
+        count, first = sum(count for count, _ in told), next((key for _, key in told if key is not None), None)
+        if count:
+            which = f"; the first of them is {first}" if first else ""  # none where all came before a kill
+            self._report({
+                "note": f"epoch {epoch + 1}: {count} images could not be decoded, and others of their batches took their "
+                f"places{which}; pack {self.run.shards} again to be rid of them"
+            })  # fmt: skip
+        return count
 
     def over(self, row: dict[str, Any]) -> None:
         """The epoch of this row is over."""
@@ -137,20 +161,21 @@ class Worker:
         whole = {name: mean for name, mean in self.means().items() if "/" not in name}
         self._report({"steps": steps} | facts | {"rates": rates, "images/s": self.speed} | whole)
 
-    def batches(self, epoch: int) -> Iterator[tuple[list[Tensor], list[Tensor]]]:
-        """Images and labels of both views on the device, ready before the step asks for them."""
+    def batches(self, epoch: int) -> Iterator[Tensors]:
+        """Images and labels of both views on the device, ready before the step asks for them; keys of damaged images."""
         device = self.training.device
 
-        def tensors(pair: tuple[Batch, Batch]) -> tuple[list[Tensor], list[Tensor]]:
+        def tensors(pair: tuple[Batch, Batch]) -> Tensors:
             images = [torch.from_numpy(batch.images_B3HW) for batch in pair]
             labels = [torch.from_numpy(batch.location_B) for batch in pair]
             if device.type == "cuda":  # from pinned memory the copy runs beside the computation
                 images = [tensor.pin_memory() for tensor in images]
                 labels = [tensor.pin_memory() for tensor in labels]
-            return images, labels
+            return images, labels, pair[0].damaged + pair[1].damaged
 
-        for images, labels in ready(map(tensors, self.stream.epoch(epoch, self.tally.steps)), BATCHES_READY):
-            yield [i.to(device, non_blocking=True) for i in images], [n.to(device, non_blocking=True) for n in labels]
+        for images, labels, damaged in ready(map(tensors, self.stream.epoch(epoch, self.tally.steps)), BATCHES_READY):
+            images, labels = ([tensor.to(device, non_blocking=True) for tensor in both] for both in (images, labels))
+            yield images, labels, damaged
 
 
 def open_stream(run: Run, place: Place) -> TrainingStream:
@@ -162,6 +187,7 @@ def open_stream(run: Run, place: Place) -> TrainingStream:
     reading = Reading(
         batch_size=recipe.batch_size,
         image_size=recipe.network.image_size,
+        resizer=recipe.resizer,
         augmentation=recipe.augmentation,
         seed=recipe.seed,
         threads=max(1, torch.get_num_threads()),

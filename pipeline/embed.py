@@ -17,11 +17,13 @@ from ray.util import ActorPool
 
 from pipeline import cluster, storage
 from pipeline.features import Floats, PartFooter, PartRows, read_footer, write_part
+from pipeline.foreign import open_manifest
 from pipeline.progress import console, progress
 from pipeline.records import InputError, Rejection, Split, View
-from pipeline.shards import Manifest, Shard, read_manifest
-from pipeline.stream import Sample, decoded, stack
-from pipeline.transforms import DecodeError, Pixels
+from pipeline.samples import Sample, read_shard
+from pipeline.shards import Manifest, Shard
+from pipeline.stream import decoded, stack
+from pipeline.transforms import DecodeError, Pixels, Resizer
 
 Encoder = Callable[[npt.NDArray[np.uint8]], Floats]
 "Images as bytes (B, 3, H, W) -> unit vectors (B, D), float32."
@@ -36,9 +38,9 @@ class EmbeddingSettings:
     out: str
     "Folder or URI of the feature table."
     split: Split | None = None
-    "Only this split."
+    "Only this split; of shards that others made, which have no manifest, what they are."
     view: View | None = None
-    "Only this view."
+    "Only this view; likewise."
     batch_size: int = 32
     "Images per forward pass."
     dtype: str = "float32"
@@ -67,6 +69,8 @@ class Network:
     "Of weights, config and preprocessing."
     image_size: int
     "Side in pixels of the images that it takes."
+    resizer: Resizer = "torch"
+    "Whose bicubic brings them to it."
     factory: Callable[[int], Encoder]
     "Called once on each worker, with the number of threads that it may use."
 
@@ -82,7 +86,7 @@ def is_done(path: str, fingerprint: str, shard: Shard) -> bool:
     if footer.fingerprint != fingerprint:
         raise InputError(
             f"{path} was made by network {footer.fingerprint[:12]}, this checkpoint is {fingerprint[:12]}; choose another "
-            "--out, or delete the old table"
+            "--out, the --resizer that it was made with, or delete the old table"
         )
     return footer.shard_sha256 == shard.sha256 and footer.rows + len(footer.rejected) == shard.samples
 
@@ -96,8 +100,10 @@ class ShardEmbedder:
 
     def embed(self, shard: Shard) -> tuple[Shard, dict[str, float]]:
         """Embed one shard and write its part; returns where the seconds went."""
-        settings, seconds = self.settings, defaultdict[str, float](float)
-        ready = decoded(settings.shards, shard.name, self.network.image_size, self.threads, 2 * settings.batch_size)
+        settings, network, seconds = self.settings, self.network, defaultdict[str, float](float)
+        depth = 2 * settings.batch_size
+        read = read_shard(settings.shards, shard.name, shard.split, shard.view)
+        ready = decoded(read, network.image_size, self.threads, depth, network.resizer)
         samples: list[Sample] = []
         rejected: list[Rejection] = []
         blocks: list[Floats] = []
@@ -147,7 +153,7 @@ def embed_gallery(settings: EmbeddingSettings, network: Network) -> int:
 
     `settings` must name paths that a worker can open (absolute, or URIs). Raises InputError on unusable input.
     """
-    manifest: Manifest = read_manifest(settings.shards)
+    manifest: Manifest = open_manifest(settings.shards, settings.split, settings.view)
     wanted = [shard for shard in manifest.of(settings.split, settings.view) if shard.samples]
     if not wanted:
         held = ", ".join(sorted({f"{shard.split} {shard.view}" for shard in manifest.shards})) or "nothing"

@@ -4,13 +4,11 @@ In: the names of locations. Out: those held out, chosen by the hash of their nam
 """
 
 import hashlib
-import json
-import tarfile
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from pipeline import storage
 from pipeline.records import InputError
+from pipeline.samples import read_locations
 from pipeline.shards import Shard
 
 
@@ -44,9 +42,4 @@ def without(shards: str, described: Iterable[Shard], locations: frozenset[str]) 
 
 
 def _count(shards: str, name: str, locations: frozenset[str]) -> int:
-    kept = 0
-    with storage.open_read(storage.join(shards, f"{name}.tar")) as stream, tarfile.open(fileobj=stream) as tar:
-        for member in tar:
-            facts = tar.extractfile(member) if member.name.endswith(".json") else None
-            kept += facts is not None and json.load(facts)["location"] not in locations
-    return kept
+    return sum(location not in locations for location in read_locations(shards, name))

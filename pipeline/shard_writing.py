@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import IO, Any, Literal
 
 from pipeline import shard_records, storage
+from pipeline.ahead import ahead
 from pipeline.inspection import inspect
 from pipeline.records import ImageRecord, Rejection
 from pipeline.shard_plan import ShardPlan
@@ -18,7 +19,6 @@ from pipeline.shard_records import Packed
 from pipeline.shards import Shard
 from pipeline.sources import name_of
 from pipeline.sources.source import Source
-from pipeline.stream import ahead
 from pipeline.transforms import DecodeError, decode
 
 Check = Literal["quick", "full"]

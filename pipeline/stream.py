@@ -4,38 +4,24 @@ In: a set of shards. Out: batches of images as bytes (B, 3, H, W) with their lab
 of the seed, the epoch and the rank, so a run that is continued sees what it would have seen.
 """
 
-import json
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from webdataset.tariterators import group_by_keys, tar_file_expander
 
 from pipeline import storage
+from pipeline.ahead import ahead
 from pipeline.hold_out import held_out, without
 from pipeline.records import InputError, Split, View
+from pipeline.samples import Sample, read_shard
 from pipeline.shards import Manifest, Shard, read_manifest
-from pipeline.transforms import Augmentation, DecodeError, Pixels, augment, decode, resize
+from pipeline.tars import IMAGES, read_tar
+from pipeline.transforms import Augmentation, DecodeError, Pixels, Resizer, augment, decode, resize
 
-In = TypeVar("In")
-Out = TypeVar("Out")
-Item = TypeVar("Item")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sample:
-    """One image as a shard holds it."""
-
-    key: str
-    data: bytes
-    "The encoded image."
-    facts: dict[str, Any]
-    "The JSON beside it."
+Opened = tuple[Sample, Pixels | DecodeError]
+"A sample and its pixels, or why there are none."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,15 +33,8 @@ class Batch:
     "Class numbers, as the manifest's classes are in order."
     view: View
     keys: tuple[str, ...]
-
-
-def read_shard(shards: str, name: str) -> Iterator[Sample]:
-    """The samples of one tar in their order."""
-    path = storage.join(shards, f"{name}.tar")
-    with storage.open_read(path) as stream:
-        for sample in group_by_keys(tar_file_expander([{"url": path, "stream": stream}])):
-            [ending] = [name for name in sample if not name.startswith("__") and name != "json"]
-            yield Sample(key=sample["__key__"], data=sample[ending], facts=json.loads(sample["json"]))
+    damaged: tuple[str, ...] = ()
+    "Keys of images that could not be decoded; the first image of the batch that could stands in their places."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,34 +91,6 @@ def shuffled(samples: Iterable[Sample], buffer: int, rng: np.random.Generator) -
         yield held[chosen]
 
 
-def ahead(function: Callable[[In], Out], items: Iterable[In], threads: int, depth: int) -> Iterator[Out]:
-    """`map` by threads, in order, at most `depth` items ahead of the consumer. Decoding releases the GIL."""
-    with ThreadPoolExecutor(threads) as pool:
-        waiting: deque[Future[Out]] = deque()
-        try:
-            for item in items:
-                waiting.append(pool.submit(function, item))
-                if len(waiting) > depth:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def ready(items: Iterable[Item], depth: int) -> Iterator[Item]:
-    """The items in order, made by a thread of their own, `depth` of them before they are asked for."""
-    source, end = iter(items), object()
-    with ThreadPoolExecutor(1) as pool:
-        waiting: deque[Future[Any]] = deque(pool.submit(next, source, end) for _ in range(depth))
-        try:
-            while (item := waiting.popleft().result()) is not end:
-                waiting.append(pool.submit(next, source, end))
-                yield item
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Reading:
     """How training images are read."""
@@ -148,6 +99,8 @@ class Reading:
     "Images of each view per step and worker [LPN lineage: 8]."
     image_size: int = 256
     "Side in pixels that the network is given."
+    resizer: Resizer = "torch"
+    "Whose bicubic brings images to that size."
     augmentation: Augmentation = field(default_factory=Augmentation)
     seed: int = 0
     shuffle_buffer: int = 4096
@@ -203,21 +156,33 @@ class TrainingStream:
         order_rng = np.random.default_rng([reading.seed, epoch, number, self.rank])
         samples = shuffled(read_spans(self.shards, spans, self.held_out), reading.shuffle_buffer, order_rng)
 
-        def prepare(numbered: tuple[int, Sample]) -> tuple[Sample, Pixels]:
+        def prepare(numbered: tuple[int, Sample]) -> Opened:
             position, sample = numbered
             # A generator for each image: what becomes of it does not depend on which thread had it.
             rng = np.random.default_rng([reading.seed, epoch, number, self.rank, position])
-            return sample, augment(decode(sample.data), view, reading.image_size, reading.augmentation, rng)
+            try:
+                image_HW3 = decode(sample.data)
+            except DecodeError as error:
+                return sample, error
+            return sample, augment(image_HW3, view, reading.image_size, reading.augmentation, rng, reading.resizer)
 
         numbered = islice(enumerate(samples), skip * reading.batch_size, None)
         prepared = ahead(prepare, numbered, reading.threads, 4 * reading.batch_size)
         while group := list(islice(prepared, reading.batch_size)):
-            labels = [self.classes[sample.facts["location"]] for sample, _ in group]
+            whole, damaged = sound(group)
+            if not whole:
+                raise InputError(
+                    f"not one of {len(group)} {view} images of a batch from {self.shards} can be decoded ({damaged[0]} and "
+                    "on), expected at least one; pack these shards again"
+                )
+            # A batch keeps its size, and what stands in is a function of the data alone.
+            chosen = [(sample, image) if not isinstance(image, DecodeError) else whole[0] for sample, image in group]
             yield Batch(
-                images_B3HW=stack([image for _, image in group]),
-                location_B=np.asarray(labels, np.int64),
+                images_B3HW=stack([image for _, image in chosen]),
+                location_B=np.asarray([self.classes[sample.facts["location"]] for sample, _ in chosen], np.int64),
                 view=view,
-                keys=tuple(sample.key for sample, _ in group),
+                keys=tuple(sample.key for sample, _ in chosen),
+                damaged=tuple(damaged),
             )
 
 
@@ -227,17 +192,29 @@ def stack(images_HW3: Sequence[Pixels]) -> npt.NDArray[np.uint8]:
 
 
 def decoded(
-    shards: str, name: str, image_size: int, threads: int, depth: int
-) -> Iterator[tuple[Sample, Pixels | DecodeError]]:
-    """The images of one shard in order, decoded and resized by threads; what cannot be decoded comes as its error."""
+    samples: Iterable[Sample], image_size: int, threads: int, depth: int, resizer: Resizer = "torch"
+) -> Iterator[Opened]:
+    """The samples' images in order, decoded and resized by threads; what cannot be decoded comes as its error."""
 
-    def prepare(sample: Sample) -> tuple[Sample, Pixels | DecodeError]:
+    def prepare(sample: Sample) -> Opened:
         try:
-            return sample, resize(decode(sample.data), image_size)
+            return sample, resize(decode(sample.data), image_size, resizer)
         except DecodeError as error:
             return sample, error
 
-    yield from ahead(prepare, read_shard(shards, name), threads, depth)
+    return ahead(prepare, samples, threads, depth)
+
+
+def sound(images: Iterable[Opened]) -> tuple[list[tuple[Sample, Pixels]], list[str]]:
+    """The images that could be decoded, and the keys of the others."""
+    whole: list[tuple[Sample, Pixels]] = []
+    damaged: list[str] = []
+    for sample, image in images:
+        if isinstance(image, DecodeError):
+            damaged.append(sample.key)
+        else:
+            whole.append((sample, image))
+    return whole, damaged
 
 
 def fetch(shards: str, keys: Iterable[str]) -> dict[str, bytes]:
@@ -247,5 +224,6 @@ def fetch(shards: str, keys: Iterable[str]) -> dict[str, bytes]:
     for shard in read_manifest(shards).shards:
         prefix = f"{shard.split}-{shard.view}-"
         if any(key.startswith(prefix) for key in wanted):
-            found |= {sample.key: sample.data for sample in read_shard(shards, shard.name) if sample.key in wanted}
+            members = read_tar(storage.join(shards, f"{shard.name}.tar"), IMAGES)
+            found |= {key: next(iter(images.values())) for key, images in members if key in wanted}
     return found

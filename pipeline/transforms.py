@@ -7,6 +7,7 @@ import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +17,8 @@ from PIL import Image, UnidentifiedImageError
 from pipeline.records import View
 
 Pixels = npt.NDArray[np.uint8]
-PREPROCESSING = "resize bicubic pillow, ImageNet normalisation"
-"Part of the fingerprint: tables made with another preprocessing do not mix."
+Resizer = Literal["torch", "pillow"]
+"Whose antialiased bicubic. Torch's is several times as fast on a CPU with AVX2 and half as fast on one without."
 ORIENTATION_TAG = 0x0112
 UPRIGHT = {
     1: (slice(None), slice(None)),
@@ -90,11 +91,31 @@ def upright(image_HW3: Pixels, orientation: int) -> Pixels:
     return np.ascontiguousarray(image_HW3[UPRIGHT[orientation]])
 
 
-def resize(image_HW3: Pixels, size: int) -> Pixels:
-    """To (size, size, 3) by antialiased bicubic, as Pillow does it."""
-    if image_HW3.shape[:2] == (size, size):
+def preprocessing(by: Resizer = "torch") -> str:
+    """Part of the fingerprint: tables made with another preprocessing do not mix."""
+    return f"resize bicubic {by}, ImageNet normalisation"
+
+
+def resize(image_HW3: Pixels, size: int, by: Resizer = "torch") -> Pixels:
+    """To (size, size, 3) by antialiased bicubic.
+
+    Torch's is within one grey level of Pillow's, within two at a few pixels of the hardest edges. Both go along the rows
+    first; Pillow from version 13 on goes down the columns first where an image is tall and shrinks, which shows at hard
+    edges. One image by one thread: torch's code for AVX2 starts no threads of its own, so many threads may call this.
+    """
+    height, width, _ = image_HW3.shape
+    if height == width == size:
         return image_HW3
-    return np.asarray(Image.fromarray(image_HW3).resize((size, size), Image.Resampling.BICUBIC))
+    if by == "pillow":
+        return np.asarray(Image.fromarray(image_HW3).resize((size, size), Image.Resampling.BICUBIC))
+    import torch  # here: packing and ranking, which resize nothing, would wait most of a second for it
+
+    # A batch of one by reshape: with a new axis of stride 0 torch would not know it as channels last, and rearrange it.
+    image_1HW3 = np.require(image_HW3, requirements=["C", "W"]).reshape(1, height, width, 3)
+    image_13HW = torch.from_numpy(image_1HW3).permute(0, 3, 1, 2)
+    resized_13HW = torch.nn.functional.interpolate(image_13HW, (size, size), mode="bicubic", antialias=True)
+    resized_HW3: Pixels = resized_13HW.permute(0, 2, 3, 1)[0].numpy()
+    return resized_HW3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,12 +130,14 @@ class Augmentation:
     "Whether half of the images are mirrored [paper, LPN]."
 
 
-def augment(image_HW3: Pixels, view: View, size: int, settings: Augmentation, rng: np.random.Generator) -> Pixels:
+def augment(
+    image_HW3: Pixels, view: View, size: int, settings: Augmentation, rng: np.random.Generator, by: Resizer = "torch"
+) -> Pixels:
     """Train transform of one image, (size, size, 3): resize, pad, turn (satellite only), crop, mirror.
 
     Turned corners are black and the nearest pixel is taken, as torchvision's RandomAffine does in LPN.
     """
-    image_HW3 = resize(image_HW3, size)
+    image_HW3 = resize(image_HW3, size, by)
     pad = settings.pad
     padded_HW3 = np.pad(image_HW3, ((pad, pad), (pad, pad), (0, 0)), mode="edge")
     if view == View.SATELLITE and settings.rotation:

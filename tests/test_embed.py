@@ -8,8 +8,8 @@ import pytest
 from pipeline.embed import EmbeddingSettings, Encoder, Network, embed_gallery
 from pipeline.features import open_table, read_footer
 from pipeline.records import InputError, Split, View
+from pipeline.samples import read_shard
 from pipeline.shards import read_manifest
-from pipeline.stream import read_shard
 
 
 def mean_colour_network(fingerprint: str = "f" * 64) -> Network:

@@ -283,6 +283,10 @@ def test_torchvisions_weights_become_a_checkpoint_whose_refinement_is_said_to_be
         assert torch.allclose(encoder(photos(256))[0], twin_maps(state, normal), atol=1e-4)
     prints = {network_of(Path(out).read_bytes(), out).fingerprint for out in outs}
     assert len(prints) == 1  # the same file gives the same network
+    data = Path(outs[0]).read_bytes()
+    others = {network_of(data, "it", resizer="pillow").fingerprint, network_of(data, "it", mirror=False).fingerprint}
+    assert len(prints | others) == 3  # tables of other preprocessing do not mix
+    assert network_of(data, "it", resizer="pillow").resizer == "pillow"
 
 
 def test_another_depths_names_are_listed(tmp_path: Path) -> None:

@@ -25,12 +25,12 @@ from pipeline import packing, shard_records, storage
 from pipeline.duplicates import find_duplicates
 from pipeline.packing import PackingSettings, TooManyRejected, pack
 from pipeline.records import GeoTag, ImageRecord, InputError, Rejection, Split, View, make_key
+from pipeline.samples import read_shard
 from pipeline.shard_plan import ShardPlan, ShardSize, plan_shards
 from pipeline.shard_records import Packed, read_part
 from pipeline.shard_writing import header, write_shard
 from pipeline.shards import read_manifest
 from pipeline.sources.university1652 import University1652
-from pipeline.stream import read_shard
 from pipeline.verification import verify
 
 SOURCE = University1652()
@@ -254,7 +254,7 @@ def test_verification_names_every_kind_of_damage(tmp_path: Path, ray_cluster: No
     text = "\n".join(wrong)
     for path, words in (
         (flipped, "has not the hash that its JSON says"), (flipped, "has not the hash that the manifest says"),
-        (cut, "cannot be read behind"), (cut, "has 5000 bytes, the manifest says"), (gone, "is missing"),
+        (cut, "is cut off or damaged after"), (cut, "has 5000 bytes, the manifest says"), (gone, "is missing"),
         (out / f"records/{names[3]}.parquet", "cannot be read"),
     ):  # fmt: skip
         assert any(line.startswith(str(path)) and words in line for line in wrong), f"{path.name}: {words}\n{text}"

@@ -1,16 +1,19 @@
 """What the probes say of features made here, and that looking changes nothing."""
 
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
 import torch
 
-from jobs.probes import look, view_gap
+from jobs.probes import look, see, view_gap
 from jobs.recipes import smoke
 from model.pvda import FeatureEncoder
 from pipeline.features import Floats
+from pipeline.records import InputError, View
 from pipeline.stream import Reading, TrainingStream
+from pipeline.transforms import DecodeError, Pixels, decode
 
 
 def features(shift: float, count: int = 80, channels: int = 40) -> tuple[Floats, Floats]:
@@ -62,3 +65,26 @@ def test_a_look_at_training_places_leaves_the_encoder_as_it_was(tiny_shards: str
     assert set(found) == names
     assert all(value >= 0 for value in found.values())
     assert found == look(encoder, stream)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_look_leaves_out_damaged_images_and_says_where_all_are(
+    tiny_shards: str, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encoder = FeatureEncoder(replace(smoke().network, part_dim=16))
+    stream = TrainingStream(tiny_shards, Reading(batch_size=2, image_size=64, hold_out=share, threads=1))
+    whole = see(encoder, stream, View.DRONE)
+    drawn, every = count(), 2
+
+    def failing(data: bytes) -> Pixels:
+        if next(drawn) % every == 0:
+            raise DecodeError("damaged image", "here")
+        return decode(data)
+
+    monkeypatch.setattr("pipeline.stream.decode", failing)
+    found = see(encoder, stream, View.DRONE)
+    assert found.locations == whole.locations[1::2]
+    assert np.allclose(found.pooled_NC, whole.pooled_NC[1::2], atol=1e-5)
+    every = 1
+    with pytest.raises(InputError, match="not one drone image"):
+        see(encoder, stream, View.DRONE)

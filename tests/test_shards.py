@@ -107,7 +107,7 @@ def test_bad_files_are_refused_with_reasons_and_the_rest_is_packed(tmp_path: Pat
     rows = pq.read_table(tmp_path / "out/rejected.parquet").to_pylist()
     reasons = {Path(row["path"]).name: row["reason"] for row in rows}
     assert reasons == {
-        "empty.jpeg": "empty file", "text.jpeg": "not an image", "cut.jpeg": "damaged image",
+        "empty.jpeg": "empty file", "text.jpeg": "not an image", "cut.jpeg": "truncated image",
         "Thumbs.db": "not an image's name", "stray.jpeg": "wrong folder", "image-00.jpg": "same name twice",
     }  # fmt: skip
 

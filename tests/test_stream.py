@@ -3,10 +3,11 @@
 Shapes: B images, H x W pixels.
 """
 
+import io
 import json
 import tarfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from itertools import count
 from pathlib import Path
@@ -20,25 +21,14 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pipeline import storage
+from pipeline.ahead import ahead, ready
 from pipeline.records import ImageRecord, InputError, Split, View
+from pipeline.samples import Sample, read_shard
 from pipeline.shard_plan import ShardPlan
 from pipeline.shard_writing import write_shard
 from pipeline.shards import MANIFEST, Manifest, Shard
 from pipeline.sources.university1652 import University1652
-from pipeline.stream import (
-    Batch,
-    Reading,
-    Sample,
-    TrainingStream,
-    ahead,
-    decoded,
-    fetch,
-    plan_pass,
-    read_shard,
-    read_spans,
-    ready,
-    shuffled,
-)  # fmt: skip
+from pipeline.stream import Batch, Reading, TrainingStream, decoded, fetch, plan_pass, read_spans, shuffled  # fmt: skip
 from pipeline.transforms import Augmentation, DecodeError, decode
 
 CLASSES = ("0003", "0008", "0839", "Aa")
@@ -51,7 +41,7 @@ def records(folder: Path, view: View, images: int) -> list[ImageRecord]:
     found = []
     for number in range(images):
         path = folder / f"{view}-{number:03d}.png"
-        Image.new("RGB", (9, 7), (number, 2 * number, list(View).index(view))).save(path)
+        Image.new("RGB", (9, 8), (number, 2 * number, list(View).index(view))).save(path)
         location = CLASSES[number % len(CLASSES)]
         found.append(ImageRecord(path=str(path), split=Split.TRAIN, view=view, location=location))
     return found
@@ -338,6 +328,64 @@ def test_fewer_uav_than_satellite_images_come_again_within_an_epoch(shards: str,
     assert len(seen) == 10
 
 
+# Images that were damaged after packing.
+
+
+def with_damage(shards: str, out: Path, spoilt: Callable[[str], bool]) -> str:
+    """The same set; the images whose member's name says so have lost their pixels."""
+    for path in filter(Path.is_file, Path(shards).iterdir()):
+        if path.suffix != ".tar":
+            (out / path.name).write_bytes(path.read_bytes())
+            continue
+        with tarfile.open(path) as old, tarfile.open(out / path.name, "w") as new:
+            for member in old.getmembers():
+                stream = old.extractfile(member)
+                assert stream is not None
+                data = stream.read()
+                if member.name.endswith(".png") and spoilt(member.name):
+                    data = data[:40] + bytes(len(data) - 40)
+                new.addfile(member, io.BytesIO(data))
+    return str(out)
+
+
+def odd(name: str) -> bool:
+    """Whether an image's number, in its key or its member's name, ends in 1 or 3."""
+    return name.split("-")[4][2] in "13"
+
+
+def test_a_damaged_images_place_is_taken_by_the_first_whole_one_of_its_batch_under_its_own_label(
+    shards: str, tmp_path: Path
+) -> None:
+    broken = with_damage(shards, tmp_path, odd)
+    lively = replace(PLAIN, augmentation=Augmentation(pad=2))
+    counted = 0
+    for pair, same in zip(epoch(shards, 2, reading=lively), epoch(broken, 2, reading=lively), strict=True):
+        for batch, found in zip(pair, same, strict=True):
+            whole = [place for place, key in enumerate(batch.keys) if not odd(key)]
+            taken = [place if place in whole else whole[0] for place in range(4)]
+            assert found.keys == tuple(batch.keys[place] for place in taken)
+            assert found.damaged == tuple(key for key in batch.keys if odd(key))
+            assert found.location_B.tolist() == [batch.location_B[place] for place in taken]
+            assert np.array_equal(found.images_B3HW, batch.images_B3HW[taken])
+            assert batch.damaged == ()
+            counted += len(found.damaged)
+    assert counted > 4
+
+
+def test_damaged_images_leave_an_epoch_that_is_entered_later_as_it_would_have_been(shards: str, tmp_path: Path) -> None:
+    stream = TrainingStream(with_damage(shards, tmp_path, odd), PLAIN)
+    for pair, same in zip(list(stream.epoch(1))[3:], stream.epoch(1, 3), strict=True):
+        for batch, other in zip(pair, same, strict=True):
+            assert (batch.keys, batch.damaged) == (other.keys, other.damaged)
+            assert np.array_equal(batch.images_B3HW, other.images_B3HW)
+
+
+def test_a_batch_without_a_whole_image_stops_training_with_the_sets_name(shards: str, tmp_path: Path) -> None:
+    broken = with_damage(shards, tmp_path, lambda name: "satellite" in name)
+    with pytest.raises(InputError, match=rf"not one of 4 satellite images of a batch from {tmp_path} can be decoded"):
+        epoch(broken)
+
+
 # Reading for embedding and for pictures.
 
 
@@ -350,7 +398,7 @@ def test_images_for_embedding_come_in_the_shards_order_and_an_undecodable_one_as
             if number == 2:  # the second sample's image, cut short
                 member.size -= 30
             new.addfile(member, stream)
-    found = list(decoded(str(tmp_path), "x", 8, threads=2, depth=4))
+    found = list(decoded(read_shard(str(tmp_path), "x"), 8, threads=2, depth=4))
     assert [held.key for held, _ in found] == [held.key for held in read_shard(shards, "train-drone-000002")]
     kinds = [type(image) for _, image in found]
     assert kinds == [np.ndarray, DecodeError, *[np.ndarray] * 8]
@@ -381,7 +429,7 @@ def test_plain_webdataset_opens_a_shard(shards: str) -> None:
     found = list(dataset.decode("pil"))
     assert len(found) == 8
     for held in found:
-        assert held["png"].size == (9, 7)
+        assert held["png"].size == (9, 8)
         assert held["json"]["key"] == held["__key__"]
         assert json.dumps(held["json"])
         assert held["json"]["view"] == "satellite"

@@ -12,9 +12,11 @@ from jobs.cli import Failure
 from jobs.recipes import Recipe, paper, smoke
 from jobs.run_folder import Run, read_checkpoint
 from jobs.train import Settings, known_recipe, train
-from jobs.training_loop import untrained
-from model.checkpoint import CheckpointError, build_encoder, loads
+from jobs.training_loop import Place, train_worker, untrained
+from model.checkpoint import CheckpointError, build_encoder, dumps, loads
 from pipeline.records import InputError
+from pipeline.samples import read_shard
+from pipeline.transforms import DecodeError, Pixels, decode
 
 
 def tiny(epochs: int = 2) -> Recipe:
@@ -31,6 +33,11 @@ def settings(shards: str, out: Path, recipe: Recipe, **changes: object) -> Setti
 
 def rows(out: Path) -> list[dict[str, object]]:
     return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+def rows_of(shards: str, out: Path) -> list[dict[str, object]]:
+    train(settings(shards, out, tiny(1)))
+    return rows(out)
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:
@@ -74,6 +81,42 @@ def test_a_finished_run_is_left_alone_and_another_recipe_refused(
     assert "nothing to do" in capsys.readouterr().err
     with pytest.raises(InputError, match="with another schedule; choose another --out"):
         train(settings(tiny_shards, tmp_path, tiny(3)))
+
+
+def test_a_run_from_before_the_resizer_was_a_setting_goes_on_with_pillows(tiny_shards: str, tmp_path: Path) -> None:
+    path = Path(train(settings(tiny_shards, tmp_path, replace(tiny(1), resizer="pillow"))))
+    held = loads(path.read_bytes())
+    path.write_bytes(
+        dumps(replace(held, recipe={name: held.recipe[name] for name in held.recipe if name != "resizer"}))
+    )
+    train(settings(tiny_shards, tmp_path, replace(tiny(1), resizer="pillow")))  # nothing to do
+    with pytest.raises(InputError, match="with another resizer"):
+        train(settings(tiny_shards, tmp_path, tiny(1)))
+
+
+def test_damaged_images_are_counted_in_the_row_and_said_once_an_epoch(
+    tiny_shards: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert [row["damaged_images"] for row in rows_of(tiny_shards, tmp_path / "whole")] == [0]
+    bad = next(sample for sample in read_shard(tiny_shards, "train-drone-000000")).data
+
+    def failing(data: bytes) -> Pixels:
+        if data == bad:
+            raise DecodeError("damaged image", "here")
+        return decode(data)
+
+    monkeypatch.setattr("pipeline.stream.decode", failing)
+    told: list[dict[str, object]] = []
+    run = Run(shards=tiny_shards, out=str(tmp_path / "run"), recipe=tiny(4), probe_epochs=0)
+    train_worker(run, Place(gather=lambda damage: [damage, (2, "another-worker's")]), told.append)
+    counts = [row["damaged_images"] for row in rows(tmp_path / "run")]
+    assert set(counts) == {2, 3}  # 6 of the 18 UAV images are drawn in an epoch, and another worker's come in addition
+    notes = [str(facts["note"]) for facts in told if "note" in facts]
+    assert len(notes) == 4
+    assert all(note.startswith(f"epoch {number}: ") for number, note in enumerate(notes, start=1))
+    for number, note in zip(counts, notes, strict=True):
+        assert f": {number} images could not be decoded" in note
+        assert ("the first of them is train-drone-" in note) == (number == 3)
 
 
 def test_ray_train_takes_the_same_steps_as_this_process(tiny_shards: str, tmp_path: Path, ray_cluster: None) -> None:

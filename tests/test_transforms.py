@@ -5,18 +5,25 @@ Shapes: H x W pixels.
 
 import io
 import struct
+import subprocess
+import sys
 import zlib
 from contextlib import suppress
 from math import atan2, degrees
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageOps
 
 from pipeline.records import View
-from pipeline.transforms import Augmentation, DecodeError, Pixels, augment, decode, resize
+from pipeline.transforms import Augmentation, DecodeError, Pixels, Resizer, augment, decode, preprocessing, resize
+
+ROOT = Path(__file__).parent.parent
+RESIZERS: tuple[Resizer, ...] = ("torch", "pillow")
 
 
 def noise(height: int = 37, width: int = 50) -> Pixels:
@@ -197,14 +204,89 @@ def test_no_damage_raises_anything_but_a_decode_error(data: bytes, faults: list[
 
 
 @pytest.mark.parametrize(("height", "width"), [(37, 50), (16, 16), (3, 2), (100, 64)])
-def test_resizing_is_pillows_antialiased_bicubic(height: int, width: int) -> None:
+def test_resizing_by_pillow_is_its_antialiased_bicubic(height: int, width: int) -> None:
     image_HW3 = noise(height, width)
     expected = Image.fromarray(image_HW3).resize((16, 16), Image.Resampling.BICUBIC)
-    assert np.array_equal(resize(image_HW3, 16), np.asarray(expected))
+    assert np.array_equal(resize(image_HW3, 16, "pillow"), np.asarray(expected))
 
 
-def test_an_image_that_has_its_size_is_left_as_it_is() -> None:
-    assert np.array_equal(resize(noise(16, 16), 16), noise(16, 16))
+@settings(max_examples=100, deadline=None)
+@given(
+    height=st.integers(1, 200),
+    width=st.integers(1, 200),
+    size=st.integers(1, 200),
+    seed=st.integers(0, 99),
+    extremes=st.booleans(),
+)
+def test_resizing_by_torch_is_within_one_grey_level_of_pillows_and_hardly_ever_two(
+    height: int, width: int, size: int, seed: int, extremes: bool
+) -> None:
+    image_HW3 = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    if extremes:  # black and white alone: where a filter overshoots
+        image_HW3 = np.where(image_HW3 < 128, 0, 255).astype(np.uint8)
+    image_HW3.flags.writeable = False  # as Pillow's are: torch would warn
+    found_HW3 = resize(image_HW3, size)
+    assert found_HW3.shape == (size, size, 3)
+    # Along the rows first, whatever Pillow's version thinks best: between the passes values are clipped.
+    rows = Image.fromarray(image_HW3).resize((size, height), Image.Resampling.BICUBIC)
+    expected_HW3 = np.asarray(rows.resize((size, size), Image.Resampling.BICUBIC))
+    apart_HW3 = np.abs(found_HW3.astype(np.int64) - expected_HW3)
+    assert apart_HW3.max() <= 2
+    assert (apart_HW3 == 2).sum() <= 2 + 0.001 * apart_HW3.size
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "size"), [(512, 512, 256), (750, 1000, 256), (1000, 750, 256), (96, 96, 64)]
+)
+def test_photos_made_small_by_torch_are_within_one_grey_level_of_pillows(height: int, width: int, size: int) -> None:
+    image_HW3 = noise(height, width)
+    by_torch, by_pillow = (resize(image_HW3, size, by).astype(np.int64) for by in RESIZERS)
+    assert np.abs(by_torch - by_pillow).max() <= 1
+
+
+def test_an_image_resized_by_torch_is_one_block_of_memory_of_which_nobody_else_knows() -> None:
+    image_HW3 = noise()
+    found_HW3 = resize(image_HW3, 16)
+    assert found_HW3.flags.c_contiguous
+    assert found_HW3.dtype == np.uint8
+    assert not np.shares_memory(found_HW3, image_HW3)
+    assert np.array_equal(resize(image_HW3[:, ::-1], 16), resize(np.ascontiguousarray(image_HW3[:, ::-1]), 16))
+
+
+@pytest.mark.skipif(
+    torch.backends.cpu.get_cpu_capability() not in ("AVX2", "AVX512"), reason="torch's code for other CPUs is parallel"
+)
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted as Linux shows them")
+def test_threads_that_resize_start_no_threads_of_their_own() -> None:
+    script = (
+        "import os, numpy, torch\n"
+        "from concurrent.futures import ThreadPoolExecutor\n"
+        "from pipeline.transforms import resize\n"
+        "torch.set_num_threads(8)\n"
+        "image = numpy.zeros((2000, 2000, 3), numpy.uint8)\n"
+        "before = len(os.listdir('/proc/self/task'))\n"
+        "with ThreadPoolExecutor(3) as pool:\n"
+        "    list(pool.map(lambda _: resize(image, 1000), range(6)))\n"
+        "    print(len(os.listdir('/proc/self/task')) - before)\n"
+    )
+    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert int(told.stdout) <= 3
+
+
+def test_decoding_and_inspecting_do_not_wait_for_torch() -> None:
+    script = "import sys, pipeline.inspection; print('torch' in sys.modules)"
+    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert told.stdout.strip() == "False"
+
+
+def test_the_preprocessing_says_who_resized_and_pillows_is_what_it_always_was() -> None:
+    assert preprocessing("pillow") == "resize bicubic pillow, ImageNet normalisation"
+    assert preprocessing() == preprocessing("torch") != preprocessing("pillow")
+
+
+@pytest.mark.parametrize("by", RESIZERS)
+def test_an_image_that_has_its_size_is_left_as_it_is(by: Resizer) -> None:
+    assert np.array_equal(resize(noise(16, 16), 16, by), noise(16, 16))
 
 
 SIZE, PAD = 12, 3

@@ -4,13 +4,13 @@ In: any folders below a root. Out: a record per image name, in the order of thei
 """
 
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
 
 from pipeline import storage
+from pipeline.ahead import ahead
 from pipeline.records import GeoTag, ImageRecord, InputError, Rejection, Split, View
 from pipeline.sources.camera_tags import CameraTags, read_tags
 from pipeline.sources.image_blocks import UnreadableTag, find_blocks
@@ -54,19 +54,8 @@ class Photos(Source):
             others = Counter(path.rpartition(".")[2] for path in files).most_common(3)
             said = ", ".join(f"{count} .{ending}" for ending, count in others) or "nothing at all"
             raise InputError(f"no images below {root}, but {said}; expected photos in any folders; check --root")
-        with ThreadPoolExecutor(THREADS) as pool:
-            ahead: deque[Future[ImageRecord | Rejection]] = deque()
-            try:
-                for path, size in files.items():
-                    if path.lower().endswith(COMPANIONS):
-                        continue
-                    ahead.append(pool.submit(self._judge, root, path, size))
-                    if len(ahead) >= WINDOW:
-                        yield ahead.popleft().result()
-                while ahead:
-                    yield ahead.popleft().result()
-            finally:
-                pool.shutdown(cancel_futures=True)
+        photos = [(path, size) for path, size in files.items() if not path.lower().endswith(COMPANIONS)]
+        yield from ahead(lambda photo: self._judge(root, *photo), photos, THREADS, WINDOW)
 
     def _judge(self, root: str, path: str, size: int) -> ImageRecord | Rejection:
         whole = storage.join(root, path)
