@@ -32,6 +32,10 @@ def test_every_job_runs_as_a_module_too() -> None:
 WRONG: list[tuple[str, list[str], str]] = [
     ("make_shards", ["--source", "university1652", "--root", "{}/nowhere", "--out", "{}/o"], "no folder"),
     ("make_shards", ["--source", "university1652", "--root", "{}", "--out", "{}/o"], "no images below"),
+    ("make_shards", ["--root", "{}", "--out", "{}/o"], "--source is missing, expected one of: university1652"),
+    ("make_shards", ["--verify", "--out", "{}"], "not a finished set of shards"),
+    ("make_shards", ["--export", "{}/x.parquet", "--out", "{}"], "not a finished set of shards"),
+    ("make_shards", ["--source", "photos", "--tile-m", "3", "--root", "{}", "--out", "{}/o"], "--tile-m"),
     ("make_shards", ["--source", "flickr", "--root", "{}", "--out", "{}/o"], "expected one of: university1652"),
     ("train", ["papr", "--shards", "{}", "--out", "{}/o"], "unknown recipe 'papr'"),
     ("train", ["smoke", "--shards", "{}", "--out", "{}/o"], "not a finished set of shards"),

@@ -21,6 +21,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from jobs import make_shards
+from jobs.cli import Failure
 from pipeline import packing, shard_records, storage
 from pipeline.duplicates import find_duplicates
 from pipeline.packing import PackingSettings, TooManyRejected, pack
@@ -389,3 +391,24 @@ def test_headers_are_those_that_tarfile_makes(name: str, size: int) -> None:
     info = tarfile.TarInfo(name)
     info.size, info.uname, info.gname = size, "root", "root"
     assert header(name, size) == info.tobuf(tarfile.USTAR_FORMAT)
+
+
+def test_the_job_checks_and_exports_a_finished_set(
+    tmp_path: Path, ray_cluster: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    manifest = pack(SOURCE, said(imagery(tmp_path / "root"), out))
+    make_shards.check(str(out), verify=True)
+    make_shards.export(str(out), export=str(tmp_path / "all.geojson"))
+    told = capsys.readouterr().err
+    assert f"all {len(manifest.shards)} shards are what was packed" in told
+    assert "0 images, 15 without a place left out" in told
+    (out / f"{manifest.shards[0].name}.tar").unlink()
+    with pytest.raises(Failure, match="is damaged in 1 places; delete the tars that are named"):
+        make_shards.check(str(out), verify=True)
+
+
+def test_a_source_is_named_by_a_flag_in_either_form() -> None:
+    for words in (["--root", "x", "--source", "xyz", "--zoom", "3"], ["--root", "x", "--source=xyz", "--zoom", "3"]):
+        assert make_shards.source_as_subcommand(words) == ["xyz", "--root", "x", "--zoom", "3"]
+    assert make_shards.source_as_subcommand(["--help"]) == ["--help"]
