@@ -102,7 +102,8 @@ def pack(source: Source, settings: PackingSettings) -> Manifest:
     tables = (read_part(out, name, COLUMNS) for name in sorted(old.union(packed)))
     doubles = find_duplicates(tables, settled=old) if packed else {}
     again = [plan for plan in plans if plan.name in doubles]
-    packed |= pack_plans(again, source, settings, said, haul, doubles)
+    if again:
+        packed |= pack_plans(again, source, settings, said, haul, doubles)
     haul.rejected += [rejection for done in packed.values() for rejection in done.rejected]
     judge(settings, haul.rejected, haul.found)
     refusals = rejects.write(out, haul.rejected, keep=before is not None)
@@ -216,7 +217,9 @@ def pack_plans(
         arguments = (
             (plan, source, out, digests[plan.name], settings.check, (doubles or {}).get(plan.name)) for plan in todo
         )
-        for done in write_all(arguments, settings.workers):
+        # Starting Ray takes longer than one tar.
+        workers = 0 if settings.workers is None and len(todo) <= 1 else settings.workers
+        for done in write_all(arguments, workers):
             packed[done.shard.name] = done
             refused += done.rejected
             megabytes += done.shard.bytes / 1e6
