@@ -17,7 +17,7 @@ from torch import Tensor
 from model.compiling import NotCompiled, compile_frozen
 from model.folding import fold
 from model.inference import FastEncoder, InEffect, Kind, OneBatch, Precision, effective_precision, embed
-from model.int8 import PrecisionError, in_batches, quantise, require_int8
+from model.int8 import CALIBRATION_BATCH, PrecisionError, quantise, require_int8
 from model.pvda import FeatureEncoder
 
 LEAST_COSINE: dict[InEffect, float] = {"float32": 0.9999, "bfloat16": 0.999, "int8": 0.99}
@@ -135,11 +135,10 @@ def _int8(module: OneBatch, check: _Check, calibration_B3HW: Tensor | None, say:
     start = time.perf_counter()
 
     def calibrate() -> None:
-        for batch_B3HW in in_batches(calibration_B3HW, check.batch_size):
+        for batch_B3HW in torch.split(calibration_B3HW, CALIBRATION_BATCH):
             module(batch_B3HW)
 
-    rows = check.batch_size * (2 if module.mirror else 1)
-    quantise(module.encoder, rows, check.probe_B3HW.shape[2], calibrate)
+    quantise(module.encoder, check.probe_B3HW.shape[2], calibrate)
     try:
         fast = check.measured("compiled", compile_frozen(module, check.batch()))
     except NotCompiled as error:

@@ -6,7 +6,7 @@ it computes the same slower than float32. Rings and refinement stay in float32: 
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 
@@ -19,6 +19,8 @@ from model.pvda import FeatureEncoder
 STEPS = "torchao.quantization.pt2e.quantize_pt2e"
 QUANTIZER = "torchao.quantization.pt2e.quantizer.x86_inductor_quantizer"
 "Imported when they are needed: torchao is optional, and its import takes seconds."
+CALIBRATION_BATCH = 8
+"Images at a time, whatever the batch size of embedding: the ranges must not depend on it."
 INSTRUCTIONS = ("avx512_vnni", "avx_vnni", "amx_int8")
 "Any one of these multiplies 8-bit integers, as torch names them."
 
@@ -47,27 +49,28 @@ def require_int8(device: str) -> None:
         ) from error
 
 
-def quantise(encoder: FeatureEncoder, rows: int, size: int, calibrate: Callable[[], None]) -> None:
-    """Put a quantised backbone into a folded `encoder`, for batches of exactly `rows` images of `size` x `size` pixels.
+def quantise(encoder: FeatureEncoder, size: int, calibrate: Callable[[], None]) -> None:
+    """Put a quantised backbone into a folded `encoder`, for images of `size` x `size` pixels.
 
-    `calibrate` runs images through the encoder, in such batches, while the ranges of its activations are watched:
-    per tensor, 8 bits unsigned, from histograms. Weights have a range per output channel, signed.
+    `calibrate` runs images through the encoder while the ranges of its activations are watched: per tensor, 8 bits
+    unsigned, from histograms. Weights have a range per output channel, signed. It runs on one thread: sums in another
+    order give other ranges in their last digit, and workers would round differently.
     """
+    threads = torch.get_num_threads()
     with _quiet_torchao(), torch.no_grad():
         pt2e, x86 = import_module(STEPS), import_module(QUANTIZER)
-        example_B3HW = torch.zeros(rows, 3, size, size).to(memory_format=torch.channels_last)
+        example_B3HW = torch.zeros(CALIBRATION_BATCH, 3, size, size).to(memory_format=torch.channels_last)
         quantizer = x86.X86InductorQuantizer().set_global(x86.get_default_x86_inductor_quantization_config())
-        watched = pt2e.prepare_pt2e(torch.export.export(encoder.backbone, (example_B3HW,)).module(), quantizer)
+        any_batch = ({0: torch.export.Dim.AUTO},)
+        exported = torch.export.export(encoder.backbone, (example_B3HW,), dynamic_shapes=any_batch).module()
+        watched = pt2e.prepare_pt2e(exported, quantizer)
         encoder.add_module("backbone", watched)
-        calibrate()
+        torch.set_num_threads(1)
+        try:
+            calibrate()
+        finally:
+            torch.set_num_threads(threads)
         encoder.add_module("backbone", pt2e.convert_pt2e(watched))
-
-
-def in_batches(images_B3HW: Tensor, rows: int) -> Iterable[Tensor]:
-    """The images in batches of `rows`, the last one filled up with the first images again."""
-    count = len(images_B3HW)
-    for start in range(0, count, rows):
-        yield images_B3HW[torch.arange(start, start + rows) % count]
 
 
 def calibration_digest(images_B3HW: Tensor) -> str:
