@@ -5,7 +5,6 @@ In: normalised images (B, 3, H, W). Out: feature maps (B, C, H/16, W/16); C is 2
 
 from typing import Literal
 
-import torch
 from torch import Tensor, nn
 
 Depth = Literal[18, 34, 50, 101]
@@ -33,13 +32,14 @@ class BasicBlock(nn.Module):
         self.bn1 = nn.BatchNorm2d(width)
         self.conv2 = nn.Conv2d(width, width, 3, 1, 1, bias=False)
         self.bn2 = nn.BatchNorm2d(width)
-        self.relu = nn.ReLU(inplace=True)
+        self.relu1, self.relu2 = relus(2)
         self.downsample = shortcut(inside, width, stride)
 
     def forward(self, x: Tensor) -> Tensor:
-        y = self.relu(self.bn1(self.conv1(x)))
+        y = self.relu1(self.bn1(self.conv1(x)))
         y = self.bn2(self.conv2(y))
-        return torch.relu(y + (x if self.downsample is None else self.downsample(x)))
+        z: Tensor = self.relu2(y + (x if self.downsample is None else self.downsample(x)))
+        return z
 
 
 class Bottleneck(nn.Module):
@@ -55,14 +55,20 @@ class Bottleneck(nn.Module):
         self.bn2 = nn.BatchNorm2d(width)
         self.conv3 = nn.Conv2d(width, width * self.expansion, 1, bias=False)
         self.bn3 = nn.BatchNorm2d(width * self.expansion)
-        self.relu = nn.ReLU(inplace=True)
+        self.relu1, self.relu2, self.relu3 = relus(3)
         self.downsample = shortcut(inside, width * self.expansion, stride)
 
     def forward(self, x: Tensor) -> Tensor:
-        y = self.relu(self.bn1(self.conv1(x)))
-        y = self.relu(self.bn2(self.conv2(y)))
+        y = self.relu1(self.bn1(self.conv1(x)))
+        y = self.relu2(self.bn2(self.conv2(y)))
         y = self.bn3(self.conv3(y))
-        return torch.relu(y + (x if self.downsample is None else self.downsample(x)))
+        z: Tensor = self.relu3(y + (x if self.downsample is None else self.downsample(x)))
+        return z
+
+
+def relus(count: int) -> list[nn.ReLU]:
+    """So many modules, not one used so often: quantisers fuse a ReLU into its convolution by the module that it is."""
+    return [nn.ReLU(inplace=True) for _ in range(count)]
 
 
 def shortcut(inside: int, outside: int, stride: int) -> nn.Module | None:

@@ -1,10 +1,14 @@
-"""Fixtures that several tests share: one Ray for all, and a tiny data set made by the simulator."""
+"""Fixtures that several tests share: one Ray for all, a tiny data set made by the simulator, a small encoder."""
 
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from model.pvda import FeatureEncoder
 
 os.environ.setdefault("RAY_AUTH_MODE", "disabled")  # the same for every Ray process that the tests start
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -54,3 +58,25 @@ def ray_address(ray_cluster: None, monkeypatch: pytest.MonkeyPatch) -> str:
     address: str = ray.get_runtime_context().gcs_address
     monkeypatch.setenv("RAY_ADDRESS", address)
     return address
+
+
+@pytest.fixture
+def lively_encoder() -> "FeatureEncoder":
+    """A ResNet-18 of a quarter's width at 64 px whose BatchNorms have been somewhere, so that leaving one out shows."""
+    import torch
+    from torch import nn
+
+    from model.pvda import FeatureEncoder, PVDAConfig
+
+    torch.manual_seed(0)
+    encoder = FeatureEncoder(PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=16)).eval()
+    with torch.no_grad():
+        for module in encoder.modules():
+            if isinstance(module, nn.modules.batchnorm._BatchNorm):
+                assert module.running_mean is not None
+                assert module.running_var is not None
+                module.running_mean.normal_(0, 0.3)
+                module.running_var.uniform_(0.3, 2)
+                module.weight.uniform_(0.5, 1.5)
+                module.bias.normal_(0, 0.3)
+    return encoder
