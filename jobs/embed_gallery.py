@@ -7,11 +7,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from jobs.cli import run
+from jobs.cli import Failure, run
 from model.checkpoint import build_encoder, fingerprint, loads
 from model.inference import embed
 from pipeline import storage
-from pipeline.embed import EmbeddingSettings, Encoder, Network, embed_gallery
+from pipeline.embed import EmbeddingSettings, Encoder, Incomplete, Network, embed_gallery
 from pipeline.features import Floats
 from pipeline.records import InputError
 from pipeline.transforms import Resizer, preprocessing
@@ -67,7 +67,10 @@ def main(settings: Settings) -> None:
     given |= {"shards": storage.absolute(settings.shards), "out": storage.absolute(settings.out)}
     data = storage.read_bytes(settings.checkpoint)
     network = network_of(data, settings.checkpoint, settings.mirror, settings.resizer)
-    embed_gallery(EmbeddingSettings(**given), network)
+    try:
+        embed_gallery(EmbeddingSettings(**given), network)
+    except Incomplete as error:
+        raise Failure(str(error)) from None
 
 
 if __name__ == "__main__":
