@@ -13,7 +13,7 @@ from typing import Any
 from rich.text import Text
 
 from jobs.cli import run
-from jobs.embed_gallery import network_of
+from jobs.encoders import network_of
 from jobs.evaluate import print_table
 from jobs.recipes import smoke
 from jobs.run_folder import Run
@@ -83,9 +83,9 @@ def demo(settings: Settings) -> list[dict[str, Any]]:
         with step(
             seconds, f"{4 + 2 * number} embed", f"test images with the {name} network, one Parquet part per shard"
         ):
-            network = network_of(storage.read_bytes(file), file)
             for split in (Split.QUERY, Split.GALLERY):
-                embed_gallery(EmbeddingSettings(shards=shards, out=table, split=split), network)
+                embedding = EmbeddingSettings(shards=shards, out=table, split=split)
+                embed_gallery(embedding, network_of(storage.read_bytes(file), file, embedding))
         with step(seconds, f"{5 + 2 * number} evaluate", f"both directions and multi-query, the {name} network"):
             rows[name] = evaluate(
                 EvaluationSettings(

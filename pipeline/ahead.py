@@ -1,7 +1,7 @@
 """Work done by threads before it is asked for, in order and never too far ahead."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -25,7 +25,7 @@ def ahead(function: Callable[[In], Out], items: Iterable[In], threads: int, dept
             pool.shutdown(cancel_futures=True)
 
 
-def ready(items: Iterable[Item], depth: int) -> Iterator[Item]:
+def ready(items: Iterable[Item], depth: int) -> Generator[Item, None, None]:
     """The items in order, made by a thread of their own, `depth` of them before they are asked for."""
     source, end = iter(items), object()
     with ThreadPoolExecutor(1) as pool:

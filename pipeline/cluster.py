@@ -8,6 +8,8 @@ from typing import Any, TypeVar
 
 import ray
 
+from pipeline.placement import Node
+
 Item = TypeVar("Item")
 
 
@@ -34,6 +36,12 @@ def cpus() -> int:
 def gpus() -> int:
     """GPUs of the whole cluster."""
     return int(_resources().get("GPU", 0))
+
+
+def nodes() -> list[Node]:
+    """The machines of the cluster that are up."""
+    up = [node["Resources"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
+    return [Node(cpus=has.get("CPU", 0.0), gpus=has.get("GPU", 0.0)) for has in up]
 
 
 def _resources() -> dict[str, float]:

@@ -1,32 +1,37 @@
-"""Shards + encoder -> feature table: Ray actors that hold the encoder, one Parquet part per shard, done parts skipped.
+"""Shards + encoder -> feature table: the stage. Ray actors make one Parquet part per shard; done parts are left as they are.
 
-The encoder comes as a factory that is called on the worker; what it computes is named by a fingerprint.
-Shapes: B images of a batch, H x W pixels, D dimensions of an embedding.
+In: a set of shards, and the encoder as a factory that is called on each worker. Out: the table, the list of what of the
+shards has no row, and a summary. However often workers or the stage itself are killed, the table ends up with the same
+bytes: a part is a function of its shard, and appears whole.
 """
 
 import time
-from collections import defaultdict
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
+from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import ray
-from ray.util import ActorPool
 
 from pipeline import cluster, storage
-from pipeline.features import Floats, PartFooter, PartRows, read_footer, write_part
+from pipeline.crew import CannotWork, Crew, NobodyCame, SetAside, Terms
+from pipeline.feature_parts import REJECTED, PartHeader, list_rejected, part_names, read_header, read_headers
 from pipeline.foreign import open_manifest
+from pipeline.placement import Node, Placement, place
 from pipeline.progress import console, progress
-from pipeline.records import InputError, Rejection, Split, View
-from pipeline.samples import Sample, read_shard
+from pipeline.records import InputError, Split, View
+from pipeline.shard_embedder import (
+    IN_FLIGHT,
+    Assignment,
+    CannotWrite,
+    Embedded,
+    Encoder,
+    Network,
+    ShardEmbedder,
+)
 from pipeline.shards import Manifest, Shard
-from pipeline.stream import decoded, stack
-from pipeline.transforms import DecodeError, Pixels, Resizer
 
-Encoder = Callable[[npt.NDArray[np.uint8]], Floats]
-"Images as bytes (B, 3, H, W) -> unit vectors (B, D), float32."
+__all__ = ["EmbeddingSettings", "Encoder", "Incomplete", "Network", "embed_gallery"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,142 +51,175 @@ class EmbeddingSettings:
     dtype: str = "float32"
     "Of the stored embeddings: float32, or float16 for half the space."
     workers: int | None = None
-    "Actors; by default one per GPU, or one per eight CPU cores."
+    "Actors; by default one per GPU, or where there is none one per eight CPU cores."
     cpus_per_worker: int | None = None
-    "CPU cores of an actor; by default an even share of the cluster's."
-    gpus_per_worker: float = 0
-    "GPUs of an actor."
+    "CPU cores of an actor; by default as many as let all actors fit on the nodes that are up."
+    gpus_per_worker: float | None = None
+    "GPUs of an actor; by default 1 where the cluster has any, else 0."
+    decode_threads: int | None = None
+    "Threads of an actor that decode; by default its cores but one beside a GPU, else one per four cores."
+    patience: float = 600.0
+    "Seconds to wait for the first actor to start, before giving up."
 
     def __post_init__(self) -> None:
         if self.batch_size < 1:
             raise InputError(f"--batch-size is {self.batch_size}, expected at least 1")
         if self.dtype not in ("float32", "float16"):
             raise InputError(f"--dtype is {self.dtype!r}, expected float32 or float16")
-        if self.workers is not None and self.workers < 1:
-            raise InputError(f"--workers is {self.workers}, expected at least 1")
+        for name in ("workers", "cpus_per_worker", "decode_threads"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise InputError(f"--{name.replace('_', '-')} is {value}, expected at least 1")
+        if self.gpus_per_worker is not None and self.gpus_per_worker < 0:
+            raise InputError(f"--gpus-per-worker is {self.gpus_per_worker}, expected 0 or more")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Network:
-    """The encoder as the embedder needs to know it."""
-
-    fingerprint: str
-    "Of weights, config and preprocessing."
-    image_size: int
-    "Side in pixels of the images that it takes."
-    resizer: Resizer = "torch"
-    "Whose bicubic brings them to it."
-    factory: Callable[[int], Encoder]
-    "Called once on each worker, with the number of threads that it may use."
-
-
-def is_done(path: str, fingerprint: str, shard: Shard) -> bool:
-    """Whether a part is there, complete, and made of this shard.
-
-    Raises InputError when it was made by another network.
-    """
-    if not storage.exists(path):
-        return False
-    footer = read_footer(path)
-    if footer.fingerprint != fingerprint:
-        raise InputError(
-            f"{path} was made by network {footer.fingerprint[:12]}, this checkpoint is {fingerprint[:12]}; choose another "
-            "--out, the --resizer that it was made with, or delete the old table"
-        )
-    return footer.shard_sha256 == shard.sha256 and footer.rows + len(footer.rejected) == shard.samples
-
-
-class ShardEmbedder:
-    """One worker: loads the encoder once, then embeds shard after shard."""
-
-    def __init__(self, settings: EmbeddingSettings, network: Network, cpus: int) -> None:
-        self.settings, self.network, self.threads = settings, network, cpus
-        self.encoder = network.factory(cpus)
-
-    def embed(self, shard: Shard) -> tuple[Shard, dict[str, float]]:
-        """Embed one shard and write its part; returns where the seconds went."""
-        settings, network, seconds = self.settings, self.network, defaultdict[str, float](float)
-        depth = 2 * settings.batch_size
-        read = read_shard(settings.shards, shard.name, shard.split, shard.view)
-        ready = decoded(read, network.image_size, self.threads, depth, network.resizer)
-        samples: list[Sample] = []
-        rejected: list[Rejection] = []
-        blocks: list[Floats] = []
-        while True:
-            start = time.perf_counter()
-            group = list(islice(ready, settings.batch_size))
-            seconds["read and decode"] += time.perf_counter() - start
-            if not group:
-                break
-            images: list[Pixels] = []
-            for sample, image in group:
-                if isinstance(image, DecodeError):
-                    rejected.append(Rejection(path=sample.key, reason=image.reason, found=image.found))
-                else:
-                    samples.append(sample)
-                    images.append(image)
-            start = time.perf_counter()
-            if images:
-                blocks.append(self.encoder(stack(images)))
-            seconds["infer"] += time.perf_counter() - start
-        start = time.perf_counter()
-        self._write(shard, samples, blocks, rejected)
-        seconds["write"] += time.perf_counter() - start
-        return shard, dict(seconds)
-
-    def _write(self, shard: Shard, samples: list[Sample], blocks: list[Floats], rejected: list[Rejection]) -> None:
-        if not blocks:
-            raise RuntimeError(f"not one image of {shard.name}.tar can be decoded; verify the shards and pack it again")
-        tags = [sample.facts["geotag"] or {} for sample in samples]
-        rows = PartRows(
-            keys=[sample.key for sample in samples],
-            locations=[sample.facts["location"] for sample in samples],
-            views=[sample.facts["view"] for sample in samples],
-            splits=[sample.facts["split"] for sample in samples],
-            lats=[tag.get("lat") for tag in tags],
-            lons=[tag.get("lon") for tag in tags],
-            embeddings_BD=np.concatenate(blocks),
-        )
-        footer = PartFooter(
-            fingerprint=self.network.fingerprint, shard_sha256=shard.sha256, rows=len(samples), rejected=tuple(rejected)
-        )
-        write_part(storage.join(self.settings.out, f"{shard.name}.parquet"), rows, footer, self.settings.dtype)
+class Incomplete(RuntimeError):
+    """Embedding has done what it could, and some shards could not be done. One sentence, with their names."""
 
 
 def embed_gallery(settings: EmbeddingSettings, network: Network) -> int:
     """Embed every shard that has no finished part yet; returns how many images were embedded.
 
-    `settings` must name paths that a worker can open (absolute, or URIs). Raises InputError on unusable input.
+    `settings` must name paths that a worker can open (absolute, or URIs). Raises InputError on unusable input, Incomplete
+    where shards are unreadable or kill their workers, the others being done.
+    """
+    wanted = wanted_shards(settings)
+    missing = missing_shards(settings, network, wanted)
+    crew, lost, embedded = None, dict[str, SetAside](), 0
+    if missing:
+        cluster.connect()
+        nodes = cluster.nodes()
+        given = (settings.workers, settings.cpus_per_worker, settings.gpus_per_worker)
+        placement = place(nodes, len(missing), *given)
+        crew = Crew(terms_of(settings, network, placement, nodes))
+        embedded, lost = run(settings, crew, missing, placement)
+    storage.sweep(settings.out, [f"{shard.name}.parquet" for shard in wanted])
+    rejections = [
+        (header.name.removesuffix(".parquet"), one.path, one.reason, one.found)
+        for header in read_headers(settings.out)
+        for one in header.footer.rejected
+    ]
+    listed = list_rejected(
+        settings.out, [*rejections, *((name, None, aside.reason, aside.found) for name, aside in lost.items())]
+    )
+    if listed and rejections:
+        reasons = ", ".join(
+            f"{reason} ({count})" for reason, count in Counter(row[2] for row in rejections).most_common(3)
+        )
+        told = f"{len(rejections)} images could not be decoded: {reasons}; see {storage.join(settings.out, REJECTED)}"
+        console.print(told, style="yellow")
+    if lost:
+        reasons = "; ".join(f"{name} ({aside.reason}: {aside.found})" for name, aside in sorted(lost.items()))
+        raise Incomplete(
+            f"{len(lost)} of {len(wanted)} shards could not be embedded, expected all; the others are done; mend these and run "
+            f"the same command again: {reasons}"
+        )
+    if not missing:
+        console.print(f"{settings.out} is complete: {len(wanted)} parts; nothing to do")
+    return embedded
+
+
+def wanted_shards(settings: EmbeddingSettings) -> list[Shard]:
+    """The shards that were asked for.
+
+    Raises InputError when there are none.
     """
     manifest: Manifest = open_manifest(settings.shards, settings.split, settings.view)
     wanted = [shard for shard in manifest.of(settings.split, settings.view) if shard.samples]
     if not wanted:
         held = ", ".join(sorted({f"{shard.split} {shard.view}" for shard in manifest.shards})) or "nothing"
         raise InputError(f"{settings.shards} holds {held}, and none of it was asked for; check --split and --view")
-    missing = [
-        s for s in wanted if not is_done(storage.join(settings.out, f"{s.name}.parquet"), network.fingerprint, s)
-    ]
-    total = sum(shard.samples for shard in missing)
-    if not missing:
-        console.print(f"{settings.out} is complete: {len(wanted)} parts; nothing to do")
-        return 0
-    cluster.connect()
-    gpus = cluster.gpus() if settings.gpus_per_worker else 0
-    workers = min(len(missing), settings.workers or gpus or max(1, cluster.cpus() // 8))
-    cpus = settings.cpus_per_worker or max(1, cluster.cpus() // workers)
-    actor = ray.remote(num_cpus=cpus, num_gpus=settings.gpus_per_worker)(ShardEmbedder)
-    spent, start = defaultdict[str, float](float), time.perf_counter()
-    with progress(total, "embedding") as meter:
-        actors = [actor.remote(settings, network, cpus) for _ in range(workers)]
-        pool = ActorPool(actors)  # one call in flight per actor, the rest waits in the driver
-        for shard, seconds in pool.map_unordered(lambda one, shard: one.embed.remote(shard), missing):
-            for name, value in seconds.items():
-                spent[name] += value
-            meter.advance(shard.samples)
-    for finished in actors:
-        ray.kill(finished)  # type: ignore[arg-type]
-    elapsed = time.perf_counter() - start
-    spent["start and idle"] = max(0.0, workers * elapsed - sum(spent.values()))
-    split = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.items())
-    console.print(f"{settings.out}: {total} images in {elapsed:.1f} s ({split}, over {workers} workers)")
-    return total
+    return wanted
+
+
+def missing_shards(settings: EmbeddingSettings, network: Network, wanted: Sequence[Shard]) -> list[Shard]:
+    """Those that have no finished part: one that is there, complete, and made of this very shard.
+
+    Raises InputError when the table holds another network's parts, or another kind of numbers.
+    """
+    own = {f"{shard.name}.parquet": shard for shard in wanted}
+    done = set()
+    for name in part_names(settings.out):
+        try:
+            header = read_header(storage.join(settings.out, name))
+        except InputError as error:
+            if name not in own:
+                raise
+            console.print(f"{error}; it is embedded again", style="yellow")
+            continue
+        refuse_other(settings, network, header)
+        footer, shard = header.footer, own.get(name)
+        counted = footer.rows + len(footer.rejected)
+        if shard and (footer.shard_sha256, counted) == (shard.sha256, shard.samples):
+            done.add(shard.name)
+    return [shard for shard in wanted if shard.name not in done]
+
+
+def refuse_other(settings: EmbeddingSettings, network: Network, header: PartHeader) -> None:
+    """Raise InputError where a part of the table cannot stand beside those that would be made."""
+    path, made_by = storage.join(settings.out, header.name), header.footer.fingerprint
+    if made_by != network.fingerprint:
+        raise InputError(
+            f"{path} was made by network {made_by[:12]}, this checkpoint is {network.fingerprint[:12]}; choose another "
+            "--out, the --resizer that it was made with, or delete the old table"
+        )
+    if header.dtype != settings.dtype:
+        raise InputError(
+            f"{path} holds {header.dtype}, --dtype is {settings.dtype}, expected one kind of numbers in a table; choose "
+            f"another --out, or --dtype {header.dtype}"
+        )
+
+
+def terms_of(settings: EmbeddingSettings, network: Network, placement: Placement, nodes: Sequence[Node]) -> Terms:
+    """How the crew works: what an actor is, and which failures are whose."""
+    cpus, gpus = placement.cpus, placement.gpus
+    assignment = Assignment(
+        shards=settings.shards,
+        out=settings.out,
+        batch_size=settings.batch_size,
+        dtype=settings.dtype,
+        threads=cpus,
+        decode_threads=settings.decode_threads or max(1, cpus - 1 if gpus else cpus // 4),
+    )
+    actor: Any = ray.remote(num_cpus=cpus, num_gpus=gpus)(ShardEmbedder).options(max_concurrency=IN_FLIGHT)
+    shared = ray.put(network)  # the weights travel to each node once
+    return Terms(
+        hire=lambda: actor.remote(assignment, shared),
+        size=placement.workers,
+        asks_for=f"{placement}, and the largest of {len(nodes)} nodes has {max((n.cpus for n in nodes), default=0):g} CPUs",
+        in_flight=IN_FLIGHT,
+        refusals=(InputError,),
+        fatal=(CannotWrite,),
+        patience=settings.patience,
+        say=console.print,
+    )
+
+
+def run(
+    settings: EmbeddingSettings, crew: Crew, missing: Sequence[Shard], placement: Placement
+) -> tuple[int, dict[str, SetAside]]:
+    """Embed the missing shards; returns how many images that made, and which shards had to be set aside."""
+    spent, embedded, lost, start = Counter[str](), 0, dict[str, SetAside](), time.monotonic()
+    try:
+        with progress(sum(shard.samples for shard in missing), "embedding") as meter:
+            for shard, result in crew.work(missing):
+                if isinstance(result, SetAside):
+                    lost[shard.name] = result
+                    meter.note(f"{shard.name} is set aside ({result.reason}): {result.found}")
+                    continue
+                assert isinstance(result, Embedded)
+                spent.update(result.seconds)
+                embedded += shard.samples
+                meter.advance(shard.samples, workers=crew.working)
+    except NobodyCame as error:
+        raise InputError(f"{error}; start nodes that have them, or give --cpus-per-worker, --gpus-per-worker") from None
+    except (CannotWork, CannotWrite) as error:
+        raise Incomplete(str(error)) from error
+    elapsed = time.monotonic() - start
+    idle = max(0.0, crew.seconds - spent["infer"])
+    threads = ", ".join(f"{name} {spent[name]:.1f} s" for name in ("read", "decode", "write"))
+    console.print(
+        f"{settings.out}: {embedded} images in {elapsed:.1f} s; over {placement.workers} workers of {placement}: infer "
+        f"{spent['infer']:.1f} s, idle {idle:.1f} s, beside it {threads}"
+    )
+    return embedded, lost

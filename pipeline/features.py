@@ -1,125 +1,52 @@
 """The feature table: a folder of Parquet parts, one per shard, that any Parquet reader opens as it is.
 
-In: unit vectors with their keys, locations, views, splits and positions. Out: atomic parts whose footers say what made
-them, and block-wise reading for whoever ranks, indexes or evaluates.
+In: a folder that embedding has filled. Out: its rows in blocks, all of them or a selection, for whoever ranks, indexes or
+evaluates. What is not a whole table of one network is refused.
 Shapes: B rows of a block, D dimensions of an embedding.
 """
 
-import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal, overload
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from pipeline import storage
-from pipeline.records import InputError, Rejection, Split, View
+from pipeline.ahead import ahead
+from pipeline.feature_parts import (
+    READERS,
+    Floats,
+    Halves,
+    PartFooter,
+    PartHeader,
+    PartRows,
+    header_of,
+    open_part,
+    part_names,
+    part_schema,
+    read_footer,
+    write_part,
+)
+from pipeline.feature_selection import Box, Selection
+from pipeline.records import InputError, Split, View
 
-SCHEMA_VERSION = "1"
-BLOCK_ROWS = 65_536
-Floats = npt.NDArray[np.float32]
+__all__ = [
+    "Box", "FeatureTable", "Floats", "Labels", "PartFooter", "PartRows", "Words", "open_table", "part_names", "part_schema",
+    "read_footer", "verify", "write_part",
+]  # fmt: skip
+
+BLOCK_BYTES = 64 * 2**20
+"Of a block as float32, where its rows are not said."
+TOLERANCE = 0.01
+"Of an embedding's length: what float16 and rounding take."
+KEYS_AT_OPENING = 1_000_000
+"Rows up to which opening looks whether a key repeats, a third of a second; `verify` does for any number."
 Words = npt.NDArray[np.str_]
-
-
-@dataclass(frozen=True, kw_only=True)
-class PartFooter:
-    """What a part says of itself."""
-
-    fingerprint: str
-    "Hash of the model's weights, its config and the preprocessing."
-    shard_sha256: str
-    "Hash of the shard that was embedded."
-    rows: int
-    rejected: tuple[Rejection, ...] = ()
-    "Images of the shard that could not be decoded; they have no row."
-
-    def metadata(self) -> dict[bytes, bytes]:
-        rejected = json.dumps([[r.path, r.reason, r.found] for r in self.rejected])
-        said = {"schema_version": SCHEMA_VERSION, "fingerprint": self.fingerprint, "shard_sha256": self.shard_sha256,
-                "rows": str(self.rows), "rejected": rejected}  # fmt: skip
-        return {f"pvda.{name}".encode(): value.encode() for name, value in said.items()}
-
-
-def part_schema(dimension: int, dtype: str = "float32") -> pa.Schema:
-    """Arrow schema of a part. `dtype` is float32 or float16."""
-    names = pa.dictionary(pa.int8(), pa.string())
-    return pa.schema([
-        pa.field("key", pa.string(), nullable=False),
-        pa.field("location", pa.string(), nullable=False),
-        pa.field("view", names, nullable=False),
-        pa.field("split", names, nullable=False),
-        pa.field("lat", pa.float64()),
-        pa.field("lon", pa.float64()),
-        pa.field("embedding", pa.list_(pa.field("item", pa.type_for_alias(dtype), nullable=False), dimension), False),
-    ])  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class PartRows:
-    """Rows on their way into a part."""
-
-    keys: Sequence[str]
-    locations: Sequence[str]
-    views: Sequence[str]
-    splits: Sequence[str]
-    lats: Sequence[float | None]
-    lons: Sequence[float | None]
-    embeddings_BD: Floats
-
-
-def write_part(path: str, rows: PartRows, footer: PartFooter, dtype: str = "float32") -> None:
-    """Write one part, whole or not at all."""
-    dimension = rows.embeddings_BD.shape[1]
-    schema = part_schema(dimension, dtype)
-    flat = pa.array(rows.embeddings_BD.astype(dtype).ravel())
-    columns = [
-        pa.array(rows.keys, pa.string()), pa.array(rows.locations, pa.string()),
-        pa.array(rows.views, pa.string()).dictionary_encode().cast(schema.field("view").type),
-        pa.array(rows.splits, pa.string()).dictionary_encode().cast(schema.field("split").type),
-        pa.array(rows.lats, pa.float64()), pa.array(rows.lons, pa.float64()),
-        pa.FixedSizeListArray.from_arrays(flat, type=schema.field("embedding").type),
-    ]  # fmt: skip
-    table = pa.Table.from_arrays(columns, schema=schema.with_metadata(footer.metadata()))
-    text = [name for name in schema.names if name != "embedding"]
-    with storage.atomic(path) as stream:
-        # Embeddings do not compress and nobody filters on them: plain bytes are the fastest to read back.
-        pq.write_table(table, stream, compression="none", use_dictionary=text, write_statistics=text)
-
-
-def read_footer(path: str) -> PartFooter:
-    """What a part says of itself.
-
-    Raises InputError when the file is not a part of a feature table.
-    """
-    try:
-        with storage.open_read(path) as stream:
-            parquet = pq.ParquetFile(stream)
-            said = parquet.schema_arrow.metadata or {}
-            rows = parquet.metadata.num_rows
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(
-            f"{path} is not a readable Parquet file ({error}); delete it and embed its shard again"
-        ) from None
-    try:
-        version, stated = said[b"pvda.schema_version"].decode(), int(said[b"pvda.rows"])
-        fingerprint, shard = said[b"pvda.fingerprint"].decode(), said[b"pvda.shard_sha256"].decode()
-        rejected = tuple(Rejection(path=p, reason=r, found=f) for p, r, f in json.loads(said[b"pvda.rejected"]))
-    except KeyError as missing:
-        raise InputError(f"{path} has no {missing} in its footer; expected a part written by embed_gallery") from None
-    if version != SCHEMA_VERSION or stated != rows:
-        raise InputError(
-            f"{path} says version {version} and {stated} rows and holds {rows}; expected version {SCHEMA_VERSION} and "
-            "equal counts; delete it and embed its shard again"
-        )
-    return PartFooter(fingerprint=fingerprint, shard_sha256=shard, rows=rows, rejected=rejected)
-
-
-def part_names(path: str) -> list[str]:
-    return [name for name in storage.names(path) if name.endswith(".parquet")]
+Counts = Counter[tuple[Split, View]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,33 +62,48 @@ class Labels:
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureTable:
-    """A feature table, or the rows of one split and view of it. Opened by `open_table`; embeddings are read in blocks."""
+    """A feature table, or the rows of it that were selected. Opened by `open_table`; embeddings are read in blocks."""
 
     path: str
     fingerprint: str
+    "Of the network that made every row."
     dimension: int
+    dtype: str
+    "Of the stored embeddings: float32 or float16."
     parts: tuple[str, ...]
     footers: tuple[PartFooter, ...]
     counts: dict[tuple[Split, View], int]
     "Rows of each split and view that the whole table holds, whatever is selected."
-    split: Split | None = None
-    view: View | None = None
+    selections: tuple[Selection, ...] = ()
+    "A row is meant when all of them mean it."
 
-    def select(self, split: Split | None = None, view: View | None = None) -> "FeatureTable":
-        """The rows of one split or one view (None: any)."""
-        return replace(self, split=split, view=view)
+    def select(
+        self,
+        split: Split | None = None,
+        view: View | None = None,
+        locations: str | Iterable[str] | None = None,
+        box: Box | None = None,
+    ) -> "FeatureTable":
+        """Of these rows, those of a split, a view, one or several locations, a rectangle of positions (None: any)."""
+        named = frozenset([locations]) if isinstance(locations, str) else locations
+        meant = Selection(split=split, view=view, locations=None if named is None else frozenset(named), box=box)
+        return replace(self, selections=(*self.selections, meant)) if meant != Selection() else self
 
-    @property
+    @cached_property
     def rows(self) -> int:
+        """How many are selected."""
+        if any(meant.columns - {"split", "view"} for meant in self.selections):
+            return sum(len(rows) for _, rows in self._read(["split"]))
         return sum(
             count for (split, view), count in self.counts.items()
-            if self.split in (None, split) and self.view in (None, view)
+            if all(one.split in (None, split) and one.view in (None, view) for one in self.selections)
         )  # fmt: skip
 
     def labels(self) -> Labels:
         """Keys, locations and positions of all selected rows."""
-        tables = list(self._read(["key", "location", "lat", "lon"]))
-        whole = pa.concat_tables(tables) if tables else pa.table({c: [] for c in ("key", "location", "lat", "lon")})
+        columns = ["key", "location", "lat", "lon"]
+        tables = [rows for _, rows in self._read(columns)]
+        whole = pa.concat_tables(tables) if tables else pa.table({name: [] for name in columns})
         return Labels(
             keys=np.asarray(whole["key"].to_pylist(), dtype=np.str_),
             locations=np.asarray(whole["location"].to_pylist(), dtype=np.str_),
@@ -169,73 +111,146 @@ class FeatureTable:
             lons=np.asarray(whole["lon"].to_numpy(), dtype=np.float64),
         )
 
-    def blocks(self, rows: int = BLOCK_ROWS) -> Iterator[Floats]:
-        """Embeddings of the selected rows as float32 arrays (B, D), B <= rows, in the order of `labels`."""
-        for table in self._read(["embedding"], rows):
-            flat = table["embedding"].combine_chunks().flatten()
-            yield flat.to_numpy(zero_copy_only=False).astype(np.float32, copy=False).reshape(-1, self.dimension)
+    @overload
+    def blocks(self, rows: int | None = None, dtype: Literal["float32"] = "float32") -> Iterator[Floats]: ...
+
+    @overload
+    def blocks(self, rows: int | None = None, *, dtype: Literal["float16"]) -> Iterator[Halves]: ...
+
+    @overload
+    def blocks(self, rows: int | None = None, *, dtype: Literal["stored"]) -> Iterator[Floats | Halves]: ...
+
+    def blocks(
+        self, rows: int | None = None, dtype: Literal["float32", "float16", "stored"] = "float32"
+    ) -> Iterator[Any]:
+        """Embeddings of the selected rows as arrays (B, D), B <= rows, in the order of `labels`.
+
+        No more than a block is in memory; without `rows` it has 64 MiB at most. `dtype` may be `stored`: as the parts have
+        them. Raises InputError where an embedding is NaN or not of unit length.
+        """
+        wanted = self.dtype if dtype == "stored" else dtype
+        for part, found in self._read(["embedding"], rows):
+            flat = found["embedding"].combine_chunks().flatten().to_numpy(zero_copy_only=False)
+            block_BD = flat.reshape(-1, self.dimension)
+            single_BD = block_BD.astype(np.float32, copy=False)
+            self._refuse_lengths(part, np.sqrt(np.einsum("bd,bd->b", single_BD, single_BD)))
+            yield single_BD if wanted == "float32" else block_BD.astype(wanted, copy=False)
 
     def embeddings(self) -> Floats:
         """All selected embeddings at once, float32 (rows, D)."""
         return np.concatenate([np.empty((0, self.dimension), np.float32), *self.blocks()])
 
-    def _read(self, columns: list[str], rows: int = BLOCK_ROWS) -> Iterator[pa.Table]:
-        wanted = {"split": self.split, "view": self.view}
-        tests = {name: str(value) for name, value in wanted.items() if value is not None}
+    def _refuse_lengths(self, part: str, length_B: Floats) -> None:
+        unit_B = np.abs(length_B - 1) <= TOLERANCE  # false of a NaN
+        if not unit_B.all():
+            raise InputError(
+                f"{storage.join(self.path, part)} holds {np.count_nonzero(~unit_B)} embeddings like one of length "
+                f"{length_B[np.argmin(unit_B)]:.4g}, expected unit length; delete this part and embed its shard again"
+            )
+
+    def _read(self, columns: list[str], rows: int | None = None) -> Iterator[tuple[str, pa.Table]]:
+        """The selected rows' columns in pieces, each with the part that it is from."""
+        rows = rows or max(1, BLOCK_BYTES // (4 * self.dimension))
+        tests = set().union(*(meant.columns for meant in self.selections))
         for part in self.parts:
-            with storage.open_read(storage.join(self.path, part)) as stream:
-                parquet = pq.ParquetFile(stream)
-                groups = [group for group in range(parquet.num_row_groups) if _may_hold(parquet, group, tests)]
-                for batch in parquet.iter_batches(rows, groups, columns=[*columns, *tests]):
-                    table = pa.Table.from_batches([batch])
-                    for name, value in tests.items():
-                        table = table.filter(pc.equal(table[name].cast(pa.string()), value))
-                    if len(table):
-                        yield table.select(columns)
-
-
-def _may_hold(parquet: pq.ParquetFile, group: int, tests: dict[str, str]) -> bool:
-    """Whether a row group's statistics leave room for the wanted values: most parts hold one split and view only."""
-    for name, value in tests.items():
-        column = parquet.schema_arrow.get_field_index(name)
-        bounds = parquet.metadata.row_group(group).column(column).statistics
-        if bounds is not None and bounds.has_min_max and not bounds.min <= value <= bounds.max:
-            return False
-    return True
-
-
-def _count(path: str, parts: Sequence[str]) -> dict[tuple[Split, View], int]:
-    found: Counter[tuple[Split, View]] = Counter()
-    for part in parts:
-        with storage.open_read(storage.join(path, part)) as stream:
-            table = pq.read_table(stream, columns=["split", "view"])
-        for row in table.group_by(["split", "view"]).aggregate([([], "count_all")]).to_pylist():
-            found[Split(row["split"]), View(row["view"])] += row["count_all"]
-    return dict(found)
+            with open_part(storage.join(self.path, part)) as parquet:
+                groups = [
+                    group
+                    for group in range(parquet.num_row_groups)
+                    if all(meant.may_hold(parquet, group) for meant in self.selections)
+                ]
+                for batch in parquet.iter_batches(rows, groups, columns=sorted({*columns, *tests})):
+                    found = pa.Table.from_batches([batch])
+                    for meant in self.selections:
+                        found = found.filter(meant.mask(found))
+                    if len(found):
+                        yield part, found.select(columns)
 
 
 def open_table(path: str) -> FeatureTable:
     """Open a feature table.
 
-    Raises InputError when there is none, or when its parts come from different networks.
+    Raises InputError when there is none, when a part is torn or another's, when the parts come from different networks or
+    hold different numbers, and when a key is there twice (looked for in tables of up to KEYS_AT_OPENING rows).
     """
+    table = _open(path)
+    if table.rows <= KEYS_AT_OPENING:
+        _refuse_repeats(table)
+    return table
+
+
+def verify(path: str) -> FeatureTable:
+    """`open_table`, and every row is read: keys that are there once, embeddings of unit length. Takes 8 bytes a row.
+
+    Raises InputError, naming the part, where they are not.
+    """
+    table = _open(path)
+    _refuse_repeats(table)
+    for _ in table.blocks(dtype="stored"):
+        pass
+    return table
+
+
+def _open(path: str) -> FeatureTable:
     names = part_names(path)
     if not names:
         raise InputError(f"no feature table at {path}: found no Parquet part; make one with jobs/embed_gallery.py")
-    footers = tuple(read_footer(storage.join(path, name)) for name in names)
-    fingerprints = sorted({footer.fingerprint for footer in footers})
-    if len(fingerprints) > 1:
-        raise InputError(
-            f"{path} holds features of {len(fingerprints)} networks ({', '.join(f[:12] for f in fingerprints)}); expected "
-            "one; embed into an empty folder with jobs/embed_gallery.py --out"
-        )
-    with storage.open_read(storage.join(path, names[0])) as stream:
-        dimension = pq.ParquetFile(stream).schema_arrow.field("embedding").type.list_size
+    found = list(ahead(lambda name: _open_one(storage.join(path, name)), names, READERS, 4 * READERS))
+    headers = [header for header, _ in found]
+    _refuse_mixed(path, headers)
     return FeatureTable(
         path=path,
-        fingerprint=fingerprints[0],
-        dimension=dimension,
+        fingerprint=headers[0].footer.fingerprint,
+        dimension=headers[0].dimension,
+        dtype=headers[0].dtype,
         parts=tuple(names),
-        footers=footers,
-        counts=_count(path, names),
+        footers=tuple(header.footer for header in headers),
+        counts=dict(sum((counts for _, counts in found), Counts())),
     )
+
+
+def _open_one(path: str) -> tuple[PartHeader, Counts]:
+    counts: Counts = Counter()
+    with open_part(path) as parquet:
+        header = header_of(parquet, path)
+        table = parquet.read(columns=["split", "view"])
+    for row in table.group_by(["split", "view"]).aggregate([([], "count_all")]).to_pylist():
+        counts[Split(row["split"]), View(row["view"])] += row["count_all"]
+    return header, counts
+
+
+def _refuse_mixed(path: str, headers: Sequence[PartHeader]) -> None:
+    fingerprints = sorted({header.footer.fingerprint for header in headers})
+    if len(fingerprints) > 1:
+        other = next(one for one in headers if one.footer.fingerprint != headers[0].footer.fingerprint)
+        raise InputError(
+            f"{path} holds features of {len(fingerprints)} networks ({', '.join(f[:12] for f in fingerprints)}; {other.name} "
+            f"is not of {headers[0].name}'s), expected one; embed into an empty folder with jobs/embed_gallery.py --out"
+        )
+    first = headers[0]
+    for one in headers:
+        if (one.dimension, one.dtype) != (first.dimension, first.dtype):
+            raise InputError(
+                f"{storage.join(path, one.name)} holds {one.dtype} of {one.dimension} dimensions and {first.name} "
+                f"{first.dtype} of {first.dimension}, expected the same in all parts; delete it and embed its shard again"
+            )
+
+
+def _refuse_repeats(table: FeatureTable) -> None:
+    """Raise InputError where a key is there twice. Keys are compared by 64-bit hashes, and those that agree by themselves."""
+    hashes = [np.empty(0, np.int64)]
+    for _, rows in table._read(["key"]):
+        hashes.append(np.fromiter(map(hash, rows["key"].to_pylist()), np.int64, len(rows)))
+    hash_N = np.sort(np.concatenate(hashes))
+    twice = set(hash_N[1:][hash_N[1:] == hash_N[:-1]].tolist())
+    seen: dict[str, str] = {}
+    for part, rows in table._read(["key"]) if twice else ():
+        for key in rows["key"].to_pylist():
+            if hash(key) not in twice:
+                continue
+            if key in seen:
+                raise InputError(
+                    f"{storage.join(table.path, part)} holds key {key}, which {seen[key]} holds too, expected keys that are "
+                    "there once; keep the parts of one data set only, and embed others into a folder of their own"
+                )
+            seen[key] = part

@@ -2,15 +2,19 @@
 
 import json
 import os
+import re
 import tempfile
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, cast
 
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
+
+TEMPORARY = re.compile(r"\.(.+)\.[0-9a-f]{8}")
+"Names that `atomic` gives to files until they are whole."
 
 
 def locate(path: str) -> tuple[Any, str]:
@@ -127,6 +131,17 @@ def atomic(path: str) -> Iterator[IO[bytes]]:
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def sweep(folder: str, names: Iterable[str]) -> None:
+    """Remove what `atomic` left of these files in a folder where its process was killed; nobody may be writing them."""
+    filesystem, inner = locate(folder)
+    if isinstance(filesystem, LocalFileSystem) and os.path.isdir(inner):
+        wanted = set(names)
+        for entry in os.listdir(inner):
+            left = TEMPORARY.fullmatch(entry)
+            if left and left[1] in wanted:
+                Path(inner, entry).unlink(missing_ok=True)
 
 
 def copy(source: str, target: str) -> None:

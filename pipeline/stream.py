@@ -195,14 +195,15 @@ def decoded(
     samples: Iterable[Sample], image_size: int, threads: int, depth: int, resizer: Resizer = "torch"
 ) -> Iterator[Opened]:
     """The samples' images in order, decoded and resized by threads; what cannot be decoded comes as its error."""
+    return ahead(lambda sample: opened(sample, image_size, resizer), samples, threads, depth)
 
-    def prepare(sample: Sample) -> Opened:
-        try:
-            return sample, resize(decode(sample.data), image_size, resizer)
-        except DecodeError as error:
-            return sample, error
 
-    return ahead(prepare, samples, threads, depth)
+def opened(sample: Sample, image_size: int, resizer: Resizer = "torch") -> Opened:
+    """One sample's image, decoded and resized, or why it cannot be."""
+    try:
+        return sample, resize(decode(sample.data), image_size, resizer)
+    except DecodeError as error:
+        return sample, error
 
 
 def sound(images: Iterable[Opened]) -> tuple[list[tuple[Sample, Pixels]], list[str]]:

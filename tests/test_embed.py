@@ -1,11 +1,13 @@
 """Embedding: a part per shard, rows exactly once, done parts skipped, other networks refused."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline.embed import EmbeddingSettings, Encoder, Network, embed_gallery
+from pipeline.feature_parts import read_rejected
 from pipeline.features import open_table, read_footer
 from pipeline.records import InputError, Split, View
 from pipeline.samples import read_shard
@@ -80,8 +82,7 @@ def test_an_image_that_cannot_be_decoded_is_left_out_and_told(
     data = bytearray((Path(tiny_shards) / f"{shard.name}.tar").read_bytes())
     start = data.index(b"\xff\xd8\xff")  # the first JPEG loses its beginning
     data[start : start + 3] = b"\0\0\0"
-    for path in Path(tiny_shards).glob("*.*"):
-        (tmp_path / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(tiny_shards, tmp_path, dirs_exist_ok=True)
     (tmp_path / f"{shard.name}.tar").write_bytes(data)
     settings = EmbeddingSettings(
         shards=str(tmp_path), out=str(tmp_path / "table"), split=Split.QUERY, view=View.SATELLITE
@@ -90,6 +91,8 @@ def test_an_image_that_cannot_be_decoded_is_left_out_and_told(
     footer = read_footer(str(tmp_path / "table" / f"{shard.name}.parquet"))
     assert footer.rows == shard.samples - 1
     assert [rejection.reason for rejection in footer.rejected] == ["not an image"]
+    [listed] = read_rejected(str(tmp_path / "table")).to_pylist()
+    assert (listed["shard"], listed["key"], listed["reason"]) == (shard.name, footer.rejected[0].path, "not an image")
     assert embed_gallery(settings, mean_colour_network()) == 0
 
 

@@ -13,11 +13,12 @@ from torch import Tensor
 
 from jobs.embed_gallery import Settings as EmbedSettings
 from jobs.embed_gallery import main as embed_gallery
-from jobs.embed_gallery import network_of
+from jobs.encoders import EncoderSettings, network_of
 from jobs.import_weights import Settings, import_weights
 from model.backbone import ResNet
 from model.checkpoint import Checkpoint, CheckpointError, build_encoder, load_encoder, loads
 from model.pvda import LocationClassifier
+from pipeline.embed import EmbeddingSettings
 from pipeline.features import open_table
 from pipeline.records import InputError, Split, View
 
@@ -158,12 +159,12 @@ def imported(tmp_path: Path, state: State, image_size: int = 128) -> Checkpoint:
     ids=["ResNet-18", "three rings", "ResNet-50"],
 )
 def test_an_lpn_checkpoint_embeds_as_the_original_does(
-    tmp_path: Path, blocks: tuple[int, ...], grown: int, parts: int, size: int
+    tmp_path: Path, tiny_shards: str, blocks: tuple[int, ...], grown: int, parts: int, size: int
 ) -> None:
     state = three_view_net(made_up(blocks, grown), parts)
     imported(tmp_path, state, size)
     path = tmp_path / "ours.pt"
-    encode = network_of(path.read_bytes(), str(path)).factory(2)
+    encode = network_of(path.read_bytes(), str(path), EmbeddingSettings(shards=tiny_shards, out="none")).factory(2)
     images = photos(size)
     found, expected = encode(images.numpy()), twin_embedding(state, images, parts).numpy()
     assert np.abs(found - expected).max() < 1e-5
@@ -265,7 +266,7 @@ def test_what_is_no_shared_three_view_net_is_refused_by_what_is_wrong_with_it(
 
 @pytest.mark.parametrize("ending", ["pth", "safetensors"])
 def test_torchvisions_weights_become_a_checkpoint_whose_refinement_is_said_to_be_untrained(
-    tmp_path: Path, ending: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, tiny_shards: str, ending: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     state, path = made_up() | {"fc.weight": torch.ones(9, 128)}, tmp_path / f"resnet18.{ending}"
     if ending == "pth":
@@ -281,12 +282,14 @@ def test_torchvisions_weights_become_a_checkpoint_whose_refinement_is_said_to_be
     normal = (photos(256).float() / 255 - MEAN[:, None, None]) / DEVIATION[:, None, None]
     with torch.inference_mode():
         assert torch.allclose(encoder(photos(256))[0], twin_maps(state, normal), atol=1e-4)
-    prints = {network_of(Path(out).read_bytes(), out).fingerprint for out in outs}
+    embedding = EmbeddingSettings(shards=tiny_shards, out="none")
+    prints = {network_of(Path(out).read_bytes(), out, embedding).fingerprint for out in outs}
     assert len(prints) == 1  # the same file gives the same network
     data = Path(outs[0]).read_bytes()
-    others = {network_of(data, "it", resizer="pillow").fingerprint, network_of(data, "it", mirror=False).fingerprint}
-    assert len(prints | others) == 3  # tables of other preprocessing do not mix
-    assert network_of(data, "it", resizer="pillow").resizer == "pillow"
+    other = [EncoderSettings(resizer="pillow"), EncoderSettings(mirror=False), EncoderSettings(precision="bfloat16")]
+    networks = [network_of(data, "it", embedding, settings) for settings in other]
+    assert len(prints | {network.fingerprint for network in networks}) == 4  # tables of other preprocessing do not mix
+    assert networks[0].resizer == "pillow"
 
 
 def test_another_depths_names_are_listed(tmp_path: Path) -> None:

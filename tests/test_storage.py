@@ -50,3 +50,12 @@ def test_paths_are_made_absolute_and_uris_left_alone(monkeypatch: pytest.MonkeyP
     monkeypatch.chdir(tmp_path)
     assert storage.absolute("a/b") == str(tmp_path / "a" / "b")
     assert storage.absolute("s3://bucket/a") == "s3://bucket/a"
+
+
+def test_what_killed_writers_left_is_swept_away_and_nothing_else(tmp_path: Path) -> None:
+    for name in (".a.parquet.0123abcd", ".b.parquet.0123abcd", ".a.parquet", "a.parquet", ".a.parquet.0123abcx"):
+        (tmp_path / name).touch()
+    storage.sweep(str(tmp_path), ["a.parquet"])
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert left == [".a.parquet", ".a.parquet.0123abcx", ".b.parquet.0123abcd", "a.parquet"]
+    storage.sweep(str(tmp_path / "nowhere"), ["a.parquet"])

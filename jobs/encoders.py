@@ -1,0 +1,144 @@
+"""A checkpoint -> the network as the embedder's workers build it: fast, checked against the plain one, in a stated precision.
+
+In: a checkpoint's bytes, and some images of what is to be embedded. Out: a Network with its fingerprint. The images are chosen
+by their place in the shards alone, so a run that is continued has the same ones.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from model.checkpoint import build_encoder, fingerprint, loads
+from model.fast import make_fast
+from model.inference import InEffect, Precision, effective_precision, with_precision
+from model.int8 import PrecisionError, calibration_digest, require_int8
+from pipeline.embed import EmbeddingSettings, Network, wanted_shards
+from pipeline.features import Floats
+from pipeline.records import InputError
+from pipeline.samples import read_shard
+from pipeline.stream import decoded, stack
+from pipeline.transforms import DecodeError, Resizer, preprocessing
+
+PROBES, CALIBRATING = 16, 128
+"Images by which the fast encoder is checked, and by which int8 is calibrated."
+Compiling = Literal["auto", "always", "never"]
+Bytes = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderSettings:
+    """How images become embeddings. All but `compiling` is part of the fingerprint."""
+
+    mirror: bool = True
+    "Whether the embeddings of an image and its mirror image are summed [LPN]."
+    resizer: Resizer = "torch"
+    "Whose bicubic resizes the images: torch's, or pillow's, which is faster on CPUs without AVX2; tables do not mix."
+    precision: Precision = "auto"
+    """float32; bfloat16; int8, for CPUs that multiply 8-bit integers fast, calibrated by images of the shards; auto: bfloat16
+    on GPUs, else float32."""
+    compiling: Compiling = "auto"
+    "Whether torch compiles the encoder; auto: where it saves more time than it takes."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blueprint:
+    """What a worker makes an encoder of."""
+
+    checkpoint: bytes
+    settings: EncoderSettings
+    precision: InEffect
+    batch_size: int
+    images: int
+    "That each worker will embed, about."
+    probe_B3HW: Bytes
+    calibration_B3HW: Bytes | None
+
+
+class Embedder:
+    """An encoder, made and called on a worker. `remarks` are told on the terminal."""
+
+    def __init__(self, blueprint: Blueprint, threads: int) -> None:
+        # Ray sets OMP_NUM_THREADS to the actor's cores before torch is imported; said again for callers without Ray.
+        torch.set_num_threads(threads)
+        self.remarks: list[str] = []
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+        encoder = build_encoder(loads(blueprint.checkpoint)).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        calibration = blueprint.calibration_B3HW
+        self._fast = make_fast(
+            encoder,
+            probe_B3HW=torch.from_numpy(blueprint.probe_B3HW),
+            batch_size=blueprint.batch_size,
+            precision=blueprint.precision,
+            mirror=blueprint.settings.mirror,
+            compiled={"auto": "auto", "always": True, "never": False}[blueprint.settings.compiling],  # type: ignore[arg-type]
+            images=blueprint.images,
+            calibration_B3HW=None if calibration is None else torch.from_numpy(calibration),
+            say=self.remarks.append,
+        )
+
+    def __call__(self, images_B3HW: Bytes) -> Floats:
+        result: Floats = self._fast(torch.from_numpy(images_B3HW)).cpu().numpy()
+        return result
+
+
+def network_of(
+    data: bytes, name: str, embedding: EmbeddingSettings, settings: EncoderSettings | None = None
+) -> Network:
+    """What the embedder needs to know of a checkpoint whose bytes came from `name`.
+
+    Raises CheckpointError when the bytes are none, InputError where the precision cannot be had or no image can be decoded.
+    """
+    settings = settings or EncoderSettings()
+    checkpoint = loads(data, name)
+    device = "cuda" if torch.cuda.is_available() or embedding.gpus_per_worker else "cpu"
+    precision = effective_precision(settings.precision, device)
+    size = checkpoint.network.image_size
+    if precision == "int8":
+        try:
+            require_int8(device)
+        except PrecisionError as error:
+            raise InputError(str(error)) from None
+    some_B3HW = some_images(embedding, size, settings.resizer, PROBES + (CALIBRATING if precision == "int8" else 0))
+    calibration_B3HW = some_B3HW[PROBES:] if precision == "int8" else None
+    digest = None if calibration_B3HW is None else calibration_digest(torch.from_numpy(calibration_B3HW))
+    said = with_precision(f"{preprocessing(settings.resizer)}, mirror {settings.mirror}", precision, digest)
+    blueprint = Blueprint(
+        checkpoint=data,
+        settings=settings,
+        precision=precision,
+        batch_size=embedding.batch_size,
+        images=sum(shard.samples for shard in wanted_shards(embedding)) // (embedding.workers or 1),
+        probe_B3HW=some_B3HW[:PROBES],
+        calibration_B3HW=calibration_B3HW,
+    )
+    return Network(
+        fingerprint=fingerprint(checkpoint, said),
+        image_size=size,
+        resizer=settings.resizer,
+        factory=partial(Embedder, blueprint),
+    )
+
+
+def some_images(embedding: EmbeddingSettings, size: int, resizer: Resizer, count: int) -> Bytes:
+    """The first images of what is to be embedded, from each split and view alike, as bytes (at most `count`, 3, size, size).
+
+    Within a shard images stand in the order of their keys' hashes: its first ones are a fair sample. Raises InputError where
+    none of them can be decoded.
+    """
+    first = {(shard.split, shard.view): shard for shard in reversed(wanted_shards(embedding))}
+    found = []
+    for shard in first.values():
+        samples = read_shard(embedding.shards, shard.name, shard.split, shard.view)
+        images = (image for _, image in decoded(samples, size, 1, 4, resizer) if not isinstance(image, DecodeError))
+        found.append([image for image, _ in zip(images, range(-(-count // len(first))), strict=False)])
+    mixed = [group[place] for place in range(count) for group in found if place < len(group)][:count]
+    if not mixed:
+        raise InputError(
+            f"none of the first images of {embedding.shards} can be decoded, expected some to check the encoder by; see "
+            "make_shards.py --verify, and pack again"
+        )
+    return stack(mixed)

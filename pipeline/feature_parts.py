@@ -1,0 +1,206 @@
+"""One part of a feature table: its columns, its footer, and how it is written and known again.
+
+In: unit vectors with their keys, locations, views, splits and positions. Out: atomic Parquet files whose footers say what
+made them, and the list of the images that have no row.
+Shapes: B rows of a part, D dimensions of an embedding.
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline import rejects, storage
+from pipeline.ahead import ahead
+from pipeline.records import InputError, Rejection
+
+SCHEMA_VERSION = "1"
+REJECTED = f"_rejected/{rejects.FILE}"
+"""Within a table. In a folder of its own, so that `*.parquet` names parts only, and one whose underscore keeps it from
+readers that look into folders: pandas, pyarrow and Spark."""
+REJECTED_SCHEMA = pa.schema([(name, pa.string()) for name in ("shard", "key", "reason", "found")])
+ROW_GROUP = 16_384
+"Rows: few enough that a reader's memory does not grow with a part of millions."
+READERS = 8
+"Footers read at once: on an object store each is a request of some 50 ms."
+Floats = npt.NDArray[np.float32]
+Halves = npt.NDArray[np.float16]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartFooter:
+    """What a part says of itself."""
+
+    fingerprint: str
+    "Hash of the model's weights, its config and the preprocessing."
+    shard_sha256: str
+    "Hash of the shard that was embedded."
+    rows: int
+    rejected: tuple[Rejection, ...] = ()
+    "Images of the shard that could not be decoded; they have no row."
+
+    def metadata(self) -> dict[bytes, bytes]:
+        rejected = json.dumps([[r.path, r.reason, r.found] for r in self.rejected])
+        said = {"schema_version": SCHEMA_VERSION, "fingerprint": self.fingerprint, "shard_sha256": self.shard_sha256,
+                "rows": str(self.rows), "rejected": rejected}  # fmt: skip
+        return {f"pvda.{name}".encode(): value.encode() for name, value in said.items()}
+
+
+def part_schema(dimension: int, dtype: str = "float32") -> pa.Schema:
+    """Arrow schema of a part. `dtype` is float32 or float16."""
+    names = pa.dictionary(pa.int8(), pa.string())
+    return pa.schema([
+        pa.field("key", pa.string(), nullable=False),
+        pa.field("location", pa.string(), nullable=False),
+        pa.field("view", names, nullable=False),
+        pa.field("split", names, nullable=False),
+        pa.field("lat", pa.float64()),
+        pa.field("lon", pa.float64()),
+        pa.field("embedding", pa.list_(pa.field("item", pa.type_for_alias(dtype), nullable=False), dimension), False),
+    ])  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartRows:
+    """Rows on their way into a part."""
+
+    keys: Sequence[str]
+    locations: Sequence[str]
+    views: Sequence[str]
+    splits: Sequence[str]
+    lats: Sequence[float | None]
+    lons: Sequence[float | None]
+    embeddings_BD: Floats | Halves
+
+
+def write_part(path: str, rows: PartRows, footer: PartFooter, dtype: str = "float32") -> None:
+    """Write one part, whole or not at all."""
+    dimension = rows.embeddings_BD.shape[1]
+    schema = part_schema(dimension, dtype)
+    flat = pa.array(rows.embeddings_BD.astype(dtype, copy=False).ravel())
+    columns = [
+        pa.array(rows.keys, pa.string()), pa.array(rows.locations, pa.string()),
+        pa.array(rows.views, pa.string()).dictionary_encode().cast(schema.field("view").type),
+        pa.array(rows.splits, pa.string()).dictionary_encode().cast(schema.field("split").type),
+        pa.array(rows.lats, pa.float64()), pa.array(rows.lons, pa.float64()),
+        pa.FixedSizeListArray.from_arrays(flat, type=schema.field("embedding").type),
+    ]  # fmt: skip
+    table = pa.Table.from_arrays(columns, schema=schema.with_metadata(footer.metadata()))
+    text = [name for name in schema.names if name != "embedding"]
+    with storage.atomic(path) as stream:
+        # Embeddings do not compress and nobody filters on them: plain bytes are the fastest to read back.
+        pq.write_table(
+            table, stream, row_group_size=ROW_GROUP, compression="none", use_dictionary=text, write_statistics=text
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartHeader:
+    """What is known of a part without reading its rows."""
+
+    name: str
+    "File name within the table."
+    footer: PartFooter
+    dimension: int
+    dtype: str
+    "Of the stored embeddings: float32 or float16."
+
+
+@contextmanager
+def open_part(path: str) -> Iterator[pq.ParquetFile]:
+    """A part to read from, a piece at a time.
+
+    Raises InputError when it is no whole Parquet file.
+    """
+    try:
+        with storage.open_read(path) as stream:
+            # With a buffer, a row group is read as it is decoded and not fetched whole before.
+            yield pq.ParquetFile(stream, buffer_size=1 << 20)
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(
+            f"{path} is not a readable Parquet file ({error}); delete it and embed its shard again"
+        ) from None
+
+
+def read_header(path: str) -> PartHeader:
+    """What a part says of itself.
+
+    Raises InputError when the file is not a part of a feature table.
+    """
+    with open_part(path) as parquet:
+        return header_of(parquet, path)
+
+
+def header_of(parquet: pq.ParquetFile, path: str) -> PartHeader:
+    """`read_header` of an open part."""
+    schema, rows = parquet.schema_arrow, parquet.metadata.num_rows
+    said = schema.metadata or {}
+    try:
+        version, stated = said[b"pvda.schema_version"].decode(), int(said[b"pvda.rows"])
+        fingerprint, shard = said[b"pvda.fingerprint"].decode(), said[b"pvda.shard_sha256"].decode()
+        rejected = tuple(Rejection(path=p, reason=r, found=f) for p, r, f in json.loads(said[b"pvda.rejected"]))
+        embedding = schema.field("embedding").type
+    except KeyError as missing:
+        raise InputError(f"{path} has no {missing} in its footer; expected a part written by embed_gallery") from None
+    if version != SCHEMA_VERSION or stated != rows:
+        raise InputError(
+            f"{path} says version {version} and {stated} rows and holds {rows}; expected version {SCHEMA_VERSION} and "
+            "equal counts; delete it and embed its shard again"
+        )
+    footer = PartFooter(fingerprint=fingerprint, shard_sha256=shard, rows=rows, rejected=rejected)
+    dtype = (
+        "float16"
+        if pa.types.is_float16(embedding.value_type)
+        else str(np.dtype(embedding.value_type.to_pandas_dtype()))
+    )
+    return PartHeader(name=path.rsplit("/", 1)[-1], footer=footer, dimension=embedding.list_size, dtype=dtype)
+
+
+def read_footer(path: str) -> PartFooter:
+    """`read_header`'s footer."""
+    return read_header(path).footer
+
+
+def part_names(path: str) -> list[str]:
+    """The file names of a table's parts, in its order."""
+    return [name for name in storage.names(path) if name.endswith(".parquet")]
+
+
+def read_headers(path: str) -> list[PartHeader]:
+    """Every part's header, in the table's order; a folder that is not there has none."""
+    return list(ahead(lambda name: read_header(storage.join(path, name)), part_names(path), READERS, 4 * READERS))
+
+
+def list_rejected(table: str, rejected: Iterable[tuple[str, str | None, str, str]]) -> bool:
+    """Write what has no row, as (shard, key, reason, found), in that order; the key is None where it is the whole shard.
+
+    The file is there only while there is something in it, and is left alone where it says so already; returns whether it
+    was changed.
+    """
+    rows = sorted(rejected, key=lambda row: (row[0], row[1] or ""))
+    path = storage.join(table, REJECTED)
+    wanted = pa.Table.from_pylist([dict(zip(REJECTED_SCHEMA.names, row, strict=True)) for row in rows], REJECTED_SCHEMA)
+    there = storage.exists(path)
+    if not rows:
+        if there:
+            storage.remove(path)
+        return there
+    if there and read_rejected(table).equals(wanted):
+        return False
+    with storage.atomic(path) as stream:
+        pq.write_table(wanted, stream)
+    return True
+
+
+def read_rejected(table: str) -> pa.Table:
+    """What of the shards has no row in the table: `shard, key, reason, found`; no rows where there is no such list."""
+    path = storage.join(table, REJECTED)
+    if not storage.exists(path):
+        return REJECTED_SCHEMA.empty_table()
+    with storage.open_read(path) as stream:
+        return pq.read_table(stream)
