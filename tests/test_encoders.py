@@ -1,9 +1,11 @@
 """A checkpoint as the embedder's workers build it: the same images to check it by each time, and a fingerprint that tells."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from jobs import encoders
 from jobs.encoders import PROBES, EncoderSettings, network_of, some_images
@@ -20,7 +22,7 @@ from pipeline.records import InputError, Split
 
 @pytest.fixture(scope="module")
 def checkpoint(tiny_shards: str) -> bytes:
-    return untrained(Run(shards=tiny_shards, out="none", recipe=smoke(1)))
+    return untrained(Run(shards=tiny_shards, out="none", recipe=replace(smoke(1), batch_size=2)))
 
 
 def asked(shards: str, **changes: object) -> EmbeddingSettings:
@@ -44,8 +46,6 @@ def test_a_shard_without_one_image_that_can_be_decoded_is_said_beforehand(
 
 
 def test_the_fast_encoder_of_a_worker_computes_what_the_plain_one_does(tiny_shards: str, checkpoint: bytes) -> None:
-    import torch
-
     made = network_of(checkpoint, "it", asked(tiny_shards)).factory(1)
     images = some_images(asked(tiny_shards), 64, "torch", 5)
     plain = embed(build_encoder(loads(checkpoint)), torch.from_numpy(images)).numpy()
