@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 os.environ.setdefault("RAY_AUTH_MODE", "disabled")  # the same for every Ray process that the tests start
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+# Threads that wait for each other give their core away: spinning, they take it from whoever they wait for on a busy machine.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 @pytest.fixture(scope="session")
