@@ -15,12 +15,14 @@ import pyarrow as pa
 from pipeline import metrics
 from pipeline.features import FeatureTable, Floats, Words
 from pipeline.metrics import Scores, Whole
-from pipeline.ranking import PAIR_ROWS, Blocks, Ranking, Side, on_grid, rank, side_of_array
+from pipeline.ranking import Blocks, Ranking, Side, rank, side_of_array
 from pipeline.records import InputError, Split, View
+from pipeline.scoring import on_grid
 
 Protocol = Literal["full", "queried-only"]
 "full: the official one, the whole gallery with its distractors. queried-only: gallery rows of queried locations alone."
 TOP = 10
+MEAN_ROWS = 4_096  # rows added to their means at once: 64 MB of float64 at 2,048 dimensions
 
 METRICS_SCHEMA = pa.schema([
     ("task", pa.string()), ("protocol", pa.string()), ("multi_query", pa.bool_()), ("queries", pa.int64()),
@@ -87,7 +89,7 @@ def mean_by_location(side: Side) -> Side:
     """One query per location: the mean of its vectors, brought to unit length; its key is the location's name."""
     names, location_Q = np.unique(side.locations, return_inverse=True)
     total_LD, begin = np.zeros((len(names), 0)), 0
-    for block_BD in side.blocks(PAIR_ROWS):
+    for block_BD in side.blocks(MEAN_ROWS):
         if not begin:
             total_LD = np.zeros((len(names), block_BD.shape[1]))
         # Sums on the grid are exact, so the mean does not depend on the order of the rows either.

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from pipeline import metrics
 from pipeline.features import FeatureTable, Floats, PartFooter, PartRows, open_table, write_part
-from pipeline.ranking import Blocks, Ranking, Side, on_grid, rank, side_of_array
+from pipeline.ranking import Blocks, Ranking, Side, rank, side_of_array
 from pipeline.records import InputError, Split, View
 from pipeline.retrieval import Task, mean_by_location, only_locations, possible_tasks, retrieve
+from pipeline.scoring import on_grid
 
 
 def unit(vectors: Floats) -> Floats:
