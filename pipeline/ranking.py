@@ -8,7 +8,7 @@ pipeline/metrics.py on ties); then the gallery's order. How scores are exact and
 Shapes: B gallery rows of a block, Q queries, P pairs of a query and a true match, D dimensions, K rows kept at the top.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,8 +95,13 @@ def rank(
         row_P = rows_by_code[np.repeat(begin_by_code[code_Q], matches_Q) + nth_P]
         groups.append(_rank_held(held_QD, gallery, owner_P, row_P, min(top, len(gallery.keys)), cut, advance))
         begin += len(held_QD)
+    return joined(groups)
+
+
+def joined(rankings: Sequence[Ranking]) -> Ranking:
+    """The rankings of consecutive queries as one."""
     fields = Ranking.__dataclass_fields__
-    return Ranking(**{name: np.concatenate([getattr(group, name) for group in groups]) for name in fields})
+    return Ranking(**{name: np.concatenate([getattr(each, name) for each in rankings]) for name in fields})
 
 
 def _rank_held(
@@ -196,13 +201,13 @@ def _regrouped(blocks: Iterator[Floats], rows: int) -> Iterator[Floats]:
         waiting.append(on_grid(block_BD))
         count += len(block_BD)
         while count >= rows:
-            whole_BD = _joined(waiting)
+            whole_BD = _concatenated(waiting)
             yield whole_BD[:rows]
             waiting, count = [whole_BD[rows:]], count - rows
     if count:
-        yield _joined(waiting)
+        yield _concatenated(waiting)
 
 
-def _joined(blocks: list[Floats]) -> Floats:
+def _concatenated(blocks: list[Floats]) -> Floats:
     some = [block_BD for block_BD in blocks if len(block_BD)]
     return some[0] if len(some) == 1 else np.concatenate(some)

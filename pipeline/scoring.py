@@ -32,6 +32,9 @@ LAST_ROW = 2**ROW_BITS - 1
 WRONG = 1 << ROW_BITS
 NO_KEY = np.iinfo(np.int64).min
 WHOLE_FROM = 1 / 32  # measured: from this share of doubts, a float64 product of everything beats row by row
+FEW_BANDS = (
+    12  # measured: to so many matches with rows in doubt, looking for these rows beats sorting all of them again
+)
 SORT_FROM = 6  # measured: from so many matches a query, sorting a row of scores beats comparing it with each match
 
 
@@ -93,7 +96,7 @@ def exact_entries(queries_QD: Floats, gallery_BD: Floats, flat_N: Whole) -> Floa
         scores = queries_QD[asked].astype(np.float64) @ gallery_BD.astype(np.float64).T
         return np.asarray(scores[np.searchsorted(asked, query_N), row_N], np.float32)
     scores_N = np.empty(len(flat_N), np.float32)
-    for query, (begin, end) in zip(asked, pairwise([*starts, len(flat_N)]), strict=True):
+    for query, (begin, end) in zip(asked, pairwise([*starts.tolist(), len(flat_N)]), strict=True):
         rows_ND = gallery_BD[row_N[begin:end]].astype(np.float64)
         scores_N[begin:end] = rows_ND @ queries_QD[query].astype(np.float64)
     return scores_N
@@ -114,7 +117,11 @@ def doubtful(scores_QB: Floats, owner_P: Whole, low_P: Floats, high_P: Floats, f
         ordered_B = np.sort(row_B)
         begin_P = np.searchsorted(ordered_B, low_P[first:last])
         end_P = np.searchsorted(ordered_B, high_P[first:last], side="right")
-        if np.any(end_P > begin_P):
+        near_P = np.flatnonzero(end_P > begin_P)
+        if len(near_P) <= FEW_BANDS:
+            for low, high in zip(low_P[first:last][near_P], high_P[first:last][near_P], strict=True):
+                doubt_QB[query] |= (row_B >= low) & (row_B <= high)
+        else:
             width = len(row_B) + 1
             covered = np.cumsum(np.bincount(begin_P, minlength=width) - np.bincount(end_P, minlength=width))
             doubt_QB[query, np.argsort(row_B)[covered[:-1] > 0]] = True
