@@ -29,6 +29,8 @@ class Side:
     locations: Words
     blocks: Callable[[int], Iterator[Floats]]
     "Vectors of at most so many rows at a time, float32 (B, D), in the order of `keys`."
+    positions: Doubles | None = None
+    "Latitude and longitude of each row (rows, 2), degrees, NaN where unknown; None where of no interest."
 
 
 @dataclass(frozen=True, kw_only=True)

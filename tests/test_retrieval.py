@@ -12,8 +12,9 @@ from pipeline.features import FeatureTable, Floats, PartFooter, PartRows, open_t
 from pipeline.ranking import Blocks, Ranking, Side, rank, side_of_array
 from pipeline.ranking_workers import rank_spread
 from pipeline.records import InputError, Split, View
-from pipeline.retrieval import Task, mean_by_location, only_locations, possible_tasks, retrieve
+from pipeline.retrieval import Task, only_locations, possible_tasks, retrieve
 from pipeline.scoring import error_bound, on_grid
+from pipeline.view_groups import mean_by_location
 
 
 def unit(vectors: Floats) -> Floats:
