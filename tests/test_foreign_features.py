@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.io  # type: ignore[import-untyped]
+from test_evaluation import TEST_SET, made_table
 
 from pipeline import exports
 from pipeline.evaluation import EvaluationSettings, evaluate
 from pipeline.features import PartFooter, PartRows, open_table, write_part
 from pipeline.foreign_features import ImportSettings, import_features
 from pipeline.records import InputError, Split, View
-from tests.test_evaluation import TEST_SET, made_table
 
 FIGURES = ("queries", "gallery", "r1", "r5", "r10", "r1p", "ap")
 
