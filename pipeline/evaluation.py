@@ -114,7 +114,7 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
     elif earlier:
         findings = report.read_findings(settings.out)
         _write_besides(settings, queries, gallery, tasks, findings.results)
-        _write_report(settings, findings, extras)
+        _write_report(settings, replace(findings, views=report.read_views(settings.out)), extras)
         storage.write_json(storage.join(settings.out, INPUTS), {"ranked": ranked, "shown": shown})
         console.print(f"{settings.out}: ranked before; wrote report.html and what goes with it anew")
     else:
@@ -183,7 +183,10 @@ def _evaluate(
     _write_besides(settings, queries, gallery, tasks, results)
     spent["views, groups and exports"] = time.monotonic() - started
     started = time.monotonic()
-    _write_report(settings, report.Findings(name=settings.title, metrics=rows, results=results), extras)
+    findings = report.Findings(
+        name=settings.title, metrics=rows, results=results, views=report.read_views(settings.out)
+    )
+    _write_report(settings, findings, extras)
     spent["report"] = time.monotonic() - started
     storage.write_json(storage.join(settings.out, INPUTS), inputs)
     storage.write_json(storage.join(settings.out, METRICS), rows)
