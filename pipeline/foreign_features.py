@@ -127,7 +127,8 @@ def _write(table: str, side: _Side, split: Split, view: View, fingerprint: str, 
     stems = [parts[-1].rsplit(".", 1)[0] for parts in folders] if side.paths else [""] * len(side.labels)
     keys, seen = [], set[str]()
     for row, (location, stem) in enumerate(zip(locations, stems, strict=True)):
-        key = make_key(split, view, location, stem or f"{row:06d}")
+        ours = stem.startswith(make_key(split, view, location, ""))  # exported by us: it comes back under its key
+        key = stem if ours else make_key(split, view, location, stem or f"{row:06d}")
         key = make_key(split, view, location, f"{stem}-{row:06d}") if key in seen else key
         seen.add(key)
         keys.append(key)

@@ -44,6 +44,7 @@ def test_exported_features_come_back_with_the_same_figures(tmp_path: Path) -> No
     assert {name: rows for name, (_, rows) in written.items()} == {"query": 10, "gallery": 16}
     back = open_table(str(tmp_path / "i" / "gallery"))
     assert back.labels().locations.tolist() == open_table(gallery).labels().locations.tolist()
+    assert back.labels().keys.tolist() == open_table(gallery).labels().keys.tolist()  # so that the two can be compared
     assert back.embeddings() == pytest.approx(open_table(gallery).embeddings(), abs=1e-6)
     [theirs] = evaluate(
         EvaluationSettings(
