@@ -16,7 +16,7 @@ check: .venv/installed
 	$(BIN)/mypy
 
 bench: .venv/installed
-	for name in simulate shards streaming retrieval train_step; do $(BIN)/python benchmarks/$$name.py || exit 1; done
+	for name in simulate shards streaming evaluate train_step; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 # benchmarks/ablation.py takes hours and a folder of imagery: it is called by hand
 
 .venv/installed: pyproject.toml constraints.txt

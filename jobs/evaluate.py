@@ -1,6 +1,7 @@
 """Evaluate features exactly: every task that a table allows (--table), or one of two tables (--queries and --gallery).
 
-Writes metrics.json, metrics.parquet, queries.parquet and report.html to --out and prints the measures in percent.
+Writes metrics.json, metrics.parquet, queries.parquet, views.json and report.html to --out, what --by and --exports ask for
+beside them, and prints the measures in percent.
 """
 
 from typing import Any
@@ -10,27 +11,106 @@ from rich.console import Console
 from rich.table import Table
 
 from jobs.cli import run
+from pipeline import storage
 from pipeline.evaluation import EvaluationSettings, evaluate
+from pipeline.evaluation_files import GROUPS, VIEWS
+from pipeline.published import ABLATION, TABLE
 
 MEASURES = {"r1": "R@1", "r5": "R@5", "r10": "R@10", "r1p": "R@1%", "ap": "AP"}
+SURE = ("r1", "r5", "ap")
 
 
-def main(settings: EvaluationSettings) -> None:
-    """Rank queries against galleries and measure: Recall@K and AP, official protocol first."""
-    print_table(evaluate(settings))
+def main(settings: EvaluationSettings, published: bool = False) -> None:
+    """Rank queries against galleries and measure: Recall@K and AP, official protocol first.
+
+    Args:
+        settings: What to evaluate.
+        published: Print the figures that papers published for University-1652's official test beside ours.
+    """
+    rows = evaluate(settings)
+    print_table(rows)
+    print_positions(rows)
+    for name, first in ((VIEWS, "views"), (GROUPS, "value")):
+        path = storage.join(settings.out, name)
+        if storage.exists(path):
+            print_groups(storage.read_json(path), first)
+    if published:
+        print_published(list(dict.fromkeys(row["task"] for row in rows)))
 
 
 def print_table(rows: list[dict[str, Any]]) -> None:
-    """The measures of one evaluation on standard output, in percent."""
-    table = Table(title=f"{rows[0]['protocol']} protocol, percent", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    """The measures of one evaluation on standard output, in percent, and how sure they are."""
+    table = _table(f"{rows[0]['protocol']} protocol, percent")
     table.add_column("task")
     for heading in (*MEASURES.values(), "queries", "gallery"):
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
-        name = row["task"] + ("\n  multi-query" if row["multi_query"] else "")
         counts = (f"{row['queries']:,}", f"{row['gallery']:,}")
-        table.add_row(name, *(f"{100 * row[measure]:.2f}" for measure in MEASURES), *counts)
+        table.add_row(_task(row), *(f"{100 * row[measure]:.2f}" for measure in MEASURES), *counts)
     Console().print(table)
+    table = _table("95 % intervals: locations resampled")
+    table.add_column("task")
+    for measure in SURE:
+        table.add_column(MEASURES[measure], justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(_task(row), *(_interval(row, measure) for measure in SURE))
+    Console().print(table)
+
+
+def print_published(tasks: list[str]) -> None:
+    """What papers published for the official test, by task."""
+    for task in tasks:
+        table = _table(f"{task}, published (arXiv 2401.01573), percent")
+        table.add_column("method")
+        for heading in ("pixels", "R@1", "AP"):
+            table.add_column(heading, justify="right", no_wrap=True)
+        for line in (*TABLE, *ABLATION):
+            if figures := line.of(task):
+                table.add_row(line.method, str(line.pixels), *(f"{figure:.2f}" for figure in figures))
+        if table.row_count:
+            Console().print(table)
+
+
+def print_positions(rows: list[dict[str, Any]]) -> None:
+    """How far off the best answers are, where positions are known."""
+    known = [row for row in rows if row.get("geo_queries")]
+    if not known:
+        return
+    table = _table("distance of the best answer")
+    for heading in ("task", "median", "≤ 25 m", "50 m", "100 m", "SDM@1", "SDM@3", "SDM@5", "queries"):
+        table.add_column(heading, justify="left" if heading == "task" else "right", no_wrap=True)
+    for row in known:
+        shares = (f"{100 * row[f'within_{metres}m']:.2f}" for metres in (25, 50, 100))
+        marks = ("-" if row[f"sdm{k}"] is None else f"{100 * row[f'sdm{k}']:.2f}" for k in (1, 3, 5))
+        table.add_row(row["task"], f"{row['distance_median_m']:.1f} m", *shares, *marks, f"{row['geo_queries']:,}")
+    Console().print(table)
+
+
+def print_groups(rows: list[dict[str, Any]], first: str) -> None:
+    """Measures by number of views or by group."""
+    headings = dict.fromkeys((row["task"], row.get("by", "views a query")) for row in rows)
+    for task, heading in headings:
+        table = _table(task)
+        for column in (heading, "R@1", "95 %", "AP", "95 %", "queries"):
+            table.add_column(column, justify="right", no_wrap=True)
+        for row in rows:
+            if (row["task"], row.get("by", "views a query")) == (task, heading):
+                cells = (cell for name in ("r1", "ap") for cell in (f"{100 * row[name]:.2f}", _interval(row, name)))
+                table.add_row(str(row[first]), *cells, f"{row['queries']:,}")
+        Console().print(table)
+
+
+def _task(row: dict[str, Any]) -> str:
+    return str(row["task"]) + ("\n  multi-query" if row["multi_query"] else "")
+
+
+def _interval(row: dict[str, Any], measure: str) -> str:
+    low, high = row.get(f"{measure}_low"), row.get(f"{measure}_high")
+    return "-" if low is None or high is None else f"{100 * low:.2f} to {100 * high:.2f}"
+
+
+def _table(title: str) -> Table:
+    return Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
 
 
 if __name__ == "__main__":

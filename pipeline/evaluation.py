@@ -1,8 +1,8 @@
 """The evaluation stage: feature tables on disk -> metrics, per-query rows and the report in one folder.
 
 In: one table with query and gallery rows, or one table for each. Out: `queries.parquet`, `metrics.parquet`,
-`report.html`, `evaluation.json` (what all of it was made from) and, last, `metrics.json`: where that file is, the
-evaluation is complete.
+`report.html`, what pipeline/evaluation_files.py writes, `evaluation.json` (what all of it was made from) and, last,
+`metrics.json`: where that file is, the evaluation is complete.
 """
 
 import hashlib
@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline import report, storage, stream
+from pipeline.evaluation_files import Besides, Export, write_besides
 from pipeline.features import FeatureTable, open_table
 from pipeline.progress import console, progress
 from pipeline.records import InputError, Split, View
@@ -53,6 +54,16 @@ class EvaluationSettings:
     "Folder of another evaluation on the same images, shown beside this one, such as the untrained network's."
     title: str = "Retrieval evaluation"
     "Headline of the report."
+    workers: int = 0
+    "Ray tasks that rank, of one core each, each for some of the queries; 0: this process ranks, on all cores."
+    views: bool = True
+    "Whether to measure drone->satellite by the number of views a query is the mean of."
+    by: tuple[str, ...] = ()
+    "Columns of the shards' records to break the measures down by, such as altitude_m or heading_deg; with --shards."
+    exports: tuple[Export, ...] = ()
+    "answer: the challenge's answer.txt. mat: the features as pytorch_result.mat."
+    answer_order: str | None = None
+    "Text file with the queries' file names in the challenge's order, one a line; with --exports answer and --shards."
 
     def __post_init__(self) -> None:
         one, two = self.table is not None, (self.queries is not None, self.gallery is not None)
@@ -63,6 +74,15 @@ class EvaluationSettings:
             )
         if one and self.multi_query:
             raise InputError("found --multi-query with --table, which evaluates it already; leave it out")
+        if self.by and not self.shards:
+            raise InputError(f"found --by {' '.join(self.by)} without --shards, whose records know it; add --shards")
+        if self.answer_order and ("answer" not in self.exports or not self.shards or self.table):
+            raise InputError(
+                "found --answer-order, expected one task (--queries and --gallery), --exports answer and --shards with it; "
+                "add them"
+            )
+        if self.workers < 0:
+            raise InputError(f"--workers is {self.workers}, expected 0 or more; leave it out to rank in this process")
 
 
 def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
@@ -78,7 +98,10 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
     if settings.shards:
         read_manifest(settings.shards)  # that there are none is better said before the ranking than after it
     extras = report.read_extras(settings.title, settings.run, settings.beside)
-    shown = {"title": settings.title, "shards": settings.shards, "extras": extras.sha256}
+    shown = {
+        "title": settings.title, "shards": settings.shards, "extras": extras.sha256, "views": settings.views,
+        "by": list(settings.by), "exports": list(settings.exports), "answer_order": settings.answer_order,
+    }  # fmt: skip
     earlier = _earlier(settings.out)
     if earlier and earlier["ranked"] != ranked:
         different = ", ".join(name for name, value in ranked.items() if earlier["ranked"].get(name) != value)
@@ -89,9 +112,11 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
     if earlier and earlier["shown"] == shown:
         console.print(f"{settings.out} is complete: the same features were evaluated before; nothing to do")
     elif earlier:
-        _write_report(settings, report.read_findings(settings.out), extras)
+        findings = report.read_findings(settings.out)
+        _write_besides(settings, queries, gallery, tasks, findings.results)
+        _write_report(settings, replace(findings, views=report.read_views(settings.out)), extras)
         storage.write_json(storage.join(settings.out, INPUTS), {"ranked": ranked, "shown": shown})
-        console.print(f"{settings.out}: ranked before; wrote report.html anew")
+        console.print(f"{settings.out}: ranked before; wrote report.html and what goes with it anew")
     else:
         _evaluate(settings, queries, gallery, tasks, {"ranked": ranked, "shown": shown}, extras)
     rows: list[dict[str, Any]] = storage.read_json(storage.join(settings.out, METRICS))
@@ -148,19 +173,37 @@ def _evaluate(
         known = settings.protocol == "full" and not task.multi_query
         pairs = queries.counts[Split.QUERY, task.query_view] * gallery.counts[Split.GALLERY, task.gallery_view]
         with progress(pairs if known else None, str(task), "scores") as meter:
-            found.append(retrieve(task, queries, gallery, settings.protocol, advance=meter.advance))
+            found.append(retrieve(task, queries, gallery, settings.protocol, None, meter.advance, settings.workers))
         spent[str(task)] = time.monotonic() - started
     rows, results = [each.metrics for each in found], pa.concat_tables([each.queries for each in found])
     for name, table in ((RESULTS, results), ("metrics.parquet", pa.Table.from_pylist(rows, METRICS_SCHEMA))):
         with storage.atomic(storage.join(settings.out, name)) as stream_out:
             pq.write_table(table, stream_out)
     started = time.monotonic()
-    _write_report(settings, report.Findings(name=settings.title, metrics=rows, results=results), extras)
+    _write_besides(settings, queries, gallery, tasks, results)
+    spent["views, groups and exports"] = time.monotonic() - started
+    started = time.monotonic()
+    findings = report.Findings(
+        name=settings.title, metrics=rows, results=results, views=report.read_views(settings.out)
+    )
+    _write_report(settings, findings, extras)
     spent["report"] = time.monotonic() - started
     storage.write_json(storage.join(settings.out, INPUTS), inputs)
     storage.write_json(storage.join(settings.out, METRICS), rows)
     parts = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.items())
     console.print(f"{storage.join(settings.out, METRICS)}: {time.monotonic() - begin:.1f} s ({parts})")
+
+
+def _write_besides(
+    settings: EvaluationSettings, queries: FeatureTable, gallery: FeatureTable, tasks: list[Task], results: pa.Table
+) -> None:
+    write_besides(
+        Besides(
+            out=settings.out, protocol=settings.protocol, workers=settings.workers, views=settings.views, by=settings.by,
+            exports=settings.exports, shards=settings.shards, answer_order=settings.answer_order,
+        ),
+        queries, gallery, tasks, results,
+    )  # fmt: skip
 
 
 def _write_report(settings: EvaluationSettings, findings: report.Findings, extras: report.Extras) -> None:

@@ -3,7 +3,8 @@
 Ranks are 1-based: the row that scores highest has rank 1. Ties are settled against the query (pessimistically): a true
 match ranks behind every other gallery row of equal score, so a network that gives all images one vector finds nothing.
 A query without a true match has no rank (0 in arrays here, null in files), counts as zero in every mean and stays in
-the denominator, as in University-1652's official code. All means are fractions from 0 to 1.
+the denominator: University-1652's official evaluate_gpu.py (github.com/layumi/University1652-Baseline) skips it in its sums
+and divides by the number of all queries. All means are fractions from 0 to 1.
 
 Shapes: Q queries, P true matches of all queries together. `owner_P` says which query each match belongs to; both arrays
 are ordered by query, then by rank.
@@ -39,9 +40,14 @@ def first_match_ranks(ranks_P: Whole, owner_P: Whole, queries: int) -> Whole:
     return best_Q
 
 
+def hits_at(k: int, first_Q: Whole) -> Doubles:
+    """1 where a query has a true match among the first K, else 0 (Q,). `first_Q` from `first_match_ranks`."""
+    return np.asarray((first_Q > 0) & (first_Q <= k), np.float64)
+
+
 def recall_at(k: int, first_Q: Whole) -> float:
-    """Recall@K: the share of queries with a true match among the first K. `first_Q` from `first_match_ranks`."""
-    return float(np.mean((first_Q > 0) & (first_Q <= k))) if len(first_Q) else 0.0
+    """Recall@K: the share of queries with a true match among the first K."""
+    return float(np.mean(hits_at(k, first_Q))) if len(first_Q) else 0.0
 
 
 def one_percent(gallery: int) -> int:
@@ -71,6 +77,11 @@ def average_precisions(ranks_P: Whole, owner_P: Whole, queries: int) -> Doubles:
 def chance(matches_Q: Whole, gallery: int) -> float:
     """R@1 of a ranking drawn by lot: the share of the gallery that is right, averaged over the queries."""
     return float(np.mean(matches_Q / gallery)) if len(matches_Q) and gallery else 0.0
+
+
+def per_query(first_Q: Whole, ap_Q: Doubles, gallery: int) -> Doubles:
+    """What `summarise` takes the means of: hits at 1, 5, 10 and the top 1 %, and average precision (Q, 5)."""
+    return np.stack([*(hits_at(k, first_Q) for k in (1, 5, 10, one_percent(gallery))), ap_Q], axis=1)
 
 
 def summarise(first_Q: Whole, ap_Q: Doubles, gallery: int) -> Scores:

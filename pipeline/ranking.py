@@ -3,34 +3,22 @@
 The full score matrix never exists: the gallery is read twice in blocks. The first pass scores the true matches alone,
 the second counts what ranks ahead of each of them and keeps the k best. Both rest on one total order of gallery rows,
 the same whatever the blocks: higher score first; at equal score the wrong rows before the true matches (see
-pipeline/metrics.py on ties); then the gallery's order.
-
-That order needs scores that do not depend on how the work was cut, and a BLAS product does: its last bit changes with
-the shape of the block, so equal vectors would tie in one run and not in another. Here every component is first rounded
-to a multiple of 2^-26. Products of such numbers are multiples of 2^-52 and, for unit vectors, no partial sum reaches 2,
-so each one fits the 53 bits of a double: the float64 product is exact in any order of summation, on any machine. It is
-then rounded to float32, the score that is ranked, stored and shown. The rounding moves a score by about 1e-8, less than
-what a float32 product loses. benchmarks/retrieval.py measures what it costs.
+pipeline/metrics.py on ties); then the gallery's order. How scores are exact and fast at once: pipeline/scoring.py.
 
 Shapes: B gallery rows of a block, Q queries, P pairs of a query and a true match, D dimensions, K rows kept at the top.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import metrics
+from pipeline import metrics, scoring
 from pipeline.features import Floats, Words
 from pipeline.metrics import Doubles, Whole
-from pipeline.records import InputError
+from pipeline.scoring import LAST_ROW, NO_KEY, WRONG, on_grid
 
-GRID = np.float32(2.0**26)
-ROW_BITS = 31  # an order key: 32 bits of score, 1 bit "wrong location", 31 bits of row (up to 2,147,483,648 rows)
-LAST_ROW = 2**ROW_BITS - 1
-WRONG = 1 << ROW_BITS
-PAIR_ROWS = 4_096  # true matches scored at once: two float64 arrays of 64 MB at 2,048 dimensions
-SORT_FROM = 24  # measured: from so many matches a query, sorting a row of keys beats comparing it with each match
+PAIR_ROWS = 128  # true matches scored at once: four megabytes of float64 at 2,048 dimensions stay near the core
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +29,8 @@ class Side:
     locations: Words
     blocks: Callable[[int], Iterator[Floats]]
     "Vectors of at most so many rows at a time, float32 (B, D), in the order of `keys`."
+    positions: Doubles | None = None
+    "Latitude and longitude of each row (rows, 2), degrees, NaN where unknown; None where of no interest."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +42,7 @@ class Blocks:
     query_rows: int = 2_048
     "Queries of one product."
     gallery_rows: int = 4_096
-    "Gallery rows of one product; 2,048 x 4,096 scores and keys take 170 MB."
+    "Gallery rows of one product; 2,048 x 4,096 scores take 33 MB."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,118 +97,102 @@ def rank(
         row_P = rows_by_code[np.repeat(begin_by_code[code_Q], matches_Q) + nth_P]
         groups.append(_rank_held(held_QD, gallery, owner_P, row_P, min(top, len(gallery.keys)), cut, advance))
         begin += len(held_QD)
+    return joined(groups)
+
+
+def joined(rankings: Sequence[Ranking]) -> Ranking:
+    """The rankings of consecutive queries as one."""
     fields = Ranking.__dataclass_fields__
-    return Ranking(**{name: np.concatenate([getattr(group, name) for group in groups]) for name in fields})
+    return Ranking(**{name: np.concatenate([getattr(each, name) for each in rankings]) for name in fields})
 
 
 def _rank_held(
     held_QD: Floats, gallery: Side, owner_P: Whole, row_P: Whole, top: int, cut: Blocks, advance: Callable[[int], None]
 ) -> Ranking:
     queries = len(held_QD)
+    bound = scoring.error_bound(held_QD.shape[1])
     score_P = _scores_of_pairs(held_QD, gallery, owner_P, row_P, cut)
-    key_P = _order_keys(score_P) | (LAST_ROW - row_P)
+    low_P, high_P = scoring.below(score_P, bound), scoring.above(score_P, bound)
     ahead_P = np.zeros(len(owner_P), np.int64)
-    best_QK = np.full((queries, top), np.iinfo(np.int64).min)
+    best_QK = np.full((queries, top), NO_KEY)
+    room = np.empty(cut.query_rows * cut.gallery_rows, np.float32)
     begin = 0
     for block_BD in _regrouped(gallery.blocks(cut.gallery_rows), cut.gallery_rows):
         end = begin + len(block_BD)
-        exact_DB = block_BD.astype(np.float64).T
-        low_B = WRONG | (LAST_ROW - np.arange(begin, end))
         for first in range(0, queries, cut.query_rows):
             part = slice(first, min(first + cut.query_rows, queries))
-            keys_QB = _order_keys((held_QD[part].astype(np.float64) @ exact_DB).astype(np.float32))
-            keys_QB |= low_B
+            part_QD = held_QD[part]
+            scores_QB = room[: len(part_QD) * len(block_BD)].reshape(len(part_QD), len(block_BD))
+            np.matmul(part_QD, block_BD.T, out=scores_QB)
             pairs = slice(*np.searchsorted(owner_P, [part.start, part.stop]))
-            here = (row_P[pairs] >= begin) & (row_P[pairs] < end)
-            keys_QB[owner_P[pairs][here] - first, row_P[pairs][here] - begin] ^= WRONG
-            ahead, best = _settle(keys_QB, owner_P[pairs] - first, key_P[pairs], top)
-            ahead_P[pairs] += ahead
-            best_QK[part] = np.sort(np.concatenate([best_QK[part], best], axis=1), axis=1)[:, -top:]
-            advance(keys_QB.size)
+            owner, here = owner_P[pairs] - first, (row_P[pairs] >= begin) & (row_P[pairs] < end)
+            scores_QB[
+                owner[here], row_P[pairs][here] - begin
+            ] = -np.inf  # true matches are known: wrong rows are counted
+            flat_N = scoring.doubtful(
+                scores_QB, owner, low_P[pairs], high_P[pairs], _floors(scores_QB, best_QK[part], bound)
+            )
+            exact_N = scoring.exact_entries(part_QD, block_BD, flat_N)
+            scores_QB.reshape(-1)[flat_N] = exact_N
+            ahead_P[pairs] += scoring.count_ahead(scores_QB, owner, score_P[pairs])
+            query_N, in_block_N = np.divmod(flat_N, len(block_BD))
+            key_N = scoring.order_keys(exact_N) | WRONG | (LAST_ROW - begin - in_block_N)
+            better = key_N > best_QK[part][query_N, 0] if top else np.zeros(len(key_N), np.bool_)
+            best_QK[part] = scoring.merged(best_QK[part], query_N[better], key_N[better])
+            advance(scores_QB.size)
         begin = end
-    return _ranking(best_QK[:, ::-1], owner_P, row_P, score_P, ahead_P + 1)
+    return _ranking(best_QK, owner_P, row_P, score_P, ahead_P)
+
+
+def _floors(scores_QB: Floats, best_QK: Whole, bound: float) -> Floats:
+    """For each query what a float32 product must reach to be one of the best K: K of this block, or of those before, are
+    surely no worse. Never minus infinity, which marks true matches."""
+    top = best_QK.shape[1]
+    if not top:
+        return np.full(len(best_QK), np.inf, np.float32)
+    floor_Q = scoring.below(scoring.scores_of(best_QK[:, 0]), bound)
+    if scores_QB.shape[1] >= top and np.isneginf(floor_Q).any():
+        kth_Q = np.partition(scores_QB, -top, axis=1)[:, -top]
+        floor_Q = np.maximum(floor_Q, scoring.below(kth_Q, 2 * bound))
+    return np.maximum(floor_Q, np.finfo(np.float32).min)
 
 
 def _scores_of_pairs(held_QD: Floats, gallery: Side, owner_P: Whole, row_P: Whole, cut: Blocks) -> Floats:
-    """Scores of the true matches alone: bit for bit what the product of whole blocks gives, as both are exact."""
+    """Scores of the true matches alone."""
     by_row = np.argsort(row_P, kind="stable")
     sorted_P, score_P, begin = row_P[by_row], np.zeros(len(row_P), np.float32), 0
     for block_BD in _regrouped(gallery.blocks(cut.gallery_rows), cut.gallery_rows):
         low, high = np.searchsorted(sorted_P, [begin, begin + len(block_BD)])
         for first in range(low, high, PAIR_ROWS):
             pairs = by_row[first : min(first + PAIR_ROWS, high)]
-            query_PD = held_QD[owner_P[pairs]].astype(np.float64)
-            score_P[pairs] = np.einsum("pd,pd->p", query_PD, block_BD[row_P[pairs] - begin].astype(np.float64))
+            score_P[pairs] = scoring.exact_pairs(held_QD[owner_P[pairs]], block_BD[row_P[pairs] - begin])
         begin += len(block_BD)
     return score_P
 
 
-def _order_keys(scores: Floats) -> Whole:
-    """Integers that order as the scores do, in the upper 32 bits of 64."""
-    bits = (scores + np.float32(0)).view(np.int32)  # + 0 makes -0 and 0 one score
-    bits ^= (bits >> 31) & 0x7FFFFFFF  # a float's bits order as integers do once the negative ones are turned round
-    keys = bits.astype(np.int64)
-    keys <<= 32
-    return keys
-
-
-def _settle(keys_QB: Whole, owner_P: Whole, key_P: Whole, top: int) -> tuple[Whole, Whole]:
-    """For each pair the keys above its own, and for each query its best keys (Q, at most K), both of this block."""
-    kept = min(top, keys_QB.shape[1])
-    count_Q = np.bincount(owner_P, minlength=len(keys_QB))
-    most = int(count_Q.max(initial=0))
-    if most >= SORT_FROM:
-        keys_QB.sort(axis=1)
-        bounds = np.concatenate([[0], np.cumsum(count_Q)])
-        ahead_P = np.empty(len(owner_P), np.int64)
-        for row, low, high in zip(keys_QB, bounds[:-1], bounds[1:], strict=True):
-            ahead_P[low:high] = len(row) - np.searchsorted(row, key_P[low:high], side="right")
-        return ahead_P, keys_QB[:, -kept:]
-    nth_P = np.arange(len(owner_P)) - (np.cumsum(count_Q) - count_Q)[owner_P]
-    key_QM = np.full((len(keys_QB), most), np.iinfo(np.int64).max)
-    key_QM[owner_P, nth_P] = key_P
-    ahead_QM = np.zeros_like(key_QM)
-    for m in range(most):
-        ahead_QM[:, m] = np.count_nonzero(keys_QB > key_QM[:, m, None], axis=1)
-    keys_QB.partition(keys_QB.shape[1] - kept, axis=1)
-    return ahead_QM[owner_P, nth_P], keys_QB[:, -kept:]
-
-
-def _ranking(best_QK: Whole, owner_P: Whole, row_P: Whole, score_P: Floats, rank_P: Whole) -> Ranking:
+def _ranking(best_QK: Whole, owner_P: Whole, row_P: Whole, score_P: Floats, ahead_P: Whole) -> Ranking:
+    """`ahead_P`: wrong rows ahead of each match; to these come the matches of the same query that rank before it."""
     queries = len(best_QK)
-    order = np.lexsort((rank_P, owner_P))
-    owner_P, row_P, score_P, rank_P = owner_P[order], row_P[order], score_P[order], rank_P[order]
+    key_P = scoring.order_keys(score_P) | (LAST_ROW - row_P)
+    order = np.lexsort((-key_P, owner_P))
+    owner_P, row_P, score_P, key_P = owner_P[order], row_P[order], score_P[order], key_P[order]
+    count_Q = np.bincount(owner_P, minlength=queries)
+    nth_P = np.arange(len(owner_P)) - (np.cumsum(count_Q) - count_Q)[owner_P]
+    rank_P = ahead_P[order] + nth_P + 1
     with_match, first = np.unique(owner_P, return_index=True)
     first_row_Q, first_score_Q = np.full(queries, -1), np.full(queries, np.nan, np.float32)
     first_row_Q[with_match], first_score_Q[with_match] = row_P[first], score_P[first]
-    bits = (best_QK >> 32).astype(np.int32)
+    shown = nth_P < best_QK.shape[1]
+    top_QK = scoring.merged(best_QK, owner_P[shown], key_P[shown])[:, ::-1]
     return Ranking(
-        matches_Q=np.bincount(owner_P, minlength=queries),
+        matches_Q=count_Q,
         first_rank_Q=metrics.first_match_ranks(rank_P, owner_P, queries),
         first_row_Q=first_row_Q,
         first_score_Q=first_score_Q,
         ap_Q=metrics.average_precisions(rank_P, owner_P, queries),
-        top_rows_QK=LAST_ROW - (best_QK & LAST_ROW),
-        top_scores_QK=(bits ^ ((bits >> 31) & 0x7FFFFFFF)).view(np.float32),
+        top_rows_QK=LAST_ROW - (top_QK & LAST_ROW),
+        top_scores_QK=scoring.scores_of(top_QK),
     )
-
-
-def on_grid(vectors_BD: Floats) -> Floats:
-    """Unit vectors with every component rounded to a multiple of 2^-26.
-
-    Raises InputError when one is not of unit length, within the 1 % that float16 and rounding take.
-    """
-    length_B = np.sqrt(np.einsum("bd,bd->b", vectors_BD, vectors_BD))
-    if not np.all(np.abs(length_B - 1) < 0.01):
-        row = int(np.argmin(np.abs(length_B - 1) < 0.01))
-        raise InputError(
-            f"row {row} of a block of features has length {length_B[row]:.4g}; expected unit length; normalise the "
-            "features, or embed the shards again with jobs/embed_gallery.py"
-        )
-    grid_BD = vectors_BD * GRID
-    np.rint(grid_BD, out=grid_BD)
-    grid_BD /= GRID
-    return grid_BD
 
 
 def _regrouped(blocks: Iterator[Floats], rows: int) -> Iterator[Floats]:
@@ -229,8 +203,13 @@ def _regrouped(blocks: Iterator[Floats], rows: int) -> Iterator[Floats]:
         waiting.append(on_grid(block_BD))
         count += len(block_BD)
         while count >= rows:
-            whole_BD = np.concatenate(waiting)
+            whole_BD = _concatenated(waiting)
             yield whole_BD[:rows]
             waiting, count = [whole_BD[rows:]], count - rows
     if count:
-        yield np.concatenate(waiting)
+        yield _concatenated(waiting)
+
+
+def _concatenated(blocks: list[Floats]) -> Floats:
+    some = [block_BD for block_BD in blocks if len(block_BD)]
+    return some[0] if len(some) == 1 else np.concatenate(some)

@@ -15,10 +15,11 @@ import numpy as np
 from pipeline import metrics
 from pipeline.metrics import Whole
 from pipeline.report_charts import HEIGHT, WIDTH, Chart, recall_chart, training_charts
-from pipeline.report_inputs import Extras, Findings, Pictures, no_pictures, read_extras, read_findings
+from pipeline.report_evidence import scores_chart, views_chart
+from pipeline.report_inputs import Extras, Findings, Pictures, no_pictures, read_extras, read_findings, read_views
 from pipeline.report_panels import PANELS, distance, is_hit, keys_shown, make_panel, spread, sureness
 
-__all__ = ["Extras", "Findings", "Pictures", "no_pictures", "read_extras", "read_findings", "render"]
+__all__ = ["Extras", "Findings", "Pictures", "no_pictures", "read_extras", "read_findings", "read_views", "render"]
 
 MEASURES = {"r1": "R@1", "r5": "R@5", "r10": "R@10", "r1p": "R@1%", "ap": "AP"}
 PROTOCOLS = {
@@ -51,6 +52,7 @@ def render(findings: Findings, extras: Extras, pictures: Pictures) -> str:
         measures=MEASURES,
         tasks=tasks,
         beside=extras.beside.name if extras.beside else None,
+        evidence=_evidence(findings, tasks, rows_of),
         training=training_charts(extras.training),
         sections=[_section(task, rows, pictures) for task, rows in panels],
         width=WIDTH,
@@ -69,8 +71,23 @@ def _task(row: Mapping[str, Any], rows: list[dict[str, Any]], extras: Extras) ->
         "query_view": query_view, "gallery_view": gallery_view, "other": other,
         "first": sum(is_hit(each) for each in rows), "unmatched": int(np.count_nonzero(matches_Q == 0)),
         "chance": metrics.chance(matches_Q, row["gallery"]), "one_percent": metrics.one_percent(row["gallery"]),
+        "sure": {name: (row[f"{name}_low"], row[f"{name}_high"]) for name in MEASURES if row.get(f"{name}_low") is not None},
+        "geo": row if row.get("geo_queries") else None,
         "chart": _recall_chart(name, row, rows, extras if other else None),
     }  # fmt: skip
+
+
+def _evidence(findings: Findings, tasks: list[dict[str, Any]], rows_of: list[list[dict[str, Any]]]) -> list[Chart]:
+    """R@1 by number of views, and for each task of single queries how the scores of right and wrong answers part."""
+    single = [(task, rows) for task, rows in zip(tasks, rows_of, strict=True) if not task["multi_query"]]
+    of_views = [
+        views_chart(
+            f"{task['name']}, R@1 by views a query", [row for row in findings.views if row["task"] == task["task"]]
+        )
+        for task, _ in single
+    ]
+    charts = [*of_views, *(scores_chart(f"{task['name']}, scores", rows) for task, rows in single)]
+    return [chart for chart in charts if chart]
 
 
 def _recall_chart(name: str, row: Mapping[str, Any], rows: list[dict[str, Any]], extras: Extras | None) -> Chart:

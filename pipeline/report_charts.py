@@ -83,7 +83,7 @@ def training_charts(rows: Sequence[Mapping[str, Any]]) -> list[Chart]:
             continue
         y_ticks = nice_ticks(min([0.0, *shown] if name in FROM_ZERO else shown), max(shown))
         x_ticks = [x for x in nice_ticks(points[0][0], points[-1][0]) if points[0][0] <= x <= points[-1][0]]
-        frame = _Frame(points[0][0], points[-1][0], y_ticks[0], y_ticks[-1])
+        frame = Frame(points[0][0], points[-1][0], y_ticks[0], y_ticks[-1])
         dots = [points[0]] if len(points) == 1 else []
         charts.append(Chart(
             title=title, note=note,
@@ -100,7 +100,7 @@ def recall_chart(
     title: str, note: str, first_Q: Whole, gallery: int, beside_Q: Whole | None, beside_name: str
 ) -> Chart:
     """Recall@K over K on a logarithmic axis, with dots at K = 1, 5, 10 and the top 1 %."""
-    frame = _Frame(0, max(math.log10(gallery), 0.3), 0, 1)
+    frame = Frame(0, max(math.log10(gallery), 0.3), 0, 1)
     ks = sorted({min(gallery, round(k)) for k in np.geomspace(1, max(gallery, 1), CURVE_POINTS)})
     named = {k for k in (1, 5, 10, one_percent(gallery)) if k <= gallery}
 
@@ -122,7 +122,7 @@ def recall_chart(
 
 
 @dataclass(frozen=True)
-class _Frame:
+class Frame:
     """From numbers to the chart's coordinates."""
 
     x_low: float

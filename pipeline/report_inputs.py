@@ -30,6 +30,8 @@ class Findings:
     "Rows of retrieval.METRICS_SCHEMA."
     results: pa.Table
     "Rows of retrieval.RESULTS_SCHEMA, of all tasks."
+    views: tuple[dict[str, Any], ...] = ()
+    "Rows of view_curve.VIEWS_SCHEMA."
 
     def of(self, row: dict[str, Any]) -> dict[str, Any] | None:
         """This evaluation's metric row for the task of another's row; None where it has none.
@@ -69,8 +71,18 @@ def read_findings(folder: str) -> Findings:
         raise InputError(f"no finished evaluation at {folder}: found no metrics.json; make one with jobs/evaluate.py")
     with storage.open_read(storage.join(folder, "queries.parquet")) as stream:
         results = pq.read_table(stream)
-    name = folder.rstrip("/").rsplit("/", 1)[-1]
-    return Findings(name=name, metrics=storage.read_json(storage.join(folder, "metrics.json")), results=results)
+    return Findings(
+        name=folder.rstrip("/").rsplit("/", 1)[-1],
+        metrics=storage.read_json(storage.join(folder, "metrics.json")),
+        results=results,
+        views=read_views(folder),
+    )
+
+
+def read_views(folder: str) -> tuple[dict[str, Any], ...]:
+    """The measures by number of views; none where they were not taken."""
+    path = storage.join(folder, "views.json")
+    return tuple(storage.read_json(path)) if storage.exists(path) else ()
 
 
 @dataclass(frozen=True, kw_only=True)

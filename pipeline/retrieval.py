@@ -12,20 +12,28 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 
-from pipeline import metrics
+from pipeline import metrics, positions
 from pipeline.features import FeatureTable, Floats, Words
-from pipeline.metrics import Scores, Whole
-from pipeline.ranking import PAIR_ROWS, Blocks, Ranking, Side, on_grid, rank, side_of_array
+from pipeline.intervals import intervals
+from pipeline.metrics import Whole
+from pipeline.ranking import Blocks, Ranking, Side
+from pipeline.ranking_workers import rank_spread
 from pipeline.records import InputError, Split, View
+from pipeline.view_groups import mean_by_location
 
 Protocol = Literal["full", "queried-only"]
 "full: the official one, the whole gallery with its distractors. queried-only: gallery rows of queried locations alone."
 TOP = 10
+MEASURES = ("r1", "r5", "r10", "r1p", "ap")
 
 METRICS_SCHEMA = pa.schema([
     ("task", pa.string()), ("protocol", pa.string()), ("multi_query", pa.bool_()), ("queries", pa.int64()),
     ("gallery", pa.int64()), ("r1", pa.float64()), ("r5", pa.float64()), ("r10", pa.float64()), ("r1p", pa.float64()),
     ("ap", pa.float64()), ("fingerprint", pa.string()),
+    *((f"{name}_{end}", pa.float64()) for name in MEASURES for end in ("low", "high")),  # 95 % bootstrap over locations
+    ("geo_queries", pa.int64()),  # queries with a position; 0 where distances cannot be told, and then they are null
+    ("distance_median_m", pa.float64()), *((f"within_{metres}m", pa.float64()) for metres in positions.WITHIN_M),
+    *((f"sdm{k}", pa.float64()) for k in positions.SDM_K),
 ])  # fmt: skip
 RESULTS_SCHEMA = pa.schema([
     ("query", pa.string()),  # the key; of merged queries, the location
@@ -65,7 +73,8 @@ def possible_tasks(queries: FeatureTable, gallery: FeatureTable) -> list[Task]:
 def side_of(table: FeatureTable) -> Side:
     """The selected rows of a feature table."""
     labels = table.labels()
-    return Side(keys=labels.keys, locations=labels.locations, blocks=table.blocks)
+    places = np.stack([labels.lats, labels.lons], axis=1)
+    return Side(keys=labels.keys, locations=labels.locations, blocks=table.blocks, positions=places)
 
 
 def only_locations(side: Side, locations: Words) -> Side:
@@ -80,22 +89,8 @@ def only_locations(side: Side, locations: Words) -> Side:
             if len(kept_BD):
                 yield kept_BD
 
-    return Side(keys=side.keys[keep], locations=side.locations[keep], blocks=blocks)
-
-
-def mean_by_location(side: Side) -> Side:
-    """One query per location: the mean of its vectors, brought to unit length; its key is the location's name."""
-    names, location_Q = np.unique(side.locations, return_inverse=True)
-    total_LD, begin = np.zeros((len(names), 0)), 0
-    for block_BD in side.blocks(PAIR_ROWS):
-        if not begin:
-            total_LD = np.zeros((len(names), block_BD.shape[1]))
-        # Sums on the grid are exact, so the mean does not depend on the order of the rows either.
-        np.add.at(total_LD, location_Q[begin : begin + len(block_BD)], on_grid(block_BD).astype(np.float64))
-        begin += len(block_BD)
-    length_L1 = np.linalg.norm(total_LD, axis=1, keepdims=True)
-    mean_LD = (total_LD / np.maximum(length_L1, np.finfo(np.float64).tiny)).astype(np.float32)
-    return side_of_array(names, names, mean_LD)
+    places = None if side.positions is None else side.positions[keep]
+    return Side(keys=side.keys[keep], locations=side.locations[keep], blocks=blocks, positions=places)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,10 +110,24 @@ def retrieve(
     protocol: Protocol = "full",
     blocks: Blocks | None = None,
     advance: Callable[[int], None] = lambda scores: None,
+    workers: int = 0,
 ) -> TaskResults:
-    """Rank and measure one task. `advance` is told how many scores have been settled.
+    """Rank and measure one task. `advance` is told how many scores have been settled; `workers` as in `rank_spread`.
 
     Raises InputError when no gallery row is left, or a feature is not of unit length.
+    """
+    query_side, gallery_side = sides_of(task, queries, gallery, protocol)
+    found = rank_spread(query_side, gallery_side, TOP, workers, advance, blocks)
+    return TaskResults(
+        metrics=_metric_row(task, protocol, query_side, gallery_side, found, queries.fingerprint),
+        queries=_result_rows(task, protocol, query_side, gallery_side, found),
+    )
+
+
+def sides_of(task: Task, queries: FeatureTable, gallery: FeatureTable, protocol: Protocol) -> tuple[Side, Side]:
+    """What is ranked for what.
+
+    Raises InputError when nothing is left of either.
     """
     query_side = side_of(queries.select(Split.QUERY, task.query_view))
     gallery_side = side_of(gallery.select(Split.GALLERY, task.gallery_view))
@@ -131,22 +140,26 @@ def retrieve(
             f"{task} has {len(query_side.keys)} queries and {len(gallery_side.keys)} gallery rows under the protocol "
             f"{protocol}; expected some of both, with location names in common; check the tables' splits and locations"
         )
-    ranking = rank(query_side, gallery_side, TOP, blocks, advance)
-    scores = metrics.summarise(ranking.first_rank_Q, ranking.ap_Q, len(gallery_side.keys))
-    return TaskResults(
-        metrics=_metric_row(task, protocol, query_side, gallery_side, scores, queries.fingerprint),
-        queries=_result_rows(task, protocol, query_side, gallery_side, ranking),
-    )
+    return query_side, gallery_side
 
 
 def _metric_row(
-    task: Task, protocol: Protocol, queries: Side, gallery: Side, scores: Scores, fingerprint: str
+    task: Task, protocol: Protocol, queries: Side, gallery: Side, found: Ranking, fingerprint: str
 ) -> dict[str, Any]:
-    return {
+    scores = metrics.summarise(found.first_rank_Q, found.ap_Q, len(gallery.keys))
+    row: dict[str, Any] = {
         "task": task.name, "protocol": protocol, "multi_query": task.multi_query, "queries": len(queries.keys),
-        "gallery": len(gallery.keys), "r1": scores.r1, "r5": scores.r5, "r10": scores.r10, "r1p": scores.r1p,
-        "ap": scores.ap, "fingerprint": fingerprint,
+        "gallery": len(gallery.keys), **{name: getattr(scores, name) for name in MEASURES}, "fingerprint": fingerprint,
     }  # fmt: skip
+    bounds = intervals(metrics.per_query(found.first_rank_Q, found.ap_Q, len(gallery.keys)), queries.locations)
+    for name, (low, high) in zip(MEASURES, bounds.T.tolist(), strict=True):
+        row |= {f"{name}_low": low, f"{name}_high": high}
+    unknown = np.full((len(queries.keys), 2), np.nan)
+    asked = unknown if queries.positions is None else queries.positions
+    given = np.full((len(gallery.keys), 2), np.nan) if gallery.positions is None else gallery.positions
+    if np.isnan(given).any():
+        asked = unknown
+    return row | positions.measures(asked, given[found.top_rows_QK])
 
 
 def _result_rows(task: Task, protocol: Protocol, queries: Side, gallery: Side, found: Ranking) -> pa.Table:

@@ -15,6 +15,7 @@ from PIL import Image
 from pipeline import report
 from pipeline.records import InputError
 from pipeline.report_charts import nice_ticks, recall_chart, training_charts
+from pipeline.report_evidence import scores_chart, views_chart
 from pipeline.report_inputs import Extras, Findings, read_training
 from pipeline.report_panels import distance, keys_shown, make_panel, spread, sureness, thumbnail
 from pipeline.retrieval import RESULTS_SCHEMA
@@ -200,3 +201,33 @@ def test_training_rows_that_are_none_are_refused(tmp_path: Path) -> None:
         read_training(str(tmp_path))
     with pytest.raises(InputError, match=r"line 1 of .* expected a JSON object with its epoch"):
         read_training(write_lines(tmp_path, "[]", '{"epoch": 1}'))
+
+
+SURE = {"r1_low": 0.4, "r1_high": 0.6, "ap_low": 0.5, "ap_high": 0.75}
+CURVE = tuple(
+    {"task": "drone->satellite", "views": n, "queries": 54 // n, "r1": n / 54, "r1_low": n / 60, "r1_high": n / 54}
+    for n in (1, 6, 54)
+)
+
+
+def test_the_page_shows_intervals_distances_and_what_more_views_bring() -> None:
+    geo = {"geo_queries": 4, "distance_median_m": 12.4, "within_25m": 0.5, "within_50m": 0.75, "within_100m": 1.0}
+    plain = findings(TOWN)
+    full = Findings(name="out", metrics=[plain.metrics[0] | SURE | geo], results=plain.results, views=CURVE)
+    text = report.render(full, Extras(title="Town"), lambda keys: {})
+    assert "40.0 to 60.0" in text
+    assert "best answer off by 12 m (median); within 25, 50, 100 m: 50.00, 75.00, 100.00" in text
+    assert "R@1 by views a query: 1 views: 1.85 %, 6 views: 11.11 %, 54 views: 100.00 %" in text
+    assert "median score" in text
+    before = report.render(plain, Extras(title="Town"), lambda keys: {})
+    assert "R@1 by views" not in before
+    assert "95 % interval" not in before
+
+
+def test_scores_of_right_and_wrong_answers_are_drawn_apart() -> None:
+    chart = scores_chart("t", TOWN)
+    assert chart
+    assert chart.summary == "t: median score 0.870 of true matches, 0.890 of wrong answers"
+    assert [line.style for line in chart.lines] == ["beside", "main"]
+    assert scores_chart("t", [TOWN[3]]) is None
+    assert views_chart("t", []) is None

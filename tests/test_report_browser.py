@@ -48,7 +48,13 @@ def findings(rows: list[dict[str, Any]], name: str) -> Findings:
         "gallery": 51_355,
     }
     metrics = counts | dict.fromkeys(("r1", "r5", "r10", "r1p", "ap"), 1.0) | {"fingerprint": "f" * 64}
-    return Findings(name=name, metrics=[metrics], results=pa.Table.from_pylist(rows, RESULTS_SCHEMA))
+    metrics |= {f"{measure}_{end}": 0.5 for measure in ("r1", "ap") for end in ("low", "high")}
+    metrics |= {"geo_queries": 5, "distance_median_m": 1234.5, "within_25m": 0.5, "within_50m": 0.5, "within_100m": 1.0}
+    views = tuple(
+        {"task": "drone->satellite", "views": n, "queries": 54 // n, "r1": 0.5, "r1_low": 0.25, "r1_high": 0.75}
+        for n in (1, 2, 3, 6, 9, 18, 27, 54)
+    )
+    return Findings(name=name, metrics=[metrics], views=views, results=pa.Table.from_pylist(rows, RESULTS_SCHEMA))
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,12 @@ from hypothesis import strategies as st
 
 from pipeline import metrics
 from pipeline.features import FeatureTable, Floats, PartFooter, PartRows, open_table, write_part
-from pipeline.ranking import Blocks, Ranking, Side, on_grid, rank, side_of_array
+from pipeline.ranking import Blocks, Ranking, Side, rank, side_of_array
+from pipeline.ranking_workers import rank_spread
 from pipeline.records import InputError, Split, View
-from pipeline.retrieval import Task, mean_by_location, only_locations, possible_tasks, retrieve
+from pipeline.retrieval import Task, only_locations, possible_tasks, retrieve
+from pipeline.scoring import error_bound, on_grid
+from pipeline.view_groups import mean_by_location
 
 
 def unit(vectors: Floats) -> Floats:
@@ -83,6 +86,48 @@ def test_every_bit_is_the_same_for_blocks_of_any_shape() -> None:
     whole = rank(queries, gallery)
     for rows in (3, 7, 64, 119):
         assert same(rank(queries, gallery, blocks=Blocks(held_queries=25, query_rows=rows, gallery_rows=rows)), whole)
+
+
+def test_every_bit_is_the_same_for_any_number_of_workers(ray_cluster: None) -> None:
+    rng = np.random.default_rng(3)
+    queries = side(rng.standard_normal((23, 16)).astype(np.float32), [f"{i % 7}" for i in range(23)])
+    gallery = side(rng.standard_normal((90, 16)).astype(np.float32), [f"{i % 9}" for i in range(90)])
+    whole, settled = rank(queries, gallery, 5), [0]
+
+    def advance(scores: int) -> None:
+        settled[0] += scores
+
+    assert same(rank_spread(queries, gallery, 5, 0, lambda scores: None), whole)
+    assert same(rank_spread(queries, gallery, 5, 2, advance), whole)
+    assert same(rank_spread(queries, gallery, 5, 2, advance, Blocks(held_queries=4, query_rows=3)), whole)
+    assert settled == [2 * 23 * 90]
+
+
+@pytest.mark.parametrize("spread", [0.0, 1e-7, 1e-5, 1e-3, 0.1])
+@pytest.mark.parametrize("each", [1, 3, 30])
+def test_near_ties_are_settled_exactly_however_near(spread: float, each: int) -> None:
+    """Vectors that differ by less than float32 products can tell: every score is in doubt."""
+    rng = np.random.default_rng(4)
+    centre = rng.standard_normal(300)
+    queries = side((centre + spread * rng.standard_normal((9, 300))).astype(np.float32), [f"{i % 4}" for i in range(9)])
+    names = [f"{i % 4}" if i < 4 * each else f"x{i}" for i in range(4 * each + 60)]
+    gallery = side((centre + spread * rng.standard_normal((len(names), 300))).astype(np.float32), names)
+    found = rank(queries, gallery, 10, Blocks(query_rows=4, gallery_rows=50))
+    for q, (ranks, rows, scores) in enumerate(brute(queries, gallery, 10)):
+        assert found.first_rank_Q[q] == ranks[0]
+        expected = metrics.average_precisions(np.array(ranks), np.zeros(len(ranks), np.int64), 1)[0]
+        assert found.ap_Q[q] == pytest.approx(expected, abs=1e-12)
+        assert found.top_rows_QK[q].tolist() == rows
+        assert found.top_scores_QK[q].tolist() == scores
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([2, 64, 2048]))
+@settings(max_examples=25, deadline=None)
+def test_float32_products_lie_within_the_bound_of_the_score(seed: int, dimension: int) -> None:
+    rng = np.random.default_rng(seed)
+    one, other = (on_grid(unit(np.abs(rng.standard_normal((8, dimension))).astype(np.float32))) for _ in range(2))
+    exact = (one.astype(np.float64) @ other.astype(np.float64).T).astype(np.float32)
+    assert np.abs(exact.astype(np.float64) - one @ other.T).max() <= error_bound(dimension)
 
 
 def test_many_matches_a_query_are_counted_as_few_are() -> None:

@@ -1,0 +1,79 @@
+"""What an evaluation holds besides measures and report: R@1 by views, measures by group, files for other programs.
+
+In: the tables and the per-query rows. Out: `views.json` (rows of view_curve.VIEWS_SCHEMA), `groups.json` (rows of
+breakdowns.break_down), `answer.txt` and `pytorch_result.mat`, one of each task where there are several.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from pipeline import breakdowns, exports, storage
+from pipeline.features import FeatureTable
+from pipeline.progress import progress
+from pipeline.records import View
+from pipeline.retrieval import Protocol, Task
+from pipeline.view_curve import view_curve
+
+Export = Literal["answer", "mat"]
+VIEWS, GROUPS = "views.json", "groups.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Besides:
+    """What to write; each field as in evaluation.EvaluationSettings."""
+
+    out: str
+    protocol: Protocol
+    workers: int
+    views: bool
+    by: tuple[str, ...]
+    exports: tuple[Export, ...]
+    shards: str | None
+    answer_order: str | None
+
+
+def write_besides(
+    wanted: Besides, queries: FeatureTable, gallery: FeatureTable, tasks: list[Task], results: pa.Table
+) -> None:
+    """Write what was asked for.
+
+    Raises InputError when a column or a name is not known, or features do not fit a .mat file.
+    """
+    single = [task for task in tasks if not task.multi_query]
+    several = [task for task in single if (task.query_view, task.gallery_view) == (View.DRONE, View.SATELLITE)]
+    if wanted.views and several:
+        with progress(None, "by number of views", "scores") as meter:
+            curve = view_curve(several[0], queries, gallery, wanted.protocol, wanted.workers, meter.advance)
+        if curve:
+            storage.write_json(storage.join(wanted.out, VIEWS), curve)
+    if wanted.by and wanted.shards:
+        groups: list[dict[str, Any]] = []
+        for column in wanted.by:
+            groups += breakdowns.break_down(results, column, breakdowns.read_column(wanted.shards, column))
+        storage.write_json(storage.join(wanted.out, GROUPS), groups)
+    for task in single:
+        _export(
+            wanted,
+            task,
+            f"-{task.query_view}-{task.gallery_view}" if len(single) > 1 else "",
+            queries,
+            gallery,
+            results,
+        )
+
+
+def _export(
+    wanted: Besides, task: Task, ending: str, queries: FeatureTable, gallery: FeatureTable, results: pa.Table
+) -> None:
+    if "mat" in wanted.exports:
+        data = exports.mat_bytes(queries, gallery, task.query_view, task.gallery_view)
+        storage.write_bytes(storage.join(wanted.out, f"pytorch_result{ending}.mat"), data)
+    if "answer" in wanted.exports:
+        mask = pc.and_(pc.equal(results["task"], task.name), pc.invert(results["multi_query"]))
+        names = exports.file_names(wanted.shards) if wanted.shards else None
+        order = exports.read_order(wanted.answer_order) if wanted.answer_order else None
+        text = exports.answer_text(results.filter(mask).to_pylist(), names, order)
+        storage.write_bytes(storage.join(wanted.out, f"answer{ending}.txt"), text.encode())
