@@ -18,6 +18,7 @@ from model.inference import InEffect, Precision, effective_precision, with_preci
 from model.int8 import PrecisionError, calibration_digest, require_int8
 from pipeline.embed import EmbeddingSettings, Network, wanted_shards
 from pipeline.features import Floats
+from pipeline.foreign import open_manifest
 from pipeline.records import InputError
 from pipeline.samples import read_shard
 from pipeline.stream import decoded, stack
@@ -124,12 +125,14 @@ def network_of(
 
 
 def some_images(embedding: EmbeddingSettings, size: int, resizer: Resizer, count: int) -> Bytes:
-    """The first images of what is to be embedded, from each split and view alike, as bytes (at most `count`, 3, size, size).
+    """The first images of a set, from each split and view alike, as bytes (at most `count`, 3, size, size).
 
-    Within a shard images stand in the order of their keys' hashes: its first ones are a fair sample. Raises InputError where
-    none of them can be decoded.
+    Of the whole set, whatever of it is to be embedded: queries and gallery may be embedded one after the other into one
+    table. Within a shard images stand in the order of their keys' hashes: its first ones are a fair sample. Raises InputError
+    where none of them can be decoded.
     """
-    first = {(shard.split, shard.view): shard for shard in reversed(wanted_shards(embedding))}
+    every = open_manifest(embedding.shards, embedding.split, embedding.view).shards
+    first = {(shard.split, shard.view): shard for shard in reversed(every) if shard.samples}
     found = []
     for shard in first.values():
         samples = read_shard(embedding.shards, shard.name, shard.split, shard.view)

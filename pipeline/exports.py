@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import scipy.io  # type: ignore[import-untyped]
+import scipy.io
 
 from pipeline import shard_records, storage
 from pipeline.features import FeatureTable
@@ -87,7 +87,7 @@ def mat_bytes(queries: FeatureTable, gallery: FeatureTable, query_view: View, ga
                 f"the {name} features take {size:,} bytes; expected at most {MAT_LIMIT:,}, all that an array of a .mat file "
                 "can hold; leave the export out and read the Parquet table"
             )
-        known, folder = labels[name], f"{name}_{table.view}"
+        known, folder = labels[name], f"{name}_{'-'.join(table.views)}"
         content[f"{name}_f"] = table.embeddings()
         content[f"{name}_label"] = np.array([[numbers[place] for place in known.locations.tolist()]], np.int64)
         pairs = zip(known.locations.tolist(), known.keys.tolist(), strict=True)

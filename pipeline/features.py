@@ -94,10 +94,18 @@ class FeatureTable:
         """How many are selected."""
         if any(meant.columns - {"split", "view"} for meant in self.selections):
             return sum(len(rows) for _, rows in self._read(["split"]))
-        return sum(
-            count for (split, view), count in self.counts.items()
-            if all(one.split in (None, split) and one.view in (None, view) for one in self.selections)
-        )  # fmt: skip
+        return sum(count for _, count in self._kinds())
+
+    @property
+    def views(self) -> list[View]:
+        """The views that rows of the selected splits and views have."""
+        return sorted({view for view, _ in self._kinds()})
+
+    def _kinds(self) -> Iterator[tuple[View, int]]:
+        """View and count of the splits and views that are selected."""
+        for (split, view), count in self.counts.items():
+            if all(one.split in (None, split) and one.view in (None, view) for one in self.selections):
+                yield view, count
 
     def labels(self) -> Labels:
         """Keys, locations and positions of all selected rows."""

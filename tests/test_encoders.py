@@ -33,8 +33,8 @@ def test_the_images_to_check_by_are_the_same_each_time_and_of_every_split_and_vi
     first, again = (some_images(asked(tiny_shards), 32, "torch", 12) for _ in range(2))
     assert first.shape == (12, 3, 32, 32)
     assert np.array_equal(first, again)
-    only = some_images(asked(tiny_shards, split=Split.QUERY), 32, "torch", 12)
-    assert not np.array_equal(first[: len(only)], only)
+    # Queries and gallery may be embedded one after the other: what calibrates int8 must not depend on it.
+    assert np.array_equal(first, some_images(asked(tiny_shards, split=Split.QUERY), 32, "torch", 12))
 
 
 def test_a_shard_without_one_image_that_can_be_decoded_is_said_beforehand(

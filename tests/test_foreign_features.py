@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.io  # type: ignore[import-untyped]
+import scipy.io
 from test_evaluation import TEST_SET, made_table
 
 from pipeline import exports
