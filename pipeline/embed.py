@@ -161,7 +161,7 @@ def refuse_other(settings: EmbeddingSettings, network: Network, header: PartHead
     if made_by != network.fingerprint:
         raise InputError(
             f"{path} was made by network {made_by[:12]}, this checkpoint is {network.fingerprint[:12]}; choose another "
-            "--out, the --resizer that it was made with, or delete the old table"
+            "--out, the --precision, --resizer and --mirror that it was made with, or delete the old table"
         )
     if header.dtype != settings.dtype:
         raise InputError(
