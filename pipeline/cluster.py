@@ -33,6 +33,11 @@ def cpus() -> int:
     return max(1, int(_resources().get("CPU", 1)))
 
 
+def gpus() -> int:
+    """GPUs of the whole cluster."""
+    return int(_resources().get("GPU", 0))
+
+
 def nodes() -> list[Node]:
     """The machines of the cluster that are up."""
     up = [node["Resources"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
