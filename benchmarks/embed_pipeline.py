@@ -165,7 +165,7 @@ def main() -> None:
     parser.add_argument("--decoders", type=int, default=1, help="threads that decode")
     parser.add_argument("--seconds", type=float, default=8.0, help="of a measured run, roughly")
     parser.add_argument("--rounds", type=int, default=3, help="of the two in turn")
-    parser.add_argument("--few", type=int, default=500, help="images for the memory to compare with")
+    parser.add_argument("--few", type=int, default=1000, help="images for the memory to compare with")
     given = parser.parse_args()
     cluster.connect()
     rng = np.random.default_rng(0)

@@ -10,9 +10,10 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import chain
+from queue import SimpleQueue
 
 import numpy as np
 import numpy.typing as npt
@@ -87,6 +88,11 @@ class ShardEmbedder:
         self._given, self._network = given, network
         # One thread for all that computes: shards queue here, and torch's settings of a thread hold for every pass.
         self._device = ThreadPoolExecutor(1)
+        # Threads for the worker's life, shared by the shards that it has at once.
+        self._decoders = ThreadPoolExecutor(given.decode_threads)
+        self._readers = SimpleQueue[ThreadPoolExecutor]()
+        for _ in range(IN_FLIGHT):
+            self._readers.put(ThreadPoolExecutor(1))
         self._encoder: Encoder
         self._dimension = 0
 
@@ -100,7 +106,8 @@ class ShardEmbedder:
         Raises InputError where the tar is cut off or not what the manifest says, CannotWrite where nothing can be written.
         """
         seconds, rejected, samples = Seconds(float), list[Rejection](), list[Sample]()
-        with closing(ready(self._batches(shard, samples, rejected, seconds), READY_BATCHES)) as batches:
+        batches_made = self._batches(shard, samples, rejected, seconds)
+        with self._reader() as reader, closing(ready(batches_made, READY_BATCHES, reader)) as batches:
             first = next(batches, None)  # asked for here, so that it is made while another shard is being embedded
             found = chain([] if first is None else [first], batches)
             embeddings_ND = self._device.submit(self._infer, shard, samples, found, seconds).result()
@@ -114,6 +121,14 @@ class ShardEmbedder:
         seconds["write"] += time.perf_counter() - start
         return Embedded(rows=len(samples), rejected=tuple(rejected), seconds=dict(seconds))
 
+    @contextmanager
+    def _reader(self) -> Iterator[ThreadPoolExecutor]:
+        reader = self._readers.get()
+        try:
+            yield reader
+        finally:
+            self._readers.put(reader)
+
     def _tar(self, shard: Shard) -> str:
         return storage.join(self._given.shards, f"{shard.name}.tar")
 
@@ -124,7 +139,7 @@ class ShardEmbedder:
         given = self._given
         samples = _timed(read_shard(given.shards, shard.name, shard.split, shard.view), seconds)
         images: list[Pixels] = []
-        for (sample, image), spent in ahead(self._open, samples, given.decode_threads, given.batch_size):
+        for (sample, image), spent in ahead(self._open, samples, self._decoders, given.batch_size):
             seconds["decode"] += spent
             if isinstance(image, DecodeError):
                 rejected.append(Rejection(path=sample.key, reason=image.reason, found=image.found))
