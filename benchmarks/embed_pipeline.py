@@ -22,7 +22,7 @@ import numpy as np
 import ray
 from PIL import Image
 
-from jobs.encoders import network_of
+from jobs.encoders import CALIBRATING, PROBES, EncoderSettings, network_of
 from model.checkpoint import Checkpoint, dumps
 from model.pvda import FeatureEncoder, PVDAConfig
 from pipeline import cluster
@@ -85,16 +85,22 @@ def write_shard(folder: str, number: int, images: list[bytes], count: int) -> Sh
     return Shard(name=name, split=Split.GALLERY, view=View.DRONE, samples=count, bytes=0, sha256="s")
 
 
-def network(depth: Any, size: int, batch: int, folder: str, images: list[bytes]) -> Network:
-    """An encoder with the weights that chance gave it, folded, checked by images of a shard of its own."""
+def checkpoint(depth: Any, size: int) -> bytes:
+    """A network with the weights that chance gave it."""
     config = PVDAConfig(depth=depth, image_size=size)
     weights = {"modules": {"encoder": FeatureEncoder(config).state_dict()}}
-    made = Checkpoint(network=config, recipe={}, locations=[], epoch=0, history=[], state=weights)
+    return dumps(Checkpoint(network=config, recipe={}, locations=[], epoch=0, history=[], state=weights))
+
+
+def network(
+    made: bytes, batch: int, folder: str, images: list[bytes], settings: EncoderSettings | None = None
+) -> Network:
+    """The network as a worker builds it, checked by images of a shard of its own."""
     apart = Path(folder) / "probe"
-    apart.mkdir()
-    write_shard(str(apart), 0, images, 16)
+    apart.mkdir(exist_ok=True)
+    write_shard(str(apart), 0, images, PROBES + CALIBRATING)
     embedding = EmbeddingSettings(shards=str(apart), out="none", split=Split.GALLERY, view=View.DRONE, batch_size=batch)
-    return network_of(dumps(made), "the benchmark's", embedding)
+    return network_of(made, "the benchmark's", embedding, settings)
 
 
 def worker(folder: str, made: Network, batch: int, threads: int, decoders: int) -> Any:
@@ -125,7 +131,11 @@ def measure_speed(given: argparse.Namespace, images: list[bytes]) -> None:
     threads = given.threads or os.cpu_count() or 1
     with tempfile.TemporaryDirectory() as folder:
         actor = worker(
-            folder, network(given.depth, given.size, given.batch, folder, images), given.batch, threads, given.decoders
+            folder,
+            network(checkpoint(given.depth, given.size), given.batch, folder, images),
+            given.batch,
+            threads,
+            given.decoders,
         )
         ray.get(actor.resident.remote(2 * given.batch))
         rate = ray.get(actor.resident.remote(4 * given.batch))
@@ -151,7 +161,7 @@ def measure_memory(given: argparse.Namespace, images: list[bytes]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         shards = [write_shard(folder, number, images, given.few // 2) for number in range(8)]
         peaks = []
-        made = network(18, 128, 32, folder, images)
+        made = network(checkpoint(18, 128), 32, folder, images)
         for count in (2, 8):
             actor = worker(folder, made, 32, os.cpu_count() or 1, given.decoders)
             end_to_end(actor, shards[:count])

@@ -8,7 +8,7 @@ import tyro
 
 from model.checkpoint import CheckpointError
 from pipeline.progress import console
-from pipeline.records import InputError
+from pipeline.records import InputError, Unfinished
 
 
 def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lambda arguments: arguments) -> None:
@@ -27,16 +27,12 @@ def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lamb
     except (InputError, CheckpointError) as error:
         _say(str(error))
         sys.exit(2)
-    except Failure as error:
+    except Unfinished as error:
         _say(str(error))
         sys.exit(1)
     except KeyboardInterrupt:
         console.print("stopped; run the same command again to go on")
         sys.exit(130)
-
-
-class Failure(RuntimeError):
-    """A job that could not finish for a reason that needs no traceback: one sentence, exit code 1."""
 
 
 def _say(sentence: str) -> None:

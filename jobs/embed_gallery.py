@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass, fields
 
-from jobs.cli import Failure, run
+from jobs.cli import run
 from jobs.encoders import EncoderSettings, network_of
 from pipeline import storage
-from pipeline.embed import EmbeddingSettings, Incomplete, embed_gallery
+from pipeline.embed import EmbeddingSettings, embed_gallery
 from pipeline.records import InputError
 
 
@@ -28,10 +28,7 @@ def main(settings: Settings) -> None:
     embedding = EmbeddingSettings(**given)
     encoder = EncoderSettings(**{field.name: getattr(settings, field.name) for field in fields(EncoderSettings)})
     network = network_of(storage.read_bytes(settings.checkpoint), settings.checkpoint, embedding, encoder)
-    try:
-        embed_gallery(embedding, network)
-    except Incomplete as error:
-        raise Failure(str(error)) from None
+    embed_gallery(embedding, network)
 
 
 if __name__ == "__main__":

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from jobs.cli import Failure, run
+from jobs.cli import run
 from pipeline import shard_records, storage
-from pipeline.packing import PackingSettings, TooManyRejected, pack
+from pipeline.packing import PackingSettings, pack
 from pipeline.progress import console
-from pipeline.records import InputError
+from pipeline.records import InputError, Unfinished
 from pipeline.shards import read_manifest
 from pipeline.sources import SOURCES
 from pipeline.sources.source import Source
@@ -53,13 +53,10 @@ def main(source: SourceChoice, packing: PackingSettings) -> None:
     Begin with `--source NAME`; `--source NAME --help` lists its flags. `--verify --out DIR` checks a finished set,
     `--export FILE --out DIR` writes its record table as .parquet or .geojson.
     """
-    try:
-        pack(source, packing)
-    except TooManyRejected as error:
-        raise Failure(str(error)) from None
+    pack(source, packing)
 
 
-def check(out: str, verify: bool) -> None:
+def check(out: str, verify: bool = False) -> None:
     """Check every tar, count and hash of a finished set of shards.
 
     Args:
@@ -70,7 +67,7 @@ def check(out: str, verify: bool) -> None:
     for sentence in wrong:
         console.print(sentence)
     if wrong:
-        raise Failure(
+        raise Unfinished(
             f"{out} is damaged in {len(wrong)} places; delete the tars that are named and run the command that packed "
             "them again: it makes only what is missing"
         )

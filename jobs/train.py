@@ -17,7 +17,7 @@ from ray.util.queue import Queue
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from jobs.cli import Failure, run
+from jobs.cli import run
 from jobs.config_table import show_config
 from jobs.recipes import RECIPES, Recipe
 from jobs.run_folder import CHECKPOINT, Conduct, Run, find_checkpoint
@@ -27,7 +27,7 @@ from model.pvda import FeatureEncoder
 from model.weights import load_backbone, read_state_dict
 from pipeline import cluster, storage
 from pipeline.progress import Meter, console, progress
-from pipeline.records import InputError
+from pipeline.records import InputError, Unfinished
 
 if TYPE_CHECKING:
     RecipeChoice = Recipe
@@ -176,7 +176,7 @@ def ray_worker(config: dict[str, Any]) -> None:
         place = replace(place, distribute=distribute, share=share, gather=gather)
     try:
         train_worker(config["run"], place, told.put if rank == 0 else lambda facts: None)
-    except (Failure, InputError, CheckpointError) as error:
+    except (Unfinished, InputError, CheckpointError) as error:
         told.put({"refused": error})
         raise
 

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from jobs.cli import Failure
 from jobs.probes import look
 from jobs.run_folder import CHECKPOINT, Keeper, Run, find_checkpoint
 from jobs.tally import DAMAGED, NotFinite, Tally
@@ -23,6 +22,7 @@ from model.training import Training
 from model.weights import load_backbone, read_state_dict
 from pipeline import storage
 from pipeline.ahead import ready
+from pipeline.records import Unfinished
 from pipeline.stream import Batch, Reading, TrainingStream
 
 SECONDS_BETWEEN_REPORTS = 1.0
@@ -53,7 +53,7 @@ class Place:
 def train_worker(run: Run, place: Place, report: Report) -> None:
     """Train to the end of the recipe's schedule, from the run's checkpoint where there is one.
 
-    Raises Failure when training diverges; the last checkpoint is then one from before.
+    Raises Unfinished when training diverges; the last checkpoint is then one from before.
     """
     worker, epochs = Worker(run, place, report), run.recipe.schedule.epochs
     with ExitStack() as stack:
@@ -134,18 +134,18 @@ class Worker:
         self.tally = Tally()
 
     def checkpoint(self) -> Checkpoint:
-        """All that going on from here needs. Raises Failure where it would hold the ruins of a diverged run."""
+        """All that going on from here needs. Raises Unfinished where it would hold the ruins of a diverged run."""
         self.means()
         made = checkpoint(self.run, self.training, self.stream, self.history)
         return replace(made, step=self.tally.steps, running=self.tally.running())
 
     def means(self) -> dict[str, float]:
-        """Means of the epoch's measures so far; raises Failure where one is not finite."""
+        """Means of the epoch's measures so far; raises Unfinished where one is not finite."""
         try:
             return self.tally.means()
         except NotFinite as error:
             last = storage.join(self.run.out, CHECKPOINT)
-            raise Failure(
+            raise Unfinished(
                 f"training diverged in epoch {len(self.history) + 1}, by step {self.tally.steps} of {self.stream.steps}: "
                 f"{error}, expected a finite number; {last}, where there is one, is from before; train anew into another --out "
                 "with lower learning rates or --precision float32"

@@ -19,7 +19,7 @@ from pipeline.feature_parts import REJECTED, PartHeader, list_rejected, part_nam
 from pipeline.foreign import open_manifest
 from pipeline.placement import Node, Placement, place
 from pipeline.progress import console, progress
-from pipeline.records import InputError, Split, View
+from pipeline.records import InputError, Split, Unfinished, View
 from pipeline.shard_embedder import (
     IN_FLIGHT,
     Assignment,
@@ -73,7 +73,7 @@ class EmbeddingSettings:
             raise InputError(f"--gpus-per-worker is {self.gpus_per_worker}, expected 0 or more")
 
 
-class Incomplete(RuntimeError):
+class Incomplete(Unfinished):
     """Embedding has done what it could, and some shards could not be done. One sentence, with their names."""
 
 

@@ -16,7 +16,7 @@ from pipeline import cluster, rejects, storage
 from pipeline.duplicates import COLUMNS, find_duplicates
 from pipeline.extension import new_records, next_numbers
 from pipeline.progress import console, progress
-from pipeline.records import ImageRecord, InputError, Rejection, Split
+from pipeline.records import ImageRecord, InputError, Rejection, Split, Unfinished
 from pipeline.shard_plan import ShardPlan, ShardSize, plan_shards
 from pipeline.shard_records import FOLDER, Packed, read_packed, read_part
 from pipeline.shard_writing import UNREADABLE, Check, write_shard
@@ -57,7 +57,7 @@ class PackingSettings:
             raise InputError(f"--workers is {self.workers}, expected 0 (this process) or more")
 
 
-class TooManyRejected(RuntimeError):
+class TooManyRejected(Unfinished):
     """More images were refused than `max_bad_fraction` allows."""
 
 

@@ -11,6 +11,11 @@ class InputError(Exception):
     to do. Jobs print it alone and exit with 2."""
 
 
+class Unfinished(Exception):
+    """Work that could not be done whole; what is done stays. The message is one sentence for a person. Jobs print it alone
+    and exit with 1."""
+
+
 class Split(StrEnum):
     """Which part of a data set an image belongs to. The official test set is all of query and gallery."""
 

@@ -22,11 +22,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from jobs import make_shards
-from jobs.cli import Failure
 from pipeline import packing, shard_records, storage
 from pipeline.duplicates import find_duplicates
 from pipeline.packing import PackingSettings, TooManyRejected, pack
-from pipeline.records import GeoTag, ImageRecord, InputError, Rejection, Split, View, make_key
+from pipeline.records import GeoTag, ImageRecord, InputError, Rejection, Split, Unfinished, View, make_key
 from pipeline.samples import read_shard
 from pipeline.shard_plan import ShardPlan, ShardSize, plan_shards
 from pipeline.shard_records import Packed, read_part
@@ -404,7 +403,7 @@ def test_the_job_checks_and_exports_a_finished_set(
     assert f"all {len(manifest.shards)} shards are what was packed" in told
     assert "0 images, 15 without a place left out" in told
     (out / f"{manifest.shards[0].name}.tar").unlink()
-    with pytest.raises(Failure, match="is damaged in 1 places; delete the tars that are named"):
+    with pytest.raises(Unfinished, match="is damaged in 1 places; delete the tars that are named"):
         make_shards.check(str(out), verify=True)
 
 

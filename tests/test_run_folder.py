@@ -17,7 +17,6 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from jobs.cli import Failure
 from jobs.recipes import Recipe, smoke
 from jobs.run_folder import Checkpoints, Conduct, Run, find_checkpoint, older_names
 from jobs.tally import NotFinite, Tally
@@ -25,7 +24,7 @@ from jobs.train import Settings, train
 from model.checkpoint import Checkpoint, CheckpointError, loads
 from model.training import Training
 from pipeline import storage
-from pipeline.records import InputError
+from pipeline.records import InputError, Unfinished
 
 ROOT = Path(__file__).parent.parent
 TIMES = {"seconds", "images_per_second"}
@@ -229,7 +228,7 @@ def test_a_run_that_diverges_stops_with_one_sentence_and_keeps_the_last_good_che
     steps = count()
     monkeypatch.setattr(Training, "step", poisoned)
     with pytest.raises(
-        Failure, match=r"diverged in epoch 3, by step 1 of 3: location_loss\S* is nan, expected a finite"
+        Unfinished, match=r"diverged in epoch 3, by step 1 of 3: location_loss\S* is nan, expected a finite"
     ):
         train(settings(tiny_shards, tmp_path))
     held = loads((tmp_path / "last.pt").read_bytes())

@@ -8,13 +8,12 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from jobs.cli import Failure
 from jobs.recipes import Recipe, paper, smoke
 from jobs.run_folder import Run, read_checkpoint
 from jobs.train import Settings, known_recipe, train
 from jobs.training_loop import Place, train_worker, untrained
 from model.checkpoint import CheckpointError, build_encoder, dumps, loads
-from pipeline.records import InputError
+from pipeline.records import InputError, Unfinished
 from pipeline.samples import read_shard
 from pipeline.transforms import DecodeError, Pixels, decode
 
@@ -140,7 +139,7 @@ def test_what_a_ray_worker_refuses_comes_back_as_it_was_said_and_is_not_tried_ag
     tiny_shards: str, tmp_path: Path, ray_cluster: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
     rates = replace(tiny(1).optimisation, backbone_rate=1e30, head_rate=1e30, classifier_rate=1e30)
-    with pytest.raises(Failure, match="training diverged in epoch 1"):
+    with pytest.raises(Unfinished, match="training diverged in epoch 1"):
         train(settings(tiny_shards, tmp_path, replace(tiny(1), optimisation=rates), workers=1, checkpoint_minutes=60.0))
     assert "lost a worker" not in capfd.readouterr().err
     assert not (tmp_path / "last.pt").exists()
