@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 from pipeline.records import ImageRecord, Rejection, Split, View
 
@@ -27,8 +27,8 @@ class ShardPlan:
 
         `said`: what of the settings matters to it. A file that was mended has another size, as a rule.
         """
-        told = [said, self.name, [asdict(record) for record in self.records]]
-        return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+        told = [said, self.name, self.records]
+        return hashlib.sha256(json.dumps(told, sort_keys=True, default=vars).encode()).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,8 +23,9 @@ from pipeline.transforms import DecodeError, decode
 
 Check = Literal["quick", "full"]
 "How an image is judged: by its headers and its end, or by decoding it."
-READERS, READ_AHEAD = 4, 16
-"Threads that read and judge images ahead of the tar, and how many images they may be ahead."
+READERS, REMOTE_READERS, READ_AHEAD = 1, 16, 64
+"""Threads that read and judge images ahead of the tar, from a disk of this machine (more only get in each other's way) and over
+a network, and how many images they may be ahead."""
 UNREADABLE = "unreadable file"
 
 
@@ -76,7 +77,8 @@ def write_shard(
     rejected, rows = [], []
     with storage.atomic(storage.join(out, f"{plan.name}.tar")) as stream:
         tar = TarStream(stream)
-        found = ahead(prepare, plan.records, READERS, READ_AHEAD)
+        near = not plan.records or storage.is_local(plan.records[0].path)
+        found = ahead(prepare, plan.records, READERS if near else REMOTE_READERS, READ_AHEAD)
         for record, member in zip(plan.records, found, strict=True):
             if isinstance(member, Rejection):
                 rejected.append(member)
