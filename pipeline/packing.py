@@ -83,7 +83,7 @@ def pack(source: Source, settings: PackingSettings) -> Manifest:
     if before is not None and not settings.extend:
         console.print(f"{settings.out} is complete: {len(before.shards)} shards; nothing to do")
         return before
-    haul = gather(source, settings.root)
+    haul = gather(source, storage.absolute(settings.root))  # workers may stand in another folder
     if before is not None:
         haul.records, refused, haul.known = new_records(haul.records, source, out, before)
         haul.rejected += refused

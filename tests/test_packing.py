@@ -296,6 +296,14 @@ def test_imagery_comes_from_any_storage(tmp_path: Path) -> None:
     )
 
 
+def test_a_relative_root_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    imagery(tmp_path / "root")
+    monkeypatch.chdir(tmp_path)
+    manifest = pack(SOURCE, said("root", "out"))
+    paths = read_part(str(tmp_path / "out"), manifest.shards[0].name, ["path"])["path"].to_pylist()
+    assert all(path.startswith(f"{tmp_path}/root/") for path in paths)
+
+
 def test_a_file_name_that_is_no_text_is_refused(tmp_path: Path) -> None:
     root = imagery(tmp_path / "root")
     os.link(root / "train/drone/0000/image-00.jpeg", os.fsencode(root) + b"/train/drone/0000/caf\xe9.jpeg")
