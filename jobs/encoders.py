@@ -6,6 +6,7 @@ by their place in the shards alone, so a run that is continued has the same ones
 
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from typing import Literal
 
 import numpy as np
@@ -16,11 +17,12 @@ from model.checkpoint import build_encoder, fingerprint, loads
 from model.fast import make_fast
 from model.inference import InEffect, Precision, effective_precision, with_precision
 from model.int8 import PrecisionError, calibration_digest, require_int8
-from pipeline.embed import EmbeddingSettings, Network, wanted_shards
+from pipeline.embed import EmbeddingSettings, Network
 from pipeline.features import Floats
 from pipeline.foreign import open_manifest
 from pipeline.records import InputError
 from pipeline.samples import read_shard
+from pipeline.shards import Manifest
 from pipeline.stream import decoded, stack
 from pipeline.transforms import DecodeError, Resizer, preprocessing
 
@@ -103,7 +105,10 @@ def network_of(
             require_int8(device)
         except PrecisionError as error:
             raise InputError(str(error)) from None
-    some_B3HW = some_images(embedding, size, settings.resizer, PROBES + (CALIBRATING if precision == "int8" else 0))
+    # Once: of shards that others made it is a pass over all tars.
+    manifest = open_manifest(embedding.shards, embedding.split, embedding.view)
+    count = PROBES + (CALIBRATING if precision == "int8" else 0)
+    some_B3HW = some_images(embedding.shards, manifest, size, settings.resizer, count)
     calibration_B3HW = some_B3HW[PROBES:] if precision == "int8" else None
     digest = None if calibration_B3HW is None else calibration_digest(torch.from_numpy(calibration_B3HW))
     said = with_precision(f"{preprocessing(settings.resizer)}, mirror {settings.mirror}", precision, digest)
@@ -112,7 +117,7 @@ def network_of(
         settings=settings,
         precision=precision,
         batch_size=embedding.batch_size,
-        images=sum(shard.samples for shard in wanted_shards(embedding)) // (embedding.workers or 1),
+        images=sum(shard.samples for shard in manifest.of(embedding.split, embedding.view)) // (embedding.workers or 1),
         probe_B3HW=some_B3HW[:PROBES],
         calibration_B3HW=calibration_B3HW,
     )
@@ -124,24 +129,23 @@ def network_of(
     )
 
 
-def some_images(embedding: EmbeddingSettings, size: int, resizer: Resizer, count: int) -> Bytes:
+def some_images(shards: str, manifest: Manifest, size: int, resizer: Resizer, count: int) -> Bytes:
     """The first images of a set, from each split and view alike, as bytes (at most `count`, 3, size, size).
 
     Of the whole set, whatever of it is to be embedded: queries and gallery may be embedded one after the other into one
     table. Within a shard images stand in the order of their keys' hashes: its first ones are a fair sample. Raises InputError
     where none of them can be decoded.
     """
-    every = open_manifest(embedding.shards, embedding.split, embedding.view).shards
-    first = {(shard.split, shard.view): shard for shard in reversed(every) if shard.samples}
+    first = {(shard.split, shard.view): shard for shard in reversed(manifest.shards) if shard.samples}
     found = []
     for shard in first.values():
-        samples = read_shard(embedding.shards, shard.name, shard.split, shard.view)
+        samples = read_shard(shards, shard.name, shard.split, shard.view)
         images = (image for _, image in decoded(samples, size, 1, 4, resizer) if not isinstance(image, DecodeError))
-        found.append([image for image, _ in zip(images, range(-(-count // len(first))), strict=False)])
+        found.append(list(islice(images, -(-count // len(first)))))
     mixed = [group[place] for place in range(count) for group in found if place < len(group)][:count]
     if not mixed:
         raise InputError(
-            f"none of the first images of {embedding.shards} can be decoded, expected some to check the encoder by; see "
+            f"none of the first images of {shards} can be decoded, expected some to check the encoder by; see "
             "make_shards.py --verify, and pack again"
         )
     return stack(mixed)

@@ -13,7 +13,7 @@ from typing import Any
 
 import ray
 
-from pipeline import cluster, storage
+from pipeline import cluster, rejects, storage
 from pipeline.crew import CannotWork, Crew, NobodyCame, SetAside, Terms
 from pipeline.feature_parts import REJECTED, PartHeader, list_rejected, part_names, read_header, read_headers
 from pipeline.foreign import open_manifest
@@ -95,17 +95,19 @@ def embed_gallery(settings: EmbeddingSettings, network: Network) -> int:
         embedded, lost = run(settings, crew, missing, placement)
     storage.sweep(settings.out, [f"{shard.name}.parquet" for shard in wanted])
     rejections = [
-        (header.name.removesuffix(".parquet"), one.path, one.reason, one.found)
+        (header.name.removesuffix(".parquet"), one)
         for header in read_headers(settings.out)
         for one in header.footer.rejected
     ]
     listed = list_rejected(
-        settings.out, [*rejections, *((name, None, aside.reason, aside.found) for name, aside in lost.items())]
+        settings.out,
+        [
+            *((name, one.path, one.reason, one.found) for name, one in rejections),
+            *((name, None, aside.reason, aside.found) for name, aside in lost.items()),
+        ],
     )
     if listed and rejections:
-        reasons = ", ".join(
-            f"{reason} ({count})" for reason, count in Counter(row[2] for row in rejections).most_common(3)
-        )
+        reasons = rejects.commonest(one for _, one in rejections)
         told = f"{len(rejections)} images could not be decoded: {reasons}; see {storage.join(settings.out, REJECTED)}"
         console.print(told, style="yellow")
     if lost:

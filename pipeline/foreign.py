@@ -3,7 +3,6 @@
 In: a folder of tars in webdataset's layout without a manifest.json. Out: what read_manifest and a JSON of ours would say.
 """
 
-import hashlib
 import re
 from collections.abc import Iterator, Mapping
 from typing import IO, Any, cast
@@ -12,7 +11,7 @@ from pipeline import storage
 from pipeline.progress import console, progress
 from pipeline.records import InputError, Split, View, make_key
 from pipeline.shards import MANIFEST, Manifest, Shard, read_manifest
-from pipeline.tars import IMAGES, read_members
+from pipeline.tars import IMAGES, HashedStream, read_members
 
 LOCATIONS = ("location", "label", "class", "class_name", "class_id", "place", "place_id", "id")
 "Fields of a sample's JSON that may name what the image shows, the surest first."
@@ -54,7 +53,7 @@ def describe(shards: str, tars: list[str], split: Split, view: View) -> Manifest
                 continue
             path, samples = storage.join(shards, f"{name}.tar"), 0
             with storage.open_read(path) as stream:
-                hashed = _Hashed(stream)
+                hashed = HashedStream(stream)
                 for key, _ in read_members(cast(IO[bytes], hashed), path, IMAGES):
                     samples += 1
                     if key in seen:
@@ -99,21 +98,3 @@ def _numbers(said: Mapping[str, Any], names: tuple[str, ...]) -> Iterator[float]
     for name in names:
         if isinstance(value := said.get(name), int | float) and not isinstance(value, bool):
             yield float(value)
-
-
-class _Hashed:
-    """A stream that counts and hashes what is read through it."""
-
-    def __init__(self, stream: IO[bytes]) -> None:
-        self._stream, self.digest, self.bytes = stream, hashlib.sha256(), 0
-
-    def read(self, size: int = -1) -> bytes:
-        data = self._stream.read(size)
-        self.digest.update(data)
-        self.bytes += len(data)
-        return data
-
-    def drain(self) -> None:
-        """Read what stands behind the tar's end."""
-        while self.read(1 << 20):
-            pass

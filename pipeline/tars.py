@@ -3,6 +3,7 @@
 In: a tar as a stream. Out: per sample its key and the members behind it, by ending. Broken and hostile tars are refused.
 """
 
+import hashlib
 import tarfile
 from collections.abc import Iterator
 from typing import IO, Self
@@ -78,3 +79,21 @@ class _Header(tarfile.TarInfo):
             return super().frombuf(buf, encoding, errors)
         except tarfile.HeaderError as error:
             raise tarfile.ReadError(str(error)) from None
+
+
+class HashedStream:
+    """A stream that counts and hashes what is read through it."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._stream, self.digest, self.bytes = stream, hashlib.sha256(), 0
+
+    def read(self, size: int = -1) -> bytes:
+        data = self._stream.read(size)
+        self.digest.update(data)
+        self.bytes += len(data)
+        return data
+
+    def drain(self) -> None:
+        """Read what stands behind the tar's end."""
+        while self.read(1 << 20):
+            pass

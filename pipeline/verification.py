@@ -14,7 +14,7 @@ from pipeline.progress import progress
 from pipeline.records import InputError
 from pipeline.shard_records import read_part
 from pipeline.shards import Shard, read_manifest
-from pipeline.tars import IMAGES, SAID, read_members
+from pipeline.tars import IMAGES, SAID, HashedStream, read_members
 
 
 def verify(shards: str) -> tuple[int, list[str]]:
@@ -42,7 +42,7 @@ def check_shard(root: str, shard: Shard) -> list[str]:
     wrong: list[str] = []
     keys: list[tuple[str, str]] = []
     with storage.open_read(path) as stream:
-        hashed = _Hashed(stream)
+        hashed = HashedStream(stream)
         try:
             for key, members in read_members(cast(IO[bytes], hashed), path, IMAGES + SAID):
                 said = json.loads(members.pop("json"))["sha256"]
@@ -54,8 +54,7 @@ def check_shard(root: str, shard: Shard) -> list[str]:
             wrong.append(str(error))
         except (KeyError, TypeError, ValueError) as error:
             wrong.append(f"{path}: the sample behind {keys[-1][0] if keys else 'its beginning'} is damaged ({error})")
-        while hashed.read(1 << 20):
-            pass
+        hashed.drain()
     if hashed.bytes != shard.bytes:
         wrong.append(f"{path} has {hashed.bytes} bytes, the manifest says {shard.bytes}")
     elif hashed.digest.hexdigest() != shard.sha256:
@@ -69,16 +68,3 @@ def check_shard(root: str, shard: Shard) -> list[str]:
     except InputError as error:
         wrong.append(str(error))
     return wrong
-
-
-class _Hashed:
-    """A stream that counts and hashes what is read from it."""
-
-    def __init__(self, stream: IO[bytes]) -> None:
-        self._stream, self.digest, self.bytes = stream, hashlib.sha256(), 0
-
-    def read(self, size: int) -> bytes:
-        data = self._stream.read(size)
-        self.digest.update(data)
-        self.bytes += len(data)
-        return data

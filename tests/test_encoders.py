@@ -17,7 +17,9 @@ from model.inference import embed
 from model.int8 import PrecisionError
 from pipeline.embed import EmbeddingSettings, embed_gallery
 from pipeline.features import open_table
+from pipeline.foreign import open_manifest
 from pipeline.records import InputError, Split
+from pipeline.transforms import Resizer
 
 
 @pytest.fixture(scope="module")
@@ -29,12 +31,17 @@ def asked(shards: str, **changes: object) -> EmbeddingSettings:
     return EmbeddingSettings(**({"shards": shards, "out": "none"} | changes))  # type: ignore[arg-type]
 
 
+def images_of(embedding: EmbeddingSettings, size: int, resizer: Resizer, count: int) -> encoders.Bytes:
+    manifest = open_manifest(embedding.shards, embedding.split, embedding.view)
+    return some_images(embedding.shards, manifest, size, resizer, count)
+
+
 def test_the_images_to_check_by_are_the_same_each_time_and_of_every_split_and_view(tiny_shards: str) -> None:
-    first, again = (some_images(asked(tiny_shards), 32, "torch", 12) for _ in range(2))
+    first, again = (images_of(asked(tiny_shards), 32, "torch", 12) for _ in range(2))
     assert first.shape == (12, 3, 32, 32)
     assert np.array_equal(first, again)
     # Queries and gallery may be embedded one after the other: what calibrates int8 must not depend on it.
-    assert np.array_equal(first, some_images(asked(tiny_shards, split=Split.QUERY), 32, "torch", 12))
+    assert np.array_equal(first, images_of(asked(tiny_shards, split=Split.QUERY), 32, "torch", 12))
 
 
 def test_a_shard_without_one_image_that_can_be_decoded_is_said_beforehand(
@@ -42,12 +49,12 @@ def test_a_shard_without_one_image_that_can_be_decoded_is_said_beforehand(
 ) -> None:
     monkeypatch.setattr(encoders, "decoded", lambda samples, *given: iter([]))
     with pytest.raises(InputError, match="none of the first images of"):
-        some_images(asked(tiny_shards), 32, "torch", PROBES)
+        images_of(asked(tiny_shards), 32, "torch", PROBES)
 
 
 def test_the_fast_encoder_of_a_worker_computes_what_the_plain_one_does(tiny_shards: str, checkpoint: bytes) -> None:
     made = network_of(checkpoint, "it", asked(tiny_shards)).factory(1)
-    images = some_images(asked(tiny_shards), 64, "torch", 5)
+    images = images_of(asked(tiny_shards), 64, "torch", 5)
     plain = embed(build_encoder(loads(checkpoint)), torch.from_numpy(images)).numpy()
     assert np.abs(made(images) - plain).max() < 1e-4
     assert "folded encoder in float32: cosine with the plain one 1.0" in made.remarks[-1]  # type: ignore[attr-defined]

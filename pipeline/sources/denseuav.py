@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 from pipeline import storage
 from pipeline.records import GeoTag, ImageRecord, InputError, Rejection, View
-from pipeline.sources.folders import PlacedImage, SplitFolder, checked, images_by_location, split_folders
+from pipeline.sources.folders import PlacedImage, SplitFolder, checked, images_by_split
 from pipeline.sources.source import Source
 from pipeline.sources.tables import Unreadable, number, place, read_lines, unreadable_tag
 
@@ -42,19 +42,7 @@ class DenseUAV(Source):
     def _scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
         tags, rejected = read_geotags(root)
         yield from rejected
-        for folder in split_folders((View.DRONE, View.SATELLITE)):
-            for item in images_by_location(storage.join(root, folder.phase, folder.folder)):
-                if isinstance(item, Rejection):
-                    yield item
-                    continue
-                yield ImageRecord(
-                    path=item.path,
-                    split=folder.split,
-                    view=folder.view,
-                    location=item.location,
-                    geotag=_tag(item, folder, tags),
-                    bytes=item.bytes,
-                )
+        yield from images_by_split(root, (View.DRONE, View.SATELLITE), lambda folder, image: _tag(image, folder, tags))
 
 
 def _tag(image: PlacedImage, folder: SplitFolder, tags: dict[str, GeoTag]) -> GeoTag | None:

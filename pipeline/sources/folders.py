@@ -4,11 +4,11 @@ In: a folder on some storage. Out: its images with the location that each lies i
 elsewhere or is no image by its name.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 from pipeline import storage
-from pipeline.records import ImageRecord, InputError, Rejection, Split, View
+from pipeline.records import GeoTag, ImageRecord, InputError, Rejection, Split, View
 from pipeline.sources.source import is_image, not_an_image
 
 
@@ -56,6 +56,21 @@ def images_by_location(folder: str) -> Iterator[PlacedImage | Rejection]:
             yield not_an_image(whole)
         else:
             yield PlacedImage(path=whole, name=name, location=location, bytes=size)
+
+
+def images_by_split(
+    root: str, views: Iterable[View], tag: Callable[[SplitFolder, PlacedImage], GeoTag | None]
+) -> Iterator[ImageRecord | Rejection]:
+    """All images of a data set whose folders are named as University-1652's, with the geotag that `tag` knows of each."""
+    for folder in split_folders(views):
+        for item in images_by_location(storage.join(root, folder.phase, folder.folder)):
+            if isinstance(item, Rejection):
+                yield item
+                continue
+            yield ImageRecord(
+                path=item.path, split=folder.split, view=folder.view, location=item.location,
+                geotag=tag(folder, item), bytes=item.bytes,
+            )  # fmt: skip
 
 
 def wrong_folder(path: str, found: str) -> Rejection:

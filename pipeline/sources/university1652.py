@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from pipeline import storage
 from pipeline.records import GeoTag, ImageRecord, Rejection, View
-from pipeline.sources.folders import checked, images_by_location, split_folders
+from pipeline.sources.folders import PlacedImage, SplitFolder, checked, images_by_split
 from pipeline.sources.kml import read_kmls
 from pipeline.sources.source import Source
 from pipeline.sources.tables import Unreadable, number, place, read_rows, unreadable_tag
@@ -41,20 +41,12 @@ class University1652(Source):
             places, rejected = read_kmls(self.kml)
             yield from rejected
             tags |= places
-        for place_of in split_folders([view for view in View if view in self.views]):
-            folder = f"{place_of.phase}/{place_of.folder}"
-            for item in images_by_location(storage.join(root, folder)):
-                if isinstance(item, Rejection):
-                    yield item
-                    continue
-                yield ImageRecord(
-                    path=item.path,
-                    split=place_of.split,
-                    view=place_of.view,
-                    location=item.location,
-                    geotag=tags.get(f"{folder}/{item.location}/{item.name}") or tags.get(item.location),
-                    bytes=item.bytes,
-                )
+
+        def tag(folder: SplitFolder, image: PlacedImage) -> GeoTag | None:
+            own = tags.get(f"{folder.phase}/{folder.folder}/{image.location}/{image.name}")
+            return own or tags.get(image.location)
+
+        yield from images_by_split(root, [view for view in View if view in self.views], tag)
 
 
 def read_geotags(root: str) -> tuple[dict[str, GeoTag], list[Rejection]]:
