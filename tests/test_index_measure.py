@@ -1,5 +1,7 @@
 """Recall as it is meant, and the least effort that reaches it."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from index_tables import clustered, write_gallery
