@@ -126,7 +126,7 @@ def make_plan(settings: IndexSettings, table: FeatureTable, rows_of_part: dict[s
     """The planner's answer for a table, or what the user asked for."""
     gallery = Gallery(
         rows=sum(rows_of_part.values()), dimension=table.dimension, budget=parse_bytes(settings.memory_budget),
-        target_recall=settings.target_recall, rows_readable=readable(table.path),
+        target_recall=settings.target_recall, rows_readable=readable(table.path), workers=settings.workers,
     )  # fmt: skip
     if settings.factory:
         return plan_factory(gallery, settings.factory, "table" if settings.refine else "none")
