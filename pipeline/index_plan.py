@@ -24,7 +24,7 @@ MASK_BYTES = 1.125
 "Of a row while a filter is looked at: a truth value and a bit. Names and positions are mapped from the disk."
 TRAINING_SHARE = 0.25
 "Of the memory, for the rows that an index is trained on."
-COPIED = 1.5
+COPIED = 1.75
 "FAISS's residuals and reduced copies of them, the rows themselves included."
 MOST_TRAINING_ROWS = 2_000_000
 ROWS_PER_LIST = 50  # that train a centroid: FAISS warns below 39 and uses no more than 256
