@@ -14,6 +14,7 @@ from typing import Any
 import faiss
 
 from pipeline import storage
+from pipeline.exclusive import one_at_a_time
 from pipeline.feature_rows import readable
 from pipeline.features import FeatureTable, open_table
 from pipeline.index import Index
@@ -79,6 +80,7 @@ def parse_bytes(text: str) -> int:
     return int(float(match[1]) * UNITS[unit])
 
 
+@one_at_a_time(lambda settings: settings.out)
 def build_index(settings: IndexSettings) -> dict[str, Any]:
     """Build the index of a table, or of one split or view of it; a finished one is left as it is. Returns its facts.
 
