@@ -58,6 +58,8 @@ class EvaluationSettings:
     "Ray tasks that rank, of one core each, each for some of the queries; 0: this process ranks, on all cores."
     views: bool = True
     "Whether to measure drone->satellite by the number of views a query is the mean of."
+    parts: bool = True
+    "Whether to measure what each part of the embedding finds alone, and all but it: four times the ranking of four parts."
     by: tuple[str, ...] = ()
     "Columns of the shards' records to break the measures down by, such as altitude_m or heading_deg; with --shards."
     exports: tuple[Export, ...] = ()
@@ -100,7 +102,7 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
     extras = report.read_extras(settings.title, settings.run, settings.beside)
     shown = {
         "title": settings.title, "shards": settings.shards, "extras": extras.sha256, "views": settings.views,
-        "by": list(settings.by), "exports": list(settings.exports), "answer_order": settings.answer_order,
+        "parts": settings.parts, "by": list(settings.by), "exports": list(settings.exports), "answer_order": settings.answer_order,
     }  # fmt: skip
     earlier = _earlier(settings.out)
     if earlier and earlier["ranked"] != ranked:
@@ -199,8 +201,8 @@ def _write_besides(
 ) -> None:
     write_besides(
         Besides(
-            out=settings.out, protocol=settings.protocol, workers=settings.workers, views=settings.views, by=settings.by,
-            exports=settings.exports, shards=settings.shards, answer_order=settings.answer_order,
+            out=settings.out, protocol=settings.protocol, workers=settings.workers, views=settings.views, parts=settings.parts,
+            by=settings.by, exports=settings.exports, shards=settings.shards, answer_order=settings.answer_order,
         ),
         queries, gallery, tasks, results,
     )  # fmt: skip
