@@ -60,10 +60,9 @@ def write_figures(findings: Findings, pictures: Pictures, folder: str, formats: 
         if choice.pairs.shown:
             makers[f"multi-query-{name}"] = partial(pairs_figure, choice, images)
     for name, make in makers.items():
-        with matplotlib.rc_context(STYLE):
-            figure = make()
-            for kind in formats:
-                storage.write_bytes(storage.join(folder, f"{name}.{kind}"), _saved(figure, kind))
+        for kind in formats:
+            with matplotlib.rc_context(STYLE):  # drawn anew for each format: drawing moves what the layout has placed
+                storage.write_bytes(storage.join(folder, f"{name}.{kind}"), _saved(make(), kind))
     return list(makers)
 
 

@@ -22,7 +22,7 @@ ANSWER_PX = 180
 QUALITY, EFFORT = 78, 2  # of WebP: two thirds of JPEG's bytes at a like look
 PANELS = 4  # hits and as many misses for each task
 ANSWERS = 5
-MOSAIC = 9  # images that stand for a merged query
+MOSAIC, MOSAIC_PX = 9, 96  # images that stand for a merged query, three a row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +128,7 @@ def make_panel(
     best = zip(row["top_keys"][:ANSWERS], row["top_locations"], row["top_scores"], strict=False)
     first, key = row["first_match_rank"], row["first_match_key"]
     apart = first is not None and first > ANSWERS
-    shown = [(key, ANSWER_PX) for key in merged] or [(row["query"], QUERY_PX)]
+    shown = [(key, MOSAIC_PX) for key in merged] or [(row["query"], QUERY_PX)]
     return Panel(
         key=row["query"], location=row["location"], pictures=tuple(album.get(*each) for each in shown),
         answers=tuple(answer(rank, *each) for rank, each in enumerate(best, 1)), first_match_rank=first,
