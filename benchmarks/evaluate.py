@@ -92,28 +92,35 @@ def write_tables(folder: str, query_rows: int, gallery_rows: int) -> None:
 
 
 class Interleaved:
-    """A gallery that multiplies each of its blocks with the queries right after whoever reads it has done with it.
+    """A gallery that keeps its last blocks, and multiplies each with each block of queries right after that was ranked.
 
     On a machine with other work, products measured minutes before or after the ranking say little; these share its minutes.
     """
 
     def __init__(self, queries: Side, gallery: Side) -> None:
-        self._gallery, self.products = gallery, 0.0
+        self._gallery, self.seconds = gallery, 0.0
         self._query_blocks = list(queries.blocks(Blocks().query_rows))
         self._room = np.empty((Blocks().query_rows, Blocks().gallery_rows), np.float32)
-        self._reading = 0
+        self._kept: dict[int, Floats] = {}
+        self._done = 0
         self.side = replace(gallery, blocks=self._blocks)
 
     def _blocks(self, rows: int) -> Iterator[Floats]:
-        self._reading += 1
-        counting = self._reading % 2 == 0  # the ranking reads twice; the first time it multiplies true matches alone
-        for gallery_BD in self._gallery.blocks(rows):
+        """The ranking reads twice: first for the true matches alone."""
+        for number, gallery_BD in enumerate(self._gallery.blocks(rows)):
+            self._kept[number] = gallery_BD
+            self._kept.pop(number - 3, None)  # the ranking reads a block ahead
             yield gallery_BD
-            if counting:
-                begin = time.perf_counter()
-                for query_QD in self._query_blocks:
-                    np.matmul(query_QD, gallery_BD.T, out=self._room[: len(query_QD), : len(gallery_BD)])
-                self.products += time.perf_counter() - begin
+
+    def advance(self, scores: int) -> None:
+        """The ranking has done a block of queries x gallery."""
+        number, part = divmod(self._done, len(self._query_blocks))
+        query_QD, gallery_BD = self._query_blocks[part], self._kept[number]
+        assert scores == len(query_QD) * len(gallery_BD)
+        begin = time.perf_counter()
+        np.matmul(query_QD, gallery_BD.T, out=self._room[: len(query_QD), : len(gallery_BD)])
+        self.seconds += time.perf_counter() - begin
+        self._done += 1
 
 
 def large(scale: float) -> None:
@@ -130,12 +137,12 @@ def large(scale: float) -> None:
         beside = Interleaved(queries, gallery)
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         begin = time.perf_counter()
-        rank(queries, beside.side)
-        total = time.perf_counter() - begin - beside.products
+        rank(queries, beside.side, advance=beside.advance)
+        total = time.perf_counter() - begin - beside.seconds
         grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 2**20
         print(
-            f"streamed {query_rows} x {gallery_rows} x {DIMENSION}: {total:.1f} s, {total / beside.products:.2f} x the float32 "
-            f"products ({beside.products:.1f} s, block by block between the ranking), reading twice included; memory grew by "
+            f"streamed {query_rows} x {gallery_rows} x {DIMENSION}: {total:.1f} s, {total / beside.seconds:.2f} x the float32 "
+            f"products ({beside.seconds:.1f} s, block by block between the ranking), reading twice included; memory grew by "
             f"{grown:.2f} GiB",
             flush=True,
         )
