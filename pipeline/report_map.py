@@ -1,7 +1,7 @@
 """A map of errors: per-query rows with positions in, a picture's geometry, the farthest answers and their distances out.
 
-The map is equirectangular, true to scale at its middle latitude: right for places some hundred metres apart, and a plain
-world map for places all over the world, cut where the widest gap between their meridians lies.
+The map is equirectangular, true to scale at its middle latitude: right for places some hundred metres apart, whichever
+meridian they lie at, and a plain world map for places all over the world.
 """
 
 import math
@@ -153,6 +153,8 @@ class Sheet:
         gaps = np.diff(meridians, append=meridians[0] + 360)
         widest = int(np.argmax(gaps))
         west, wide = float(meridians[(widest + 1) % len(meridians)]), float(360 - gaps[widest])
+        if wide > 180:  # all over the world: as world maps are
+            west, wide = -180.0, 360.0
         shrink = math.cos(math.radians((south + north) / 2))
         tall_m, wide_m = ((north - south) * METRES_PER_DEGREE, wide * METRES_PER_DEGREE * shrink)
         scale = min((WIDTH - 2 * MARGIN) / max(wide_m, SMALLEST_M), (HEIGHT - 2 * MARGIN) / max(tall_m, SMALLEST_M))
@@ -198,4 +200,4 @@ class Sheet:
 
 
 def _degrees(value: float, letters: str) -> str:
-    return f"{abs(value):g}° {letters[0] if value >= 0 else letters[1]}"
+    return f"{abs(value):g}°" + (f" {letters[value < 0]}" if value else "")

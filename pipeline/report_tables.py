@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pipeline.report_charts import nice_ticks
+
 
 @dataclass(frozen=True, kw_only=True)
 class Line:
@@ -26,6 +28,18 @@ class Table:
     lines: tuple[Line, ...]
     overall: float
     "R@1 of the whole task, a hairline in every row."
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Round percentages between which the whiskers of all rows lie."""
+        ends = [100 * value for line in self.lines for value in (line.low, line.high)]
+        ticks = nice_ticks(min(*ends, 100 * self.overall), max(*ends, 100 * self.overall))
+        return ticks[0], ticks[-1]
+
+    def at(self, value: float) -> float:
+        """Where a fraction lies between the two, in percent."""
+        low, high = self.span
+        return 100 * (100 * value - low) / (high - low)
 
 
 def group_tables(groups: Sequence[Mapping[str, Any]], names: Mapping[str, str], r1: Mapping[str, float]) -> list[Table]:

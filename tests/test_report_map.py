@@ -67,8 +67,9 @@ def test_every_place_lies_on_the_sheet_wherever_on_earth(at: list[Position]) -> 
 
 def test_a_world_map_has_meridians_and_parallels() -> None:
     sheet = Sheet.around(np.array([(51.5, -0.1), (40.7, -74.0), (-33.9, 151.2)]))
-    assert {"0° N", "50° N"} <= {tick.label for tick in sheet.parallels()}
-    assert len(sheet.meridians()) > 1
+    assert {"0°", "50° N"} <= {tick.label for tick in sheet.parallels()}
+    assert [tick.label for tick in sheet.meridians()] == ["100° W", "0°", "100° E"]
+    assert sheet.x(-74.0) < sheet.x(-0.1) < sheet.x(151.2)
 
 
 def test_the_farthest_answers_are_named_one_for_each_place() -> None:

@@ -89,6 +89,7 @@ def test_tables_leave_out_a_group_that_is_the_whole_task() -> None:
     [table] = group_tables([*GROUPS, GROUPS[0] | {"by": "variant"}], {TASK: "name"}, {TASK: 0.4})
     assert (table.heading, table.overall) == ("altitude m", 0.4)
     assert [line.label for line in table.lines] == ["50 to 100", "100 to 150"]
+    assert (table.span, table.at(0.5)) == ((20.0, 80.0), 50.0)
     [parts] = part_tables([*PARTS, PARTS[0] | {"kept": "without"}], {TASK: "name"}, {TASK: 0.4})
     assert [line.label for line in parts.lines] == ["1 alone", "2 alone", "all but 1"]
 
