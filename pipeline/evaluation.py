@@ -68,7 +68,7 @@ class EvaluationSettings:
     views: bool = True
     "Whether to measure drone->satellite by the number of views a query is the mean of."
     parts: bool = True
-    "Whether to measure what each part of the embedding finds alone, and all but it: four times the ranking of four parts."
+    "Whether to measure what each part of the embedding finds alone, and all but it: for four parts, the time of four rankings."
     by: tuple[str, ...] = ()
     "Columns of the shards' records to break the measures down by, such as altitude_m or heading_deg; with --shards."
     exports: tuple[Export, ...] = ()

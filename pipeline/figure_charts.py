@@ -63,8 +63,8 @@ def views_figure(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def whiskers_figure(tasks: Sequence[TaskView], rows: Sequence[Row], label: Callable[[Row], str]) -> Figure:
-    """R@1 of each row with its 95 % interval, by task; dashed: the whole task."""
+def whiskers_figure(tasks: Sequence[TaskView], rows: Sequence[Row], of: str, label: Callable[[Row], str]) -> Figure:
+    """R@1 of each row with its 95 % interval, by task; dashed: the whole task. `of`: what the rows' labels are of."""
     of_task = [(task, [row for row in rows if row["task"] == task.row["task"]]) for task in tasks]
     shown = [(task, own) for task, own in of_task if len(own) > 1] or of_task[:1]
     figure, sheets = _sheet(len(shown), 0.5 + 0.17 * max(len(own) for _, own in shown))
@@ -74,13 +74,9 @@ def whiskers_figure(tasks: Sequence[TaskView], rows: Sequence[Row], label: Calla
         axes.errorbar(r1, at, xerr=[r1 - low, high - r1], fmt="o", color=BLUE, markersize=3, elinewidth=1)
         axes.axvline(100 * task.row["r1"], color=GREY, linestyle="--", linewidth=0.8)
         axes.set_yticks(at, [label(row) for row in own])
-        axes.set(title=task.name, xlabel="R@1 (%)", ylim=(-0.6, len(own) - 0.4))
+        axes.set(title=task.name, xlabel="R@1 (%)", ylabel=of, ylim=(-0.6, len(own) - 0.4))
         axes.grid(visible=False, axis="y")
     return figure
-
-
-def part_label(row: Row) -> str:
-    return f"part {row['part']} alone" if row["kept"] == "alone" else f"all but part {row['part']}"
 
 
 def group_label(row: Row) -> str:
@@ -109,7 +105,7 @@ def map_figure(drawn: ErrorMap) -> Figure:
     """The page's map of errors."""
     figure, [axes] = _sheet(1, COLUMN * report_map.HEIGHT / report_map.WIDTH)
     for x1, y1, x2, y2, _ in drawn.lines:
-        axes.plot([x1, x2], [y1, y2], color=RED, linewidth=0.4, alpha=0.5, zorder=1)
+        axes.plot([x1, x2], [y1, y2], color=RED, linewidth=0.4, alpha=drawn.opacity, zorder=1)
         axes.plot(x2, y2, "o", color=RED, markersize=1.2, zorder=1)
     for found, name, look in (
         (True, "found first by half or more", {"color": GREEN}),

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from pipeline import figure_charts, storage
 from pipeline.figure_panels import pairs_figure, panels_figure
+from pipeline.part_measures import part_label
 from pipeline.report_choice import choose
 from pipeline.report_inputs import Extras, Findings, Format, Pictures
 from pipeline.report_map import error_map
@@ -36,17 +37,18 @@ def write_figures(findings: Findings, pictures: Pictures, folder: str, formats: 
     """
     tasks = [task_view(row, findings.results_of(row), Extras(title="")) for row in findings.metrics]
     single = [task for task in tasks if not task.row["multi_query"]]
-    makers: dict[str, Callable[[], Figure]] = {
-        "recall": partial(figure_charts.recall_figure, tasks),
-        "scores": partial(figure_charts.scores_figure, single),
-    }
+    makers: dict[str, Callable[[], Figure]] = {"recall": partial(figure_charts.recall_figure, tasks)}
+    if single:
+        makers["scores"] = partial(figure_charts.scores_figure, single)
     if findings.views:
         makers["views"] = partial(figure_charts.views_figure, findings.views)
     if findings.parts:
-        makers["parts"] = partial(figure_charts.whiskers_figure, single, findings.parts, figure_charts.part_label)
+        makers["parts"] = partial(figure_charts.whiskers_figure, single, findings.parts, "part", part_label)
     for column in dict.fromkeys(row["by"] for row in findings.groups):
         rows = [row for row in findings.groups if row["by"] == column]
-        makers[f"groups-{column}"] = partial(figure_charts.whiskers_figure, single, rows, figure_charts.group_label)
+        makers[f"groups-{column}"] = partial(
+            figure_charts.whiskers_figure, single, rows, column.replace("_", " "), figure_charts.group_label
+        )
     for gap in findings.gaps:
         makers[f"view-gap-{gap['task'].replace('->', '-')}"] = partial(figure_charts.gap_figure, gap)
     for task in single:

@@ -3,7 +3,7 @@
 In: feature tables. Out: one row per part and way; none where the embedding has no parts.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from pipeline.breakdowns import measures_of
@@ -43,3 +43,8 @@ def measure_parts(
         named = {"task": task.name, "protocol": protocol, "parts": parts, "part": part + 1, "kept": kept}
         rows.append(named | measures_of(found.first_rank_Q, found.ap_Q, asked.locations))
     return rows
+
+
+def part_label(row: Mapping[str, Any]) -> str:
+    """What one of these rows is of, where "part" stands beside it."""
+    return f"{row['part']} alone" if row["kept"] == "alone" else f"all but {row['part']}"

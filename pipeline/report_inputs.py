@@ -11,6 +11,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from pipeline import storage
+from pipeline.evaluation_files import GAP, GROUPS, PARTS, VIEWS
 from pipeline.features import Floats
 from pipeline.records import InputError
 
@@ -22,7 +23,7 @@ Format = Literal["png", "pdf"]
 "Of the figures for a paper."
 Vectors = Callable[[Iterable[str]], dict[str, Floats]]
 "Embeddings (D,) by key; keys that are not known are absent."
-BESIDES = {"views": "views.json", "groups": "groups.json", "parts": "parts.json", "gaps": "view_gap.json"}
+BESIDES = {"views": VIEWS, "groups": GROUPS, "parts": PARTS, "gaps": GAP}
 
 
 def no_pictures(keys: Iterable[str]) -> dict[str, bytes]:

@@ -52,6 +52,11 @@ class ErrorMap:
     worst: tuple[Row, ...]
     "Of different places the queries whose first answer lies farthest off."
 
+    @property
+    def opacity(self) -> float:
+        """Of the lines: many are drawn fainter."""
+        return min(0.65, 4 / math.sqrt(max(len(self.lines), 1)))
+
 
 def located(rows: Sequence[Row]) -> list[Row]:
     """The queries whose place and whose best answer have positions."""
@@ -84,10 +89,11 @@ def error_map(title: str, rows: Sequence[Row]) -> ErrorMap | None:
         place, answer = line[:2]
         said = f"{place} taken for {answer}, {metres(far[place, answer])} off, {wrong[line]} of {len(of_place[place])}"
         lines.append((*at[place], *end, said))
-    places = [
-        Place(x=at[name][0], y=at[name][1], found=2 * hits >= len(each), text=f"{name}: {hits} of {len(each)} queries right")
-        for name, each in of_place.items() for hits in [sum(row["first_match_rank"] == 1 for row in each)]
-    ]  # fmt: skip
+    places = []
+    for name, each in of_place.items():
+        hits = sum(row["first_match_rank"] == 1 for row in each)
+        said = f"{name}: {hits} of {len(each)} queries right"
+        places.append(Place(x=at[name][0], y=at[name][1], found=2 * hits >= len(each), text=said))
     misses = sum(wrong.values())
     cut = f"; of {len(wrong):,} lines the {MOST_LINES} longest" if len(wrong) > MOST_LINES else ""
     return ErrorMap(

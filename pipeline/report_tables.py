@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pipeline.part_measures import part_label
 from pipeline.report_charts import nice_ticks
 
 
@@ -58,8 +59,7 @@ def part_tables(parts: Sequence[Mapping[str, Any]], names: Mapping[str, str], r1
     """One table for each task of parts.json."""
     found: dict[str, list[Line]] = {}
     for row in parts:
-        label = f"{row['part']} alone" if row["kept"] == "alone" else f"all but {row['part']}"
-        found.setdefault(row["task"], []).append(_line(label, row))
+        found.setdefault(row["task"], []).append(_line(part_label(row), row))
     return [
         Table(title=names[task], heading="part", lines=tuple(lines), overall=r1[task]) for task, lines in found.items()
     ]

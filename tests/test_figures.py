@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from test_report import TOWN, jpeg
@@ -24,8 +25,7 @@ AGAIN = "from test_figures import write; import sys; write(sys.argv[1])"
 def write(folder: str, formats: tuple[Format, ...] = ("pdf",)) -> list[str]:
     placed = {name: query("a", A, "b", B)[name] for name in ("lat", "lon", "answer_lat", "answer_lon", "distance_m")}
     found = full([row | placed for row in TOWN], [merged(row["location"], 1) for row in TOWN])
-    object.__setattr__(found, "views", VIEWS)
-    return write_figures(found, lambda keys: dict.fromkeys(keys, jpeg("olive")), folder, formats)
+    return write_figures(replace(found, views=VIEWS), lambda keys: dict.fromkeys(keys, jpeg("olive")), folder, formats)
 
 
 def test_every_figure_is_written_in_both_formats_and_another_process_writes_the_same_bytes(tmp_path: Path) -> None:
@@ -49,3 +49,9 @@ def test_without_pictures_there_are_no_figures_of_pictures(tmp_path: Path) -> No
     found = full(TOWN, [merged(row["location"], 1) for row in TOWN])
     names = write_figures(found, lambda keys: {}, str(tmp_path), ("png",))
     assert names == ["recall", "scores", "parts", "groups-altitude_m", "view-gap-drone-satellite"]
+
+
+def test_merged_queries_alone_have_a_recall_curve(tmp_path: Path) -> None:
+    found = full(TOWN, [merged(row["location"], 1) for row in TOWN])
+    alone = replace(found, metrics=found.metrics[1:], groups=(), parts=(), gaps=())
+    assert write_figures(alone, lambda keys: {}, str(tmp_path), ("pdf",)) == ["recall"]
