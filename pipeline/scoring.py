@@ -34,7 +34,9 @@ WRONG = 1 << ROW_BITS
 NO_KEY = np.iinfo(np.int64).min
 PAIR_ROWS = 128  # pairs scored at once: four megabytes of float64 at 2,048 dimensions stay near the core
 PAIRS_UP_TO = 3  # measured: below so many entries a query, scoring pairs beats going query by query
-FEW = 1 / 16  # of a block's entries: up to so many, those that matter are looked at by themselves
+FEW = (
+    1 / 12
+)  # of a block's entries: up to so many, fewer where each has many matches to be held against, are taken apart
 WHOLE_FROM = 1 / 32  # measured: from this share of doubts, a float64 product of everything beats row by row
 FEW_BANDS = (
     12  # measured: to so many matches with rows in doubt, looking for these rows beats sorting all of them again
@@ -123,14 +125,13 @@ def settle(
     `exact_entries` of this block.
 
     Most entries are neither in doubt nor ahead of a match, so those that reach a query's lowest bound are picked first, in one
-    look at the block. Where they are many, or the matches of a query are, it costs less to look at all entries again.
+    look at the block. Where they are many, it costs less to look at all entries again.
     """
-    if _most(owner_P) < SORT_FROM:
-        lowest_Q = floor_Q.copy()
-        np.minimum.at(lowest_Q, owner_P, bounds_P[0])
-        reach_QB = scores_QB >= lowest_Q[:, None]
-        if np.count_nonzero(reach_QB) <= FEW * reach_QB.size:
-            return _settle_few(scores_QB, np.flatnonzero(reach_QB), owner_P, score_P, bounds_P, floor_Q, exact)
+    lowest_Q = floor_Q.copy()
+    np.minimum.at(lowest_Q, owner_P, bounds_P[0])
+    reach_QB = scores_QB >= lowest_Q[:, None]
+    if np.count_nonzero(reach_QB) * (1 + _most(owner_P) / 32) <= FEW * reach_QB.size:
+        return _settle_few(scores_QB, np.flatnonzero(reach_QB), owner_P, score_P, bounds_P, floor_Q, exact)
     flat_N = doubtful(scores_QB, owner_P, *bounds_P, floor_Q)
     exact_N = exact(flat_N)
     scores_QB.reshape(-1)[flat_N] = exact_N
