@@ -94,7 +94,7 @@ def test_the_road_by_command_lines_and_again(
         ("drone->satellite", False), ("satellite->drone", False), ("drone->satellite", True),
     ]  # fmt: skip
     assert (metrics[0]["queries"], metrics[0]["gallery"]) == (9, 5)
-    assert "data:image/jpeg" in (out / "report.html").read_text()
+    assert "data:image/webp" in (out / "report.html").read_text()
     pair = ("--queries", table, "--gallery", table, "--query-view", "drone", "--gallery-view", "satellite")
     done = call("evaluate", *pair, "--out", tmp_path / "pair", "--multi-query", "--protocol", "queried-only")
     assert done.returncode == 0, done.stderr
