@@ -11,7 +11,7 @@ from typing import Any
 
 import jinja2
 
-from pipeline import report_charts, report_map, report_scatter
+from pipeline import map_sheet, report_charts, report_scatter
 from pipeline.chosen_rows import evenly
 from pipeline.features import Floats
 from pipeline.report_choice import Choice, choose
@@ -45,7 +45,7 @@ def render(
     environment.filters |= {
         "percent": lambda value: f"{100 * value:.2f}",
         "points": lambda value: f"{100 * value:+.2f}",
-        "metres": report_map.metres,
+        "metres": map_sheet.metres,
         "opened": lambda items: [(i + 1, items[i]) for i in evenly(len(items), OPENED)],
         "folded": lambda items: [(i + 1, items[i]) for i in range(len(items)) if i not in evenly(len(items), OPENED)],
     }
@@ -74,11 +74,11 @@ def render(
         evidence=[chart for chart in evidence if chart],
         groups=group_tables(findings.groups, names, r1),
         parts=part_tables(findings.parts, names, r1),
-        gaps=[scatter(gap) for gap in findings.gaps],
+        gaps=[scatter(gap, extras.beside) for gap in findings.gaps],
         maps=[each for each in maps if each],
         training=report_charts.training_charts(extras.training),
         sections=[_section(choice, album, known, parts.get(choice.task.row["task"], 1)) for choice in choices],
-        charts=report_charts, scatters=report_scatter, map_size=report_map,
+        charts=report_charts, scatters=report_scatter, map_size=map_sheet,
     )  # fmt: skip
 
 

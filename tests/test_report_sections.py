@@ -106,3 +106,7 @@ def test_the_scatter_keeps_distances_and_lies_within_its_frame() -> None:
     assert drawn.joins.startswith(f"M{first[0]} {first[1]}L")
     assert drawn.triangles.count("z") == 1
     assert drawn.figures[0][:2] == ("Cosine of true pairs", "0.750 (0.50 to 1.00)")
+    untrained = replace(findings(TOWN, name="untrained"), gaps=(GAP | {"distance": 0.5},))
+    assert scatter(GAP, untrained).figures[2][1:] == (
+        "0.125", "in units of a view's spread; 0 where there is no gap; untrained: 0.500",
+    )  # fmt: skip
