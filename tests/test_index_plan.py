@@ -84,7 +84,7 @@ def test_memory_is_what_it_comes_to() -> None:
 
 def test_a_tight_budget_leaves_the_lists_on_the_disk_or_takes_smaller_codes() -> None:
     gallery = Gallery(rows=10**7, dimension=2048, budget=4e9, target_recall=0.95)
-    assert (plan_index(gallery).factory, plan_index(gallery).refine) == ("IVF1024,PQ256x4fs", "table")
+    assert (plan_index(gallery).factory, plan_index(gallery).refine) == ("IVF2048,PQ256x4fs", "table")
     tight = plan_index(replace(gallery, budget=2e9))
     elsewhere = plan_index(replace(gallery, budget=2e9, rows_readable=False))
     assert (tight.factory, elsewhere.factory) == ("IVF1024,RaBitQ", "IVF1024,SQ8")
