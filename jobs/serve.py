@@ -1,0 +1,118 @@
+"""A checkpoint and its index -> answers over HTTP: `serve.py --checkpoint FILE --index INDEX [--host H] [--port P]`."""
+
+import asyncio
+import os
+import signal
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from aiohttp import web
+
+from jobs.cli import run
+from jobs.photo_encoder import PhotoEncoder
+from model.checkpoint import CheckpointError
+from pipeline import cluster, storage
+from pipeline.index import FACTS
+from pipeline.progress import console
+from pipeline.records import InputError
+from pipeline.service.answerer import Answerer, Status
+from pipeline.service.app import Service
+from pipeline.service.replicas import Crew, Replicas
+from pipeline.service.settings import ServiceSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(ServiceSettings):
+    """Which index answers, by which network, to whom."""
+
+    checkpoint: str
+    "The checkpoint that the index's gallery was embedded with."
+    index: str
+    "Folder or URI of the index; one that is built there later is taken over."
+    shards: str | None = None
+    "What the index was made of: needed only where it was embedded in int8."
+    replicas: int = 1
+    "Processes that each load network and index."
+    threads: int | None = None
+    "CPU cores of each; by default all cores of the cluster, shared among them."
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("replicas", "threads"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise InputError(f"--{name} is {value}, expected at least 1")
+
+
+def load(checkpoint: str, index: str, shards: str | None, threads: int) -> Answerer:
+    """What each replica calls. Raises InputError."""
+    import faiss
+    import torch
+
+    torch.set_num_threads(threads)
+    faiss.omp_set_num_threads(threads)
+
+    def encoder_for(facts: dict[str, Any]) -> PhotoEncoder:
+        try:
+            return PhotoEncoder(storage.read_bytes(checkpoint), checkpoint, facts, shards)
+        except CheckpointError as error:
+            raise InputError(str(error)) from None
+
+    return Answerer(index, encoder_for)
+
+
+def main(settings: Settings) -> None:
+    """Answer over HTTP where photos were taken, until Ctrl-C or SIGTERM."""
+    for name, path, hint in (
+        ("checkpoint", settings.checkpoint, "a last.pt of jobs/train.py"),
+        ("index", storage.join(settings.index, FACTS), "an index of jobs/build_index.py"),
+    ):
+        if not storage.exists(path):
+            raise InputError(f"no {name} at {path}; expected {hint}; check --{name}")
+    token = settings.token()
+    cluster.connect()
+    asyncio.run(serve(settings, token))
+
+
+async def serve(settings: Settings, token: str | None) -> None:
+    """Listen at once, so that whoever asks for its health hears that it is loading; answer once it has loaded."""
+    threads = settings.threads or max(1, cluster.cpus() // settings.replicas)
+    shards = None if settings.shards is None else storage.absolute(settings.shards)
+    replicas = Replicas(
+        f"pvda-{os.getpid()}",
+        Crew(replicas=settings.replicas, cpus=threads, gpus=1 if cluster.gpus() else 0),
+        partial(load, storage.absolute(settings.checkpoint), storage.absolute(settings.index), shards, threads),
+    )
+    service = Service(settings, replicas, token, abreast=settings.replicas)
+    runner = service.runner()
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    await runner.setup()
+    try:
+        site = web.TCPSite(runner, settings.host, settings.port)
+        try:
+            await site.start()
+        except OSError as error:
+            raise InputError(
+                f"cannot listen on {settings.host} port {settings.port}: {error.strerror}; choose another --port"
+            ) from None
+        console.print(f"http://{settings.host}:{site.port} listens; loading")
+        loading = asyncio.create_task(asyncio.to_thread(replicas.start))
+        stopping = asyncio.create_task(stop.wait())
+        await asyncio.wait([loading, stopping], return_when=asyncio.FIRST_COMPLETED)
+        if loading.done():
+            told(loading.result())
+            await stopping
+        console.print("stopping")
+    finally:
+        await runner.cleanup()
+        await asyncio.to_thread(replicas.stop)
+
+
+def told(status: Status) -> None:
+    console.print(f"ready: {status.rows} rows, {status.factory}, network {status.fingerprint[:12]}; Ctrl-C ends it")
+
+
+if __name__ == "__main__":
+    run(main)

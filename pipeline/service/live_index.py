@@ -1,0 +1,84 @@
+"""An index on disk that may be replaced while it is searched: the new one is taken over when it is whole, else refused.
+
+In: the path of an index. Out: the opened index, the one in use until another has proved itself. Who searches holds a reference,
+so nothing is taken from under a search.
+"""
+
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+from pipeline import storage
+from pipeline.index import FACTS, Index
+from pipeline.progress import console
+from pipeline.records import InputError
+
+LOOK_EVERY_S = 2.0
+"Between two looks at index.json."
+RETRY_S = 10.0
+"""After which a refused index is tried again though its index.json is the same: whoever copies a folder file by file may copy
+that one first."""
+
+
+class LiveIndex:
+    """`current` is the index in use; `refused` says why the newest one at the path is not it, or is None."""
+
+    def __init__(self, path: str) -> None:
+        """Raises InputError when there is no index at `path` that can be used."""
+        self._path = path
+        self._taken = self._seen = self._said()  # before it is opened: a change meanwhile is found by the next look
+        self.current = Index(path)
+        self.refused: str | None = None
+        self._refused_at = 0.0
+
+    def _said(self) -> bytes | None:
+        """What index.json holds; None where there is none to read."""
+        try:
+            return storage.read_bytes(storage.join(self._path, FACTS))
+        except OSError:
+            return None
+
+    def look(self) -> None:
+        """Take over what is new at the path. Whatever is wrong with it, the old index stays; nothing is raised."""
+        said = self._said()
+        if said == self._seen and (self.refused is None or time.monotonic() < self._refused_at + RETRY_S):
+            return
+        if said == self._taken:  # it is back as it was
+            self._seen, self.refused = said, None
+            return
+        try:
+            fresh = Index(self._path)
+            prove(fresh, self.current.facts)
+        except Exception as error:  # FAISS, Arrow, JSON and file systems each raise their own over broken files
+            self._refuse(said, error)
+            return
+        if self._said() != said:  # written once more meanwhile: what was opened may be half of each
+            return
+        self.current, self.refused = fresh, None
+        self._taken = self._seen = said
+        console.print(f"a new index at {self._path} is in use: {fresh.facts['rows']} rows")
+
+    def _refuse(self, said: bytes | None, error: Exception) -> None:
+        why = str(error).strip().split("\n")[0] or type(error).__name__
+        self._seen, self._refused_at = said, time.monotonic()
+        self.refused = f"the new index is refused and the old one goes on answering: {why}"
+
+    def follow(self, stop: threading.Event) -> None:
+        """Look every LOOK_EVERY_S seconds until `stop` is set: for a thread of its own."""
+        while not stop.wait(LOOK_EVERY_S):
+            self.look()
+
+
+def prove(fresh: Index, old: dict[str, Any]) -> None:
+    """Raises InputError where an index cannot stand in for one with the facts `old`, and whatever a trial search raises."""
+    made_by, expected = fresh.facts["fingerprint"], old["fingerprint"]
+    if made_by != expected:
+        raise InputError(
+            f"it was made by network {made_by[:12]}, the service's is {expected[:12]}, expected the same; start the service "
+            "again with the other network"
+        )
+    trial_1D = np.full((1, fresh.facts["dimension"]), fresh.facts["dimension"] ** -0.5, np.float32)
+    if not fresh.search(trial_1D, 1)[0]:
+        raise InputError("a trial search found nothing, expected a row; build the index again")

@@ -1,0 +1,141 @@
+"""Answerers as Ray Serve's replicas, and the handle that asks them. One that dies is replaced; its batch raises Gone.
+
+HTTP does not pass through Serve: its proxy takes in a request's whole body before anyone can object (docs/decisions.md).
+"""
+
+import asyncio
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import ray
+from ray import serve
+from ray.serve.exceptions import DeploymentUnavailableError
+
+from pipeline import cluster
+from pipeline.records import InputError
+from pipeline.service.answerer import Answerer, Outcome, Status
+from pipeline.service.batcher import Gone
+from pipeline.service.engine import NotReady
+from pipeline.service.question import Question
+
+STUCK_S = 120.0
+"A batch that takes longer will not end: its replica is replaced."
+CALLS = 16
+"That a replica takes at once: its batch, and whoever asks for its status meanwhile."
+
+
+class Replica:
+    """One process with the network and the index. Batches are computed one after the other, by one thread."""
+
+    def __init__(self, make: Callable[[], Answerer]) -> None:
+        self._thread = ThreadPoolExecutor(1)
+        self._began: float | None = None
+        self._answerer: Answerer | None = None
+        self._unusable = ""
+        try:
+            self._answerer = make()
+        except InputError as error:  # raised from here, Serve would try again and again, and say so in a page
+            self._unusable = str(error)
+            return
+        threading.Thread(target=self._answerer.live.follow, args=(threading.Event(),), daemon=True).start()
+
+    async def answer(self, questions: Sequence[Question]) -> list[Outcome]:
+        return await asyncio.get_running_loop().run_in_executor(self._thread, self._answer, questions)
+
+    def _answer(self, questions: Sequence[Question]) -> list[Outcome]:
+        self._began = time.monotonic()
+        try:
+            return self._ready().answer(questions)
+        finally:
+            self._began = None
+
+    async def status(self) -> Status:
+        return self._ready().status()
+
+    def _ready(self) -> Answerer:
+        if self._answerer is None:
+            raise NotReady(self._unusable)
+        return self._answerer
+
+    def check_health(self) -> None:
+        """Called by Serve every few seconds; a replica that raises here a few times is replaced."""
+        self._ready()
+        if self._began is not None and time.monotonic() > self._began + STUCK_S:
+            raise TimeoutError(f"a batch has taken {STUCK_S:.0f} s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crew:
+    """How many replicas of which size."""
+
+    replicas: int
+    cpus: int
+    "Of each."
+    gpus: float
+    "Of each."
+
+
+class Replicas:
+    """The replicas of one service, from the process that asks them."""
+
+    def __init__(self, name: str, crew: Crew, make: Callable[[], Answerer]) -> None:
+        """Nothing is started yet. `name` is no other application's on this cluster; `make` is called on each replica."""
+        self._name, self._crew, self._make = name, crew, make
+        self._handle: Any = None
+
+    def start(self) -> Status:
+        """Start all replicas and wait until they have loaded.
+
+        Raises InputError when the network or the index cannot be used.
+        """
+        cluster.connect()
+        logging.getLogger("ray.serve").setLevel(logging.ERROR)  # it warns at length of what is told here in a sentence
+        deployment: serve.Deployment = serve.deployment(
+            num_replicas=self._crew.replicas,
+            max_ongoing_requests=CALLS,
+            ray_actor_options={"num_cpus": self._crew.cpus, "num_gpus": self._crew.gpus},
+            health_check_period_s=5,
+            graceful_shutdown_wait_loop_s=0.2,
+            graceful_shutdown_timeout_s=5,
+        )(Replica)
+        serve.start(proxy_location="Disabled")
+        handle = serve.run(deployment.bind(self._make), name=self._name, route_prefix=None)
+        try:
+            status: Status = handle.status.remote().result(timeout_s=60)
+        except NotReady as error:
+            raise InputError(str(error)) from None
+        self._handle = handle
+        return status
+
+    async def answer(self, questions: Sequence[Question]) -> list[Outcome]:
+        """Raises NotReady, and Gone where the replica that was asked has died."""
+        answered: list[Outcome] = await self._ask("answer", list(questions))
+        return answered
+
+    async def status(self) -> Status:
+        """Raises NotReady, and Gone likewise."""
+        found: Status = await self._ask("status")
+        return found
+
+    async def _ask(self, method: str, *arguments: Any) -> Any:
+        if self._handle is None:
+            raise NotReady("the network and the index are being loaded")
+        try:
+            return await getattr(self._handle, method).remote(*arguments)
+        except ray.exceptions.RayActorError as error:
+            raise Gone(str(error).split("\n")[0]) from None
+        except DeploymentUnavailableError:
+            raise NotReady("no replica can load the network and the index") from None
+
+    def stop(self) -> None:
+        """End this service's replicas, and Serve itself where nobody else's application is left."""
+        if not ray.is_initialized():
+            return
+        serve.delete(self._name)
+        if not serve.status().applications:
+            serve.shutdown()  # type: ignore[no-untyped-call]
