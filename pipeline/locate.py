@@ -5,12 +5,14 @@ agree on; the probability comes from a calibration, without which there is none.
 Shapes: Q photos, D dimensions, K candidates.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from pipeline.confidence import Confidence
 from pipeline.consensus import Consensus, consensus
 from pipeline.features import Floats
 from pipeline.index import Hit
@@ -19,6 +21,11 @@ from pipeline.metrics import Doubles
 CONSIDERED = 10
 """Candidates that decide on place and probability, whatever number is shown: a calibration holds for one number only. Ten,
 since a place that agrees with none of the ten best has little to say, and the tenth is well within what comes by chance."""
+
+
+UNCALIBRATED = 0.5
+"""Of the gallery's spacing: how far apart candidates may lie that agree, where no calibration has chosen. Only images of one
+place: whether neighbours overlap is not known, and unlike ones would lead away."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,30 +58,62 @@ class Answer:
     "How many of the candidates considered lie at the place."
 
 
+NOTHING = Answer(position=None, location=None, probability=None, known=False, candidates=(), agreeing=0)
+"What is said where the search found nothing."
+
+
 def locate(
-    index: Any, embeddings_QD: Floats, k: int = CONSIDERED, where: Any = None, confidence: Any = None
+    index: Any,
+    embeddings_QD: Floats,
+    k: int = CONSIDERED,
+    where: Any = None,
+    confidence: Confidence | None = None,
+    spacing_m: float | None = None,
 ) -> list[Answer]:
     """One answer per embedding (Q, D), each with its `k` best candidates.
 
-    `where` narrows the search; `confidence` is the calibration of this index. Raises InputError for a `where` that is none.
+    `where` narrows the search; `confidence` is the calibration of this index. Without one `spacing_m`, the gallery's, says how
+    far apart candidates may lie that agree; without either they agree where they are of one location.
+    Raises InputError for a `where` that is none.
     """
     most = max(k, CONSIDERED)
     found = index.search(embeddings_QD, most) if where is None else index.search(embeddings_QD, most, where)
-    return [answer(hits, k, confidence) for hits in found]
+    return answers(found, k, confidence, spacing_m)
 
 
-def answer(hits: Sequence[Hit], k: int = CONSIDERED, confidence: Any = None) -> Answer:
-    """What the candidates of one photo, best first, amount to; `k` of them go into the answer."""
-    if not hits:
-        return Answer(position=None, location=None, probability=None, known=False, candidates=(), agreeing=0)
-    agreed = judged(hits, confidence.within_m if confidence else 0.0)
-    probability = confidence.probability(agreed, hits) if confidence else None
+def answers(
+    found: Sequence[Sequence[Hit]], k: int, confidence: Confidence | None = None, spacing_m: float | None = None
+) -> list[Answer]:
+    """What the candidates of each photo, best first, amount to; `k` of them go into the answer."""
+    spacing = (confidence.spacing_m if confidence else spacing_m) or 0.0
+    within_m = confidence.within_m if confidence else UNCALIBRATED * spacing
+    agreed = [judged(hits, within_m) if hits else None for hits in found]
+    probabilities = iter(
+        confidence.probabilities([one for one in agreed if one], [scores_of(hits) for hits in found if hits]).tolist()
+        if confidence
+        else []
+    )
+    return [
+        _answer(one, hits, k, next(probabilities, None), confidence, spacing) if one else NOTHING
+        for one, hits in zip(agreed, found, strict=True)
+    ]
+
+
+def _answer(
+    agreed: Consensus,
+    hits: Sequence[Hit],
+    k: int,
+    probability: float | None,
+    confidence: Confidence | None,
+    spacing: float,
+) -> Answer:
     position = None
     if agreed.lat is not None and agreed.lon is not None:
-        position = Position(lat=agreed.lat, lon=agreed.lon, radius_m=agreed.spread_m)
+        radius_m = math.hypot(agreed.spread_m, spacing / 2)
+        position = Position(lat=agreed.lat, lon=agreed.lon, radius_m=radius_m)
     return Answer(
         position=position, location=hits[agreed.leader].location, probability=probability,
-        known=probability is None or probability >= confidence.threshold,
+        known=confidence is None or probability is None or probability >= confidence.threshold,
         candidates=tuple(hits[:k]), agreeing=int(agreed.members_K.sum()),
     )  # fmt: skip
 
@@ -82,7 +121,19 @@ def answer(hits: Sequence[Hit], k: int = CONSIDERED, confidence: Any = None) -> 
 def judged(hits: Sequence[Hit], within_m: float) -> Consensus:
     """The place that the best CONSIDERED candidates agree on."""
     hits = hits[:CONSIDERED]
-    return consensus(np.array([hit.score for hit in hits]), [hit.location for hit in hits], places(hits), within_m)
+    return consensus(scores_of(hits), [hit.location for hit in hits], places(hits), within_m)
+
+
+def scores_of(hits: Sequence[Hit]) -> Doubles:
+    """Scores (K,) of the candidates considered, best first."""
+    return np.array([hit.score for hit in hits[:CONSIDERED]])
+
+
+def levelled(hits: Sequence[Hit]) -> Doubles:
+    """Scores of any number of candidates above that of the last one considered: what a gallery holds by chance differs from
+    photo to photo."""
+    scores_K = np.array([hit.score for hit in hits])
+    return np.asarray(scores_K - scores_K[:CONSIDERED][-1:].sum())
 
 
 def places(hits: Sequence[Hit]) -> Doubles:
