@@ -35,6 +35,8 @@ class Status:
     "Of the index in use."
     factory: str
     "How FAISS holds them."
+    calibrated: bool
+    "Whether answers have a probability."
     refused: str | None
     "Why the newest index at the path is not in use; None where it is."
 
@@ -45,11 +47,11 @@ class Answerer:
     def __init__(self, index: str, encoder_for: Callable[[dict[str, Any]], Encoder]) -> None:
         """`encoder_for` makes the encoder that fits an index of these facts. Raises InputError when either is unusable."""
         self.live = LiveIndex(index)
-        self._encoder = encoder_for(self.live.current.facts)
+        self._encoder = encoder_for(self.live.current.index.facts)
 
     def answer(self, questions: Sequence[Question]) -> list[Outcome]:
         """One outcome per question, in order. The whole batch asks one index, and the network once."""
-        index = self.live.current
+        opened = self.live.current
         embeddings_QD, rejected = self._encoder.encode([question.photo for question in questions])
         outcomes: dict[int, Outcome] = {number: why for number, why in enumerate(rejected) if why is not None}
         alike: dict[tuple[Near | None, int], list[tuple[int, int]]] = {}  # question and row of those of one search
@@ -57,12 +59,17 @@ class Answerer:
             alike.setdefault((questions[number].near, questions[number].top), []).append((number, row))
         for (near, top), members in alike.items():
             where = None if near is None else Where(near=near)
-            answers = locate(index, embeddings_QD[[row for _, row in members]], top, where)
+            answers = locate(opened.index, embeddings_QD[[row for _, row in members]], top, where, opened.confidence)
             outcomes |= {number: answer for (number, _), answer in zip(members, answers, strict=True)}
         return [outcomes[number] for number in range(len(questions))]
 
     def status(self) -> Status:
-        facts = self.live.current.facts
+        opened = self.live.current
+        facts = opened.index.facts
         return Status(
-            fingerprint=facts["fingerprint"], rows=facts["rows"], factory=facts["factory"], refused=self.live.refused
+            fingerprint=facts["fingerprint"],
+            rows=facts["rows"],
+            factory=facts["factory"],
+            calibrated=opened.confidence is not None,
+            refused=self.live.refused,
         )

@@ -98,7 +98,7 @@ class Batcher(Generic[Item, Result]):
     async def _settle(self, batch: "dict[asyncio.Future[Result], Item]") -> None:
         """Give every future its result, or the failure of the batch. Raises Gone alone."""
         try:
-            results = await self._work(list(batch.values()))
+            settled = list(zip(batch, await self._work(list(batch.values())), strict=True))
         except Gone:
             raise
         except Exception as error:
@@ -106,6 +106,6 @@ class Batcher(Generic[Item, Result]):
                 if not future.done():
                     future.set_exception(error)
             return
-        for future, result in zip(batch, results, strict=True):
+        for future, result in settled:
             if not future.done():
                 future.set_result(result)

@@ -1,25 +1,51 @@
 """An index on disk that may be replaced while it is searched: the new one is taken over when it is whole, else refused.
 
-In: the path of an index. Out: the opened index, the one in use until another has proved itself. Who searches holds a reference,
-so nothing is taken from under a search.
+In: the path of an index. Out: the opened index with its calibration, in use until another has proved itself. Who searches
+holds a reference, so nothing is taken from under a search.
 """
 
 import threading
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from pipeline import storage
+from pipeline import confidence, storage
+from pipeline.confidence import Confidence, find_confidence
+from pipeline.gallery_map import read_gallery_map
 from pipeline.index import FACTS, Index
 from pipeline.progress import console
 from pipeline.records import InputError
 
 LOOK_EVERY_S = 2.0
-"Between two looks at index.json."
+"Between two looks at what is at the path."
 RETRY_S = 10.0
 """After which a refused index is tried again though its index.json is the same: whoever copies a folder file by file may copy
 that one first."""
+
+
+Said = tuple[bytes | None, ...]
+"What the files hold by which an index is known, index.json and calibration.json; None for one that is not there."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Opened:
+    """What answers."""
+
+    index: Index
+    confidence: Confidence | None
+    "None where the index was not calibrated."
+    spacing_m: float | None
+    "Without a calibration, how far apart candidates may lie that agree: the gallery's own spacing."
+
+
+def open_whole(path: str) -> Opened:
+    """Raises InputError when there is no index at `path`, or a calibration that is another's."""
+    index = Index(path)
+    calibration = find_confidence(path, index.facts)
+    spacing_m = None if calibration else read_gallery_map(path).spacing_m
+    return Opened(index=index, confidence=calibration, spacing_m=spacing_m)
 
 
 class LiveIndex:
@@ -29,16 +55,12 @@ class LiveIndex:
         """Raises InputError when there is no index at `path` that can be used."""
         self._path = path
         self._taken = self._seen = self._said()  # before it is opened: a change meanwhile is found by the next look
-        self.current = Index(path)
+        self.current = open_whole(path)
         self.refused: str | None = None
         self._refused_at = 0.0
 
-    def _said(self) -> bytes | None:
-        """What index.json holds; None where there is none to read."""
-        try:
-            return storage.read_bytes(storage.join(self._path, FACTS))
-        except OSError:
-            return None
+    def _said(self) -> Said:
+        return tuple(_read(storage.join(self._path, name)) for name in (FACTS, confidence.FILE))
 
     def look(self) -> None:
         """Take over what is new at the path. Whatever is wrong with it, the old index stays; nothing is raised."""
@@ -49,8 +71,8 @@ class LiveIndex:
             self._seen, self.refused = said, None
             return
         try:
-            fresh = Index(self._path)
-            prove(fresh, self.current.facts)
+            fresh = open_whole(self._path)
+            prove(fresh.index, self.current.index.facts)
         except Exception as error:  # FAISS, Arrow, JSON and file systems each raise their own over broken files
             self._refuse(said, error)
             return
@@ -58,9 +80,9 @@ class LiveIndex:
             return
         self.current, self.refused = fresh, None
         self._taken = self._seen = said
-        console.print(f"a new index at {self._path} is in use: {fresh.facts['rows']} rows")
+        console.print(f"a new index at {self._path} is in use: {fresh.index.facts['rows']} rows")
 
-    def _refuse(self, said: bytes | None, error: Exception) -> None:
+    def _refuse(self, said: Said, error: Exception) -> None:
         why = str(error).strip().split("\n")[0] or type(error).__name__
         self._seen, self._refused_at = said, time.monotonic()
         self.refused = f"the new index is refused and the old one goes on answering: {why}"
@@ -69,6 +91,13 @@ class LiveIndex:
         """Look every LOOK_EVERY_S seconds until `stop` is set: for a thread of its own."""
         while not stop.wait(LOOK_EVERY_S):
             self.look()
+
+
+def _read(path: str) -> bytes | None:
+    try:
+        return storage.read_bytes(path)
+    except OSError:
+        return None
 
 
 def prove(fresh: Index, old: dict[str, Any]) -> None:

@@ -120,6 +120,7 @@ def _schemas() -> dict[str, Any]:
         ready={"type": "boolean"}, why=_says(TEXT, "Why it is not."),
         fingerprint=_says(TEXT, "Of network, settings and preprocessing."),
         rows=_says({"type": "integer"}, "Of the index in use."), factory=_says(TEXT, "How FAISS holds them."),
+        calibrated=_says({"type": "boolean"}, "Whether answers have a probability."),
         refused=_says({"type": ["string", "null"]}, "Why the newest index is not in use."),
     )  # fmt: skip
     error = _object(error=_says(TEXT, "One sentence: what was found, what was expected, what to do."))

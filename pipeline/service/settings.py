@@ -69,7 +69,7 @@ class ServiceSettings:
                 f"no file at {self.token_file}, expected one whose first line is the token; check --token-file"
             )
         token = storage.read_bytes(self.token_file).decode("ascii", "replace").partition("\n")[0].strip()
-        if len(token) < SHORTEST_TOKEN or not token.isprintable() or " " in token:
+        if len(token) < SHORTEST_TOKEN or not token.isascii() or not token.isprintable() or " " in token:
             raise InputError(
                 f"the first line of {self.token_file} has {len(token)} characters, expected a token of at least "
                 f"{SHORTEST_TOKEN}, ASCII without blanks; `openssl rand -hex 16` makes one"

@@ -89,7 +89,8 @@ async def _form(request: web.Request, most_bytes: int) -> tuple[bytes, dict[str,
                 400, f"the form has more than {MOST_PARTS - 1} fields; send the photo and {', '.join(FIELDS)}"
             )
     except (ValueError, AssertionError, RuntimeError, HttpProcessingError) as error:  # aiohttp's, over damaged forms
-        raise Refusal(400, f"the form cannot be read: {str(error)[:120]}; send it as a browser does") from None
+        why = " ".join(str(error).split())[:120]
+        raise Refusal(400, f"the form cannot be read: {why}; send it as a browser does") from None
     if photo is None:
         raise Refusal(400, f"the form has no field {PHOTO}, expected the photo there; see /api")
     return photo, fields
