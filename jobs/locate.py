@@ -4,10 +4,9 @@ Photos, or folders of them, are embedded as the index's images were, and the ind
 page with a map. Photos that cannot be decoded are listed with the reason, the others are answered, and the exit code is 1.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import batched
-from typing import Any
+from functools import partial
 
 import numpy as np
 import tyro
@@ -17,21 +16,224 @@ from rich.table import Table
 
 from jobs.cli import run
 from jobs.photo_encoder import PhotoEncoder
-from pipeline import answer_files, storage
-from pipeline.ahead import ahead
+from jobs.photos import Query, read_photos, together
+from pipeline import answer_files, rejects, storage
 from pipeline.answer_files import Located
+from pipeline.answer_page import Place, Surroundings, render
 from pipeline.confidence import Confidence, find_confidence, read_confidence
-from pipeline.features import Floats
 from pipeline.flight import settle
-from pipeline.gallery_map import GalleryMap, read_gallery_map
+from pipeline.gallery_map import read_gallery_map
 from pipeline.index import Index
 from pipeline.locate import Answer, locate
-from pipeline.photo_files import find_photos, folder_of, read_times, seconds, taken_at
-from pipeline.progress import console, progress
-from pipeline.records import InputError, Rejection, Unfinished
+from pipeline.photo_files import find_photos, read_times, seconds
+from pipeline.progress import console
+from pipeline.records import InputError, Unfinished
+from pipeline.report_inputs import no_pictures
+from pipeline.shard_records import footprints
+from pipeline.shards import read_manifest
+from pipeline.stream import fetch
 from pipeline.track import TRACKED, Motion, Start
 from pipeline.where import Near, Where
 
-BATCH = 128
-"Photos that are read and encoded at a time."
-READERS = 4
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Which photos are looked for in which index, and what is written."""
+
+    photos: tyro.conf.Positional[tuple[str, ...]]
+    "Photos, or folders with photos below them; paths or URIs."
+    checkpoint: str
+    "The network that the index was made with."
+    index: str
+    "Folder or URI of the index."
+    out: str
+    "The GeoJSON file with a point per photo."
+    top: int = 5
+    "Candidates that are listed of each photo."
+    together: bool = False
+    "All photos of a folder show one place: they are asked as one, by the mean of their embeddings."
+    near: tuple[float, float, float] | None = None
+    """Latitude, longitude and radius in metres: only gallery images in this circle may answer. With --track it is where the
+    flight began, at the time of its first photo."""
+    track: bool = False
+    "The photos are of one flight: each is placed in the light of all, and GeoJSON begins with the flight's line."
+    max_speed: float = 25.0
+    "Of the flight, metres per second over the ground; 25 is beyond most multicopters."
+    times: str | None = None
+    "CSV table with the columns photo and time (seconds or ISO 8601); by default the camera's own times."
+    interval: float | None = None
+    "Seconds between photos in the order of their names, where neither tables nor cameras say when."
+    calibration: str | None = None
+    "What jobs/calibrate.py wrote; by default INDEX/calibration.json where it is there."
+    csv: str | None = None
+    "A CSV file with a row per photo."
+    page: str | None = None
+    "An HTML page with photos, candidates and a map, in one file that needs no network."
+    shards: str | None = None
+    "Those that the index was made of: the pictures of the page; needed besides where the index's embeddings are int8."
+
+    def __post_init__(self) -> None:
+        if self.top < 1:
+            raise InputError(f"--top is {self.top}, expected at least 1")
+        if self.together and self.track:
+            raise InputError(
+                "both --together and --track were given, expected one: a track is of single photos; leave one out"
+            )
+        if self.interval is not None and not self.interval > 0:
+            raise InputError(f"--interval is {self.interval}, expected seconds above 0")
+        Motion(max_speed=self.max_speed)
+
+
+def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None) -> list[Located]:
+    """Answer, write what was asked for, and return the answers in the order of the photos (of their folders, together).
+
+    `truths`: where photos were really taken, by name, for the page. Raises InputError and CheckpointError on unusable input.
+    """
+    near = Near(lat=settings.near[0], lon=settings.near[1], radius_m=settings.near[2]) if settings.near else None
+    photos = find_photos(settings.photos)
+    if not storage.exists(settings.checkpoint):
+        raise InputError(
+            f"no checkpoint at {settings.checkpoint}; expected a last.pt of jobs/train.py; check --checkpoint"
+        )
+    index = Index(settings.index)
+    confidence = confidence_of(settings, index)
+    encoder = PhotoEncoder(storage.read_bytes(settings.checkpoint), settings.checkpoint, index.facts, settings.shards)
+    gallery = read_gallery_map(settings.index)
+    queries = read_photos(photos, encoder)
+    if settings.together:
+        queries = together(queries)
+    asked = [query for query in queries if query.embedding_D is not None]
+    embeddings_QD = np.array([query.embedding_D for query in asked], np.float32).reshape(-1, encoder.dimension)
+    where = Where(near=near) if near and not settings.track else None
+    k = max(settings.top, TRACKED) if settings.track else settings.top
+    answers = locate(index, embeddings_QD, k, where, confidence, gallery.spacing_m)
+    if settings.track and confidence:
+        times = times_of(asked, settings)
+        asked = [replace(query, taken_at=time) for query, time in zip(asked, times, strict=True)]
+        start = Start(lat=near.lat, lon=near.lon, radius_m=near.radius_m) if near else None
+        motion = Motion(max_speed=settings.max_speed, slack_m=gallery.spacing_m or 0.0)
+        answers = settle(answers, [seconds(time) for time in times], confidence, motion, start)
+    answered = dict(zip((query.name for query in asked), zip(asked, answers, strict=True), strict=True))
+    located = [
+        _located(*answered[query.name], settings.top) if query.name in answered else _located(query, None, settings.top)
+        for query in queries
+    ]
+    if settings.track:
+        located.sort(key=lambda one: (one.taken_at is None, seconds(one.taken_at or "0")))
+    about = {
+        "index": settings.index, "fingerprint": encoder.fingerprint, "together": settings.together,
+        "threshold": confidence.threshold if confidence else None,
+    }  # fmt: skip
+    storage.write_bytes(settings.out, answer_files.geojson(located, about, settings.track))
+    if settings.csv:
+        storage.write_bytes(settings.csv, answer_files.table(located))
+    if settings.page:
+        around = Surroundings(
+            title="Where these photos were taken", gallery=gallery, confidence=confidence, fingerprint=encoder.fingerprint,
+            track=settings.track, truths=truths or {},
+        )  # fmt: skip
+        storage.write_bytes(settings.page, page(located, around, settings.shards).encode())
+    return located
+
+
+def confidence_of(settings: Settings, index: Index) -> Confidence | None:
+    """The calibration that was named, or the one beside the index, or none, which is said.
+
+    Raises InputError where it is another network's, or where there is none and a track needs one.
+    """
+    if settings.calibration:
+        return read_confidence(settings.calibration, index.facts)
+    confidence = find_confidence(settings.index, index.facts)
+    if confidence is None and settings.track:
+        raise InputError(
+            f"no calibration beside {settings.index}, and --track weighs candidates by one; expected calibration.json; make it "
+            "with jobs/calibrate.py"
+        )
+    if confidence is None:
+        console.print("not calibrated: answers come without a probability, and none is unknown; see jobs/calibrate.py")
+    elif confidence.gallery != index.facts["rows"]:
+        console.print(
+            f"calibrated over {confidence.gallery} gallery images, the index has {index.facts['rows']}: probabilities are "
+            "rough until jobs/calibrate.py is run again",
+            style="yellow",
+        )
+    return confidence
+
+
+def times_of(queries: Sequence[Query], settings: Settings) -> list[str]:
+    """When each photo was taken: by the table, else by the interval, else as the cameras say.
+
+    Raises InputError where that is not known of all.
+    """
+    names = [query.name for query in queries]
+    if settings.times:
+        said = read_times(settings.times, names)
+        return [said[name] for name in names]
+    if settings.interval:
+        place = {name: number for number, name in enumerate(sorted(names))}
+        return [str(place[name] * settings.interval) for name in names]
+    unknown = [query.name for query in queries if query.taken_at is None]
+    if unknown:
+        raise InputError(
+            f"{len(unknown)} of {len(names)} photos do not say when they were taken, {unknown[0]} among them; expected times "
+            "for --track; give --times TABLE or --interval SECONDS"
+        )
+    return [query.taken_at or "" for query in queries]
+
+
+def _located(query: Query, answer: Answer | None, top: int) -> Located:
+    shown = replace(answer, candidates=answer.candidates[:top]) if answer else None
+    return Located(name=query.name, photos=query.photos, answer=shown, rejected=query.rejected, taken_at=query.taken_at)
+
+
+def page(located: Sequence[Located], around: Surroundings, shards: str | None) -> str:
+    """The HTML page; with pictures and corners of the gallery's images where shards are at hand."""
+
+    def photos(names: Iterable[str]) -> dict[str, bytes]:
+        return {name: storage.read_bytes(name) for name in names}
+
+    if shards is None:
+        return render(located, around, photos, no_pictures)
+    around = replace(around, footprints=partial(footprints, shards, read_manifest(shards)))
+    return render(located, around, photos, partial(fetch, shards))
+
+
+def print_answers(located: Sequence[Located]) -> None:
+    """The answers on standard output, a line each."""
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for heading in ("photo", "position", "within", "sure", "location", "score"):
+        table.add_column(heading, justify="left" if heading in ("photo", "location") else "right", overflow="fold")
+    for one in located:
+        table.add_row(one.name, *_cells(one))
+    Console().print(table)
+
+
+def _cells(one: Located) -> list[str]:
+    answer = one.answer
+    if answer is None:
+        return [one.rejected[0].reason, "", "", "", ""]
+    position = f"{answer.position.lat:.6f}, {answer.position.lon:.6f}" if answer.position else "no position"
+    return [
+        position if answer.known else "unknown",
+        f"{answer.position.radius_m:.0f} m" if answer.position and answer.known else "",
+        "" if answer.probability is None else f"{answer.probability:.0%}",
+        (answer.location or "") if answer.known else "",
+        f"{answer.candidates[0].score:.3f}" if answer.candidates else "",
+    ]
+
+
+def main(settings: Settings) -> None:
+    """Answer where photos were taken: a position, how sure it is, and the candidates behind it."""
+    located = locate_photos(settings)
+    print_answers(located)
+    print(f"answers: {settings.out}" + (f", page: {settings.page}" if settings.page else ""))
+    damaged = [refused for one in located for refused in one.rejected]
+    if damaged:
+        raise Unfinished(
+            f"{len(damaged)} of {sum(len(one.photos) for one in located)} photos could not be decoded: "
+            f"{rejects.commonest(damaged)}; they are listed in {settings.out}"
+        )
+
+
+if __name__ == "__main__":
+    run(main)

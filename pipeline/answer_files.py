@@ -30,8 +30,8 @@ class Located:
     "Paths of the photos that the answer is of."
     answer: Answer | None = None
     "None where no photo could be decoded."
-    rejected: Rejection | None = None
-    "Why there is no answer."
+    rejected: tuple[Rejection, ...] = ()
+    "Photos of it that could not be decoded."
     taken_at: str | None = None
     "When, as far as it is known."
 
@@ -51,11 +51,16 @@ def geojson(located: Sequence[Located], about: dict[str, Any], track: bool) -> b
 def _feature(one: Located) -> dict[str, Any]:
     row = _row(one)
     candidates = [asdict(hit) for hit in one.answer.candidates] if one.answer else []
-    properties = {name: row[name] for name in COLUMNS if name not in ("candidate", "score")}
-    point = {"type": "Point", "coordinates": [row["lon"], row["lat"]]} if row["known"] and row["lat"] is not None else None
-    return {
-        "type": "Feature", "geometry": point, "properties": properties | {"photos": one.photos, "candidates": candidates}
-    }  # fmt: skip
+    properties = {name: row[name] for name in COLUMNS[: COLUMNS.index("candidate")]}
+    properties |= {
+        "photos": one.photos,
+        "candidates": candidates,
+        "rejected": [asdict(refused) for refused in one.rejected],
+    }
+    point = (
+        {"type": "Point", "coordinates": [row["lon"], row["lat"]]} if row["known"] and row["lat"] is not None else None
+    )
+    return {"type": "Feature", "geometry": point, "properties": properties}
 
 
 def _line(located: Sequence[Located]) -> dict[str, Any]:
@@ -78,10 +83,10 @@ def table(located: Sequence[Located]) -> bytes:
 
 
 def _row(one: Located) -> dict[str, Any]:
-    answer, rejected = one.answer, one.rejected
+    answer = one.answer
     row: dict[str, Any] = dict.fromkeys(COLUMNS) | {"photo": one.name, "taken_at": one.taken_at, "known": False}
-    if rejected:
-        row |= {"reason": rejected.reason, "found": rejected.found}
+    if one.rejected:
+        row |= {"reason": one.rejected[0].reason, "found": one.rejected[0].found}
     if answer:
         row |= {name: getattr(answer, name) for name in ("known", "probability", "location", "agreeing")}
         if answer.position:

@@ -1,7 +1,7 @@
 """Answers of single photos, and when they were taken -> answers in the light of the whole flight.
 
-In: answers with TRACKED candidates each, times, and a calibration, which says how much a score is worth. Out: the same number of
-answers, whose places are those that the track passes through.
+In: answers with TRACKED candidates each, times, and a calibration, which says how much a score is worth. Out: the same number
+of answers, whose places are those that the track passes through.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,11 @@ from pipeline.track import Motion, Photo, Smoothed, Start, smooth
 
 
 def settle(
-    answers: Sequence[Answer], times_s: Sequence[float], confidence: Confidence, motion: Motion, start: Start | None = None
+    answers: Sequence[Answer],
+    times_s: Sequence[float],
+    confidence: Confidence,
+    motion: Motion,
+    start: Start | None = None,
 ) -> list[Answer]:
     """What the flight says of each photo, in the order given. A photo that the track passes over is not known.
 

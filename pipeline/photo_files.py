@@ -33,7 +33,9 @@ def find_photos(named: Sequence[str]) -> list[str]:
         else:
             raise InputError(f"no photo or folder at {path}; expected one; check the name")
     if not photos:
-        raise InputError("no photo was named, expected one or more photos or folders; name some at the end of the command")
+        raise InputError(
+            "no photo was named, expected one or more photos or folders; name some at the end of the command"
+        )
     return list(photos)
 
 
