@@ -21,6 +21,7 @@ from pipeline.records import InputError
 from pipeline.service.answerer import Answerer, Outcome, Status
 from pipeline.service.batcher import Gone
 from pipeline.service.engine import NotReady
+from pipeline.service.live_index import RETRY_S
 from pipeline.service.question import Question
 
 STUCK_S = 120.0
@@ -33,16 +34,26 @@ class Replica:
     """One process with the network and the index. Batches are computed one after the other, by one thread."""
 
     def __init__(self, make: Callable[[], Answerer]) -> None:
+        self._make = make
         self._thread = ThreadPoolExecutor(1)
         self._began: float | None = None
         self._answerer: Answerer | None = None
         self._unusable = ""
+        self._load()
+        threading.Thread(target=self._follow, daemon=True).start()
+
+    def _load(self) -> None:
         try:
-            self._answerer = make()
-        except InputError as error:  # raised from here, Serve would try again and again, and say so in a page
+            self._answerer = self._make()
+        except InputError as error:  # raised from the constructor it would come back from Serve as a page of traceback
             self._unusable = str(error)
-            return
-        threading.Thread(target=self._answerer.live.follow, args=(threading.Event(),), daemon=True).start()
+
+    def _follow(self) -> None:
+        """Take over new indexes for ever; before, where network or index were unusable, try until they are mended."""
+        while self._answerer is None:
+            time.sleep(RETRY_S)
+            self._load()
+        self._answerer.live.follow(threading.Event())
 
     async def answer(self, questions: Sequence[Question]) -> list[Outcome]:
         return await asyncio.get_running_loop().run_in_executor(self._thread, self._answer, questions)
@@ -64,8 +75,8 @@ class Replica:
 
     def check_health(self) -> None:
         """Called by Serve every few seconds; a replica that raises here a few times is replaced."""
-        self._ready()
-        if self._began is not None and time.monotonic() > self._began + STUCK_S:
+        began = self._began
+        if began is not None and time.monotonic() > began + STUCK_S:
             raise TimeoutError(f"a batch has taken {STUCK_S:.0f} s")
 
 
@@ -87,6 +98,7 @@ class Replicas:
         """Nothing is started yet. `name` is no other application's on this cluster; `make` is called on each replica."""
         self._name, self._crew, self._make = name, crew, make
         self._handle: Any = None
+        self._started = False
 
     def start(self) -> Status:
         """Start all replicas and wait until they have loaded.
@@ -103,6 +115,7 @@ class Replicas:
             graceful_shutdown_wait_loop_s=0.2,
             graceful_shutdown_timeout_s=5,
         )(Replica)
+        self._started = True
         serve.start(proxy_location="Disabled")
         handle = serve.run(deployment.bind(self._make), name=self._name, route_prefix=None)
         try:
@@ -134,7 +147,7 @@ class Replicas:
 
     def stop(self) -> None:
         """End this service's replicas, and Serve itself where nobody else's application is left."""
-        if not ray.is_initialized():
+        if not self._started:
             return
         serve.delete(self._name)
         if not serve.status().applications:
