@@ -189,7 +189,7 @@ def test_a_replica_that_cannot_load_says_why_and_loads_once_it_can(
 
 
 def test_a_replica_whose_batch_does_not_end_is_ill(road: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    replica = Replica(partial(load, *map(str, road), None, 1))
+    replica = Replica(partial(load, str(road[0]), str(road[1]), None, 1))
     replica._began = time.monotonic() - replicas.STUCK_S - 1
     with pytest.raises(TimeoutError, match="120 s"):
         replica.check_health()

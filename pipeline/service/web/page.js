@@ -1,6 +1,7 @@
 // A photo in, the answer on the page. Nothing is loaded from elsewhere; the map is drawn from the answer's own numbers.
 "use strict";
 const $ = (id) => document.getElementById(id);
+const value = (id) => $(id).value.trim().replace(",", "."); // 47,5 where people write it so
 const FIELDS = ["lat", "lon", "radius_m", "top"];
 let photo = null;
 let asking = 0; // a newer question makes older answers stale
@@ -27,7 +28,7 @@ async function ask() {
   const number = ++asking;
   const form = new FormData();
   form.append("photo", photo);
-  for (const field of FIELDS) if ($(field).value.trim()) form.append(field, $(field).value.trim().replace(",", "."));
+  for (const field of FIELDS) if (value(field)) form.append(field, value(field));
   const token = $("token").value.trim();
   $("answer").hidden = true;
   say("Looking ...", "busy");
@@ -120,7 +121,7 @@ function draw({ position, candidates, location }) {
   const origin = to({ x: 0, y: 0 });
   for (let x = origin.x % (rule * scale); x < WIDE; x += rule * scale) drawn.push(shape("line", { class: "grid", x1: x, x2: x, y1: 0, y2: HIGH }));
   for (let y = origin.y % (rule * scale); y < HIGH; y += rule * scale) drawn.push(shape("line", { class: "grid", x1: 0, x2: WIDE, y1: y, y2: y }));
-  const rough = { lat: Number($("lat").value), lon: Number($("lon").value), radius_m: Number($("radius_m").value) };
+  const rough = { lat: Number(value("lat")), lon: Number(value("lon")), radius_m: Number(value("radius_m")) };
   if (rough.radius_m > 0) {
     const centre = to(at(rough));
     drawn.push(shape("circle", { class: "near", cx: centre.x, cy: centre.y, r: rough.radius_m * scale }));
