@@ -1,33 +1,39 @@
 """What a calibration learns from made galleries: who is right, where the threshold lies, how far apart candidates may agree."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from pipeline.calibration import Example, Judging, best_radius, best_threshold, calibrate, is_right, out_of_fold
 from pipeline.calibration_examples import Labelled, examples
 from pipeline.confidence import Confidence
+from pipeline.features import Floats
 from pipeline.index import Hit
 from pipeline.locate import answers, judged
 from pipeline.logistic import sigmoid
-from pipeline.records import InputError
+from pipeline.records import InputError, View
 from pipeline.track import TRACKED
+from pipeline.where import Where
 
 METRE = 1 / 111_195.08  # degrees of latitude
 
 
 def hit(location: str, score: float, north_m: float | None = 0.0) -> Hit:
     lat, lon = (None, None) if north_m is None else (north_m * METRE, 8.0)
-    return Hit(key=f"gallery-satellite-{location}", location=location, lat=lat, lon=lon, score=score)
+    return Hit(
+        key=f"gallery-satellite-{location}", location=location, view=View.SATELLITE, lat=lat, lon=lon, score=score
+    )
 
 
 def made(count: int, rng: np.random.Generator) -> list[Example]:
-    """Photos whose own place scores 0.3 to 0.9, and others 0.2 to 0.7: right answers are those with high scores."""
+    """Photos whose own place scores about 0.6, and 39 others about 0.35: right answers are those with high scores."""
     found = []
     for number in range(count):
         others = sorted(
-            (hit(f"z{n}", float(rng.uniform(0.2, 0.7)), 9000.0 * n) for n in range(1, 40)), key=lambda h: -h.score
+            (hit(f"z{n}", float(rng.normal(0.35, 0.1)), 9000.0 * n) for n in range(1, 40)), key=lambda h: -h.score
         )
-        own = hit(f"p{number % 30}", float(rng.uniform(0.3, 0.9)))
+        own = hit(f"p{number % 30}", float(rng.normal(0.6, 0.12)))
         inside = sorted([own, *others], key=lambda h: -h.score)
         found.append(Example(location=own.location, lat=0.0, lon=8.0, inside=tuple(inside), outside=tuple(others)))
     return found
@@ -86,9 +92,10 @@ def test_neighbours_agree_only_where_that_places_photos_better() -> None:
     d = 20 * METRE
     four = [(d, d), (d, -d), (-d, d), (-d, -d)]
     tiles = [
-        Hit(key=f"k{n}", location=f"t{n}", lat=lat, lon=lon, score=0.9 - n / 1000) for n, (lat, lon) in enumerate(four)
+        Hit(key=f"k{n}", location=f"t{n}", view=View.SATELLITE, lat=lat, lon=lon, score=0.9 - n / 1000)
+        for n, (lat, lon) in enumerate(four)
     ]
-    alone = Hit(key="k", location="far", lat=1.0, lon=1.0, score=0.1)
+    alone = Hit(key="k", location="far", view=View.SATELLITE, lat=1.0, lon=1.0, score=0.1)
     overlapping = Example(location="photo", lat=0.0, lon=0.0, inside=(*tiles, alone), outside=())
     apart = Example(
         location="a", lat=0.0, lon=8.0, inside=(hit("a", 0.9), hit("b", 0.8, 60), hit("c", 0.7, 50)), outside=()
@@ -142,9 +149,13 @@ class Rows:
     def __init__(self, own: int, others: int) -> None:
         names = ["own"] * own + [f"o{n}" for n in range(others)]
         self.hits = [hit(name, 1 - n / 1000, 0.0 if name == "own" else 5000.0 * n) for n, name in enumerate(names)]
-        self.facts = {"rows": len(self.hits)}
+        self.facts: dict[str, Any] = {}
+        self.dimension = 2
 
-    def search(self, queries_QD: np.ndarray, k: int) -> list[list[Hit]]:
+    def __len__(self) -> int:
+        return len(self.hits)
+
+    def search(self, queries_QD: Floats, k: int = 10, where: Where | None = None) -> list[list[Hit]]:
         return [self.hits[:k] for _ in queries_QD]
 
 
@@ -159,7 +170,7 @@ def labelled(location: str, vector: list[float], north_m: float = 0.0) -> Labell
 
 
 def test_a_place_of_many_rows_is_left_out_whole_and_others_take_their_ranks() -> None:
-    (example,) = examples(labelled("own", [1, 0]), labelled("x", [0, 1]), Rows(100, 60), 300.0, 25.0)  # type: ignore[arg-type]
+    (example,) = examples(labelled("own", [1, 0]), labelled("x", [0, 1]), Rows(100, 60), 300.0, 25.0)
     assert {one.location for one in example.inside} == {"own"}
     assert [one.location for one in example.outside] == [f"o{n}" for n in range(TRACKED)]
 
@@ -167,12 +178,12 @@ def test_a_place_of_many_rows_is_left_out_whole_and_others_take_their_ranks() ->
 def test_a_place_that_the_index_lacks_is_ranked_by_its_own_images() -> None:
     """Its image scores 0.9975, between the third and the fourth row."""
     photos, own = labelled("new", [1, 0], -9000), labelled("new", [0.9975, 0], -9000)
-    (example,) = examples(photos, own, Rows(0, 60), 300.0, 25.0)  # type: ignore[arg-type]
+    (example,) = examples(photos, own, Rows(0, 60), 300.0, 25.0)
     assert [one.location for one in example.inside][:4] == ["o0", "o1", "o2", "new"]
     assert "new" not in {one.location for one in example.outside}
 
 
 def test_images_near_a_photo_s_place_are_left_out_under_whatever_name() -> None:
-    (example,) = examples(labelled("photo", [1, 0], 5000), labelled("x", [0, 1]), Rows(0, 60), 300.0, 25.0)  # type: ignore[arg-type]
+    (example,) = examples(labelled("photo", [1, 0], 5000), labelled("x", [0, 1]), Rows(0, 60), 300.0, 25.0)
     assert "o1" in {one.location for one in example.inside}
     assert "o1" not in {one.location for one in example.outside}

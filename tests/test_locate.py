@@ -7,20 +7,24 @@ import numpy as np
 import pytest
 
 from pipeline.confidence import Confidence, features, find_confidence, read_confidence, write_confidence
+from pipeline.features import Floats
 from pipeline.flight import settle
 from pipeline.index import Hit
 from pipeline.locate import CONSIDERED, NOTHING, answers, judged, levelled, locate, scores_of
 from pipeline.logistic import Logistic
-from pipeline.records import InputError
+from pipeline.records import InputError, View
 from pipeline.reliability import Bin
 from pipeline.track import Motion
+from pipeline.where import Where
 
 METRE = 1 / 111_195.08  # degrees of latitude
 
 
 def hit(location: str, score: float, north_m: float | None = 0.0) -> Hit:
     lat, lon = (None, None) if north_m is None else (46 + north_m * METRE, 8.0)
-    return Hit(key=f"gallery-satellite-{location}", location=location, lat=lat, lon=lon, score=score)
+    return Hit(
+        key=f"gallery-satellite-{location}", location=location, view=View.SATELLITE, lat=lat, lon=lon, score=score
+    )
 
 
 def confidence(**changes: Any) -> Confidence:
@@ -39,8 +43,13 @@ class Gallery:
 
     def __init__(self, hits: list[Hit]) -> None:
         self.hits, self.asked = hits, [0]
+        self.facts: dict[str, Any] = {}
+        self.dimension = 4
 
-    def search(self, queries_QD: np.ndarray, k: int) -> list[list[Hit]]:
+    def __len__(self) -> int:
+        return len(self.hits)
+
+    def search(self, queries_QD: Floats, k: int = 10, where: Where | None = None) -> list[list[Hit]]:
         self.asked.append(k)
         return [self.hits[:k] for _ in queries_QD]
 
