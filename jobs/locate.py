@@ -132,7 +132,7 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
             title="Where these photos were taken", gallery=gallery, confidence=confidence, fingerprint=encoder.fingerprint,
             track=settings.track, truths=truths or {},
         )  # fmt: skip
-        storage.write_bytes(settings.page, page(located, around, settings.shards).encode())
+        storage.write_bytes(settings.page, page(located, around, settings.shards).encode("utf-8", "replace"))
     return located
 
 
