@@ -17,7 +17,7 @@ from pipeline.calibration import Judging, calibrate
 from pipeline.calibration_examples import Labelled, examples
 from pipeline.confidence import FILE, Confidence, read_confidence, write_confidence
 from pipeline.foreign import open_manifest
-from pipeline.gallery_map import read_gallery_map
+from pipeline.gallery_map import gallery_map
 from pipeline.index import Index
 from pipeline.progress import console, progress
 from pipeline.records import InputError, Split, View
@@ -62,7 +62,7 @@ def calibrate_index(settings: Settings) -> Confidence:
     """
     out = settings.out or storage.join(settings.index, FILE)
     index = Index(settings.index)
-    rows = index.facts["rows"]
+    rows = len(index)
     judging = Judging(tolerance=settings.tolerance, outside=settings.outside)
     if storage.exists(out):
         confidence = read_confidence(out, index.facts)
@@ -79,7 +79,7 @@ def calibrate_index(settings: Settings) -> Confidence:
     trained_on = frozenset(loads(data, settings.checkpoint).locations)
     photos = embedded(settings, encoder, settings.view, trained_on, settings.photos)
     overhead = embedded(settings, encoder, settings.gallery_view, trained_on, None)
-    spacing_m = read_gallery_map(settings.index).spacing_m
+    spacing_m = gallery_map(index).spacing_m
     confidence = calibrate(
         examples(photos, overhead, index, spacing_m, settings.tolerance), judging, spacing_m, encoder.fingerprint, rows
     )

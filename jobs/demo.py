@@ -24,7 +24,8 @@ from pipeline import cluster, storage
 from pipeline.embed import EmbeddingSettings, embed_gallery
 from pipeline.evaluation import EvaluationSettings, evaluate
 from pipeline.features import open_table
-from pipeline.index import Index, IndexSettings, build_index
+from pipeline.index import Index
+from pipeline.index_build import IndexSettings, build_index
 from pipeline.packing import PackingSettings, pack
 from pipeline.progress import console
 from pipeline.records import Split, View

@@ -22,7 +22,7 @@ from pipeline.answer_files import Located
 from pipeline.answer_page import Place, Surroundings, render
 from pipeline.confidence import Confidence, find_confidence, read_confidence
 from pipeline.flight import settle
-from pipeline.gallery_map import read_gallery_map
+from pipeline.gallery_map import gallery_map
 from pipeline.index import Index
 from pipeline.locate import Answer, locate
 from pipeline.photo_files import find_photos, read_times, seconds
@@ -98,7 +98,7 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
     index = Index(settings.index)
     confidence = confidence_of(settings, index)
     encoder = PhotoEncoder(storage.read_bytes(settings.checkpoint), settings.checkpoint, index.facts, settings.shards)
-    gallery = read_gallery_map(settings.index)
+    gallery = gallery_map(index)
     queries = read_photos(photos, encoder)
     if settings.together:
         queries = together(queries)
@@ -132,7 +132,7 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
             title="Where these photos were taken", gallery=gallery, confidence=confidence, fingerprint=encoder.fingerprint,
             track=settings.track, truths=truths or {},
         )  # fmt: skip
-        storage.write_bytes(settings.page, page(located, around, settings.shards).encode())
+        storage.write_bytes(settings.page, page(located, around, settings.shards).encode("utf-8", "replace"))
     return located
 
 
@@ -151,7 +151,7 @@ def confidence_of(settings: Settings, index: Index) -> Confidence | None:
         )
     if confidence is None:
         console.print("not calibrated: answers come without a probability, and none is unknown; see jobs/calibrate.py")
-    elif confidence.gallery != index.facts["rows"]:
+    elif confidence.gallery != len(index):
         console.print(
             f"calibrated over {confidence.gallery} gallery images, the index has {index.facts['rows']}: probabilities are "
             "rough until jobs/calibrate.py is run again",

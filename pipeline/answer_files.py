@@ -45,7 +45,7 @@ def geojson(located: Sequence[Located], about: dict[str, Any], track: bool) -> b
     if track:
         features.insert(0, _line(located))
     collection = {"type": "FeatureCollection", "pvda": about, "features": features}
-    return (json.dumps(collection, indent=1, ensure_ascii=False) + "\n").encode()
+    return (json.dumps(collection, indent=1) + "\n").encode()  # ASCII: file names need not be Unicode
 
 
 def _feature(one: Located) -> dict[str, Any]:
@@ -78,7 +78,7 @@ def table(located: Sequence[Located]) -> bytes:
     text = io.StringIO()
     writer = csv.DictWriter(text, fieldnames=COLUMNS, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(_row(one) for one in located)
+    writer.writerows(_row(one) | {"known": str(bool(one.answer and one.answer.known)).lower()} for one in located)
     return text.getvalue().encode("utf-8", "surrogateescape")
 
 

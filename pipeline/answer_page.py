@@ -107,7 +107,9 @@ def told_m(metres: float | None) -> str:
     """A distance in words."""
     if metres is None:
         return ""
-    return f"{metres:.0f} m" if metres < 1000 else f"{metres / 1000:.1f} km"
+    if metres < 1:
+        return "here"
+    return f"{metres:.0f} m away" if metres < 1000 else f"{metres / 1000:.1f} km away"
 
 
 def short(name: str) -> str:

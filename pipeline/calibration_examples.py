@@ -13,9 +13,10 @@ import numpy as np
 
 from pipeline.calibration import Example
 from pipeline.features import Floats
-from pipeline.index import Hit, Index
+from pipeline.index import Hit, Searchable
 from pipeline.locate import places
 from pipeline.positions import haversine_m
+from pipeline.records import View
 from pipeline.track import TRACKED
 
 OWN_STEPS = 2.0
@@ -37,7 +38,7 @@ class Labelled:
 
 
 def examples(
-    photos: Labelled, overhead: Labelled, index: Index, spacing_m: float | None, tolerance_m: float
+    photos: Labelled, overhead: Labelled, index: Searchable, spacing_m: float | None, tolerance_m: float
 ) -> list[Example]:
     """One example per photo."""
     own: dict[str, list[int]] = {}
@@ -48,7 +49,7 @@ def examples(
     todo, k = list(range(len(photos.facts))), 2 * TRACKED
     while todo:
         found = index.search(photos.embeddings_QD[todo], k)
-        whole = k >= index.facts["rows"]
+        whole = k >= len(index)
         for number, hits in zip(todo, found, strict=True):
             location, (lat, lon) = photos.facts[number]["location"], photos.place(number)
             others = [hit for hit in elsewhere(hits, lat, lon, apart_m) if hit.location != location]
@@ -76,4 +77,4 @@ def elsewhere(hits: Sequence[Hit], lat: float | None, lon: float | None, apart_m
 
 def _hit(images: Labelled, number: int, score: float) -> Hit:
     facts, (lat, lon) = images.facts[number], images.place(number)
-    return Hit(key=facts["key"], location=facts["location"], lat=lat, lon=lon, score=score)
+    return Hit(key=facts["key"], location=facts["location"], view=View(facts["view"]), lat=lat, lon=lon, score=score)

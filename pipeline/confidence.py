@@ -88,8 +88,11 @@ def read_confidence(path: str, facts: dict[str, Any]) -> Confidence:
         said = storage.read_json(path)
         if said.pop("schema_version") != SCHEMA_VERSION or tuple(said.pop("features")) != FEATURES:
             raise ValueError("another version")
-        said["bins"] = tuple(Bin(**one) for one in said["bins"])
-        confidence = Confidence(**(said | {"model": Logistic(**said["model"])}))
+        model: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in said["model"].items()
+        }
+        bins = tuple(Bin(**one) for one in said["bins"])
+        confidence = Confidence(**(said | {"model": Logistic(**model), "bins": bins}))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"{path} is not a calibration of schema {SCHEMA_VERSION} ({type(error).__name__}); expected what "

@@ -5,6 +5,8 @@ evaluates. What is not a whole table of one network is refused.
 Shapes: B rows of a block, D dimensions of an embedding.
 """
 
+import hashlib
+import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -97,6 +99,12 @@ class FeatureTable:
         return sum(count for _, count in self._kinds())
 
     @property
+    def digest(self) -> str:
+        """Hash of what the whole table holds, from its parts' footers: the same for a copy elsewhere."""
+        said = [[footer.fingerprint, footer.shard_sha256, footer.rows] for footer in self.footers]
+        return hashlib.sha256(json.dumps([self.dimension, list(self.parts), said]).encode()).hexdigest()
+
+    @property
     def views(self) -> list[View]:
         """The views that rows of the selected splits and views have."""
         return sorted({view for view, _ in self._kinds()})
@@ -118,6 +126,26 @@ class FeatureTable:
             lats=np.asarray(whole["lat"].to_numpy(), dtype=np.float64),
             lons=np.asarray(whole["lon"].to_numpy(), dtype=np.float64),
         )
+
+    def only(self, parts: Sequence[str]) -> "FeatureTable":
+        """The same selection of some parts alone, in this order. `counts`, and with it `rows`, remain the whole table's."""
+        return replace(self, parts=tuple(parts), footers=tuple(self._footer_of[name] for name in parts))
+
+    @cached_property
+    def _footer_of(self) -> dict[str, PartFooter]:
+        return dict(zip(self.parts, self.footers, strict=True))
+
+    def numbered(self, columns: Sequence[str]) -> Iterator[tuple[str, pa.Table]]:
+        """Per part that holds selected rows: its name and their columns, first `part_row`, a row's number within the part."""
+        tests = set().union(*(meant.columns for meant in self.selections))
+        for part in self.parts:
+            with open_part(storage.join(self.path, part)) as parquet:
+                found = parquet.read(columns=sorted({*columns, *tests}))
+            found = found.append_column("part_row", pa.array(np.arange(len(found), dtype=np.int32)))
+            for meant in self.selections:
+                found = found.filter(meant.mask(found))
+            if len(found):
+                yield part, found.select(["part_row", *columns])
 
     @overload
     def blocks(self, rows: int | None = None, dtype: Literal["float32"] = "float32") -> Iterator[Floats]: ...

@@ -1,6 +1,6 @@
 """The images of an index on the map: where they lie, and how far apart.
 
-In: the index's `ids.parquet`. Out: keys, locations and positions of its rows, and the gallery's spacing.
+In: an opened index. Out: keys, locations and positions of its rows, and the gallery's spacing.
 Shapes: N rows, 2 = latitude and longitude in degrees (NaN where unknown).
 """
 
@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import pyarrow.parquet as pq
 from scipy.spatial import cKDTree
 
-from pipeline import storage
 from pipeline.consensus import on_sphere
 from pipeline.features import Words
-from pipeline.index import IDS
+from pipeline.index import Index
 from pipeline.metrics import Doubles, Whole
 
 MOST = 200_000
@@ -29,7 +27,7 @@ class GalleryMap:
     locations: Words
     places_N2: Doubles
     rows: int
-    "Of the whole index; these are its first ones, a fair sample, as shards are in the order of hashes."
+    "Of the whole index, of which these may be a sample."
 
     @cached_property
     def spacing_m(self) -> float | None:
@@ -53,18 +51,17 @@ class GalleryMap:
         return np.asarray(known[np.argsort(away_N, kind="stable")[:count]])
 
 
-def read_gallery_map(index: str) -> GalleryMap:
-    """The first rows of an index, at most MOST."""
-    columns: dict[str, list[object]] = {"key": [], "location": [], "lat": [], "lon": []}
-    with storage.open_read(storage.join(index, IDS)) as stream:
-        parquet = pq.ParquetFile(stream)
-        for batch in parquet.iter_batches(MOST, columns=list(columns)):
-            for name, values in columns.items():
-                values.extend(batch[name].to_pylist()[: MOST - len(values)])
-            if len(columns["key"]) == MOST:
-                break
-        rows = parquet.metadata.num_rows
+def gallery_map(index: Index) -> GalleryMap:
+    """The rows of an index, or MOST of them from all over it; without the locations that were removed."""
+    rows = np.unique(np.linspace(0, index.told.rows - 1, min(index.told.rows, MOST)).astype(np.int64))
+    names = index.names(rows[None])
+    location_N = np.asarray(names["location"].to_pylist(), dtype=np.str_)
+    kept_N = np.ones(len(rows), np.bool_)
+    for part in index.told.parts:
+        here_N = (rows >= part.first_row) & (rows < part.first_row + part.rows)
+        kept_N &= ~(here_N & np.isin(location_N, np.array(part.removed, dtype=np.str_)))
+    places_N2 = np.stack([names[name].to_numpy().astype(np.float64) for name in ("lat", "lon")], axis=1)
     return GalleryMap(
-        keys=np.asarray(columns["key"], dtype=np.str_), locations=np.asarray(columns["location"], dtype=np.str_),
-        places_N2=np.array([columns["lat"], columns["lon"]], dtype=np.float64).T.reshape(-1, 2), rows=rows,
+        keys=np.asarray(names["key"].to_pylist(), dtype=np.str_)[kept_N], locations=location_N[kept_N],
+        places_N2=places_N2[kept_N], rows=len(index),
     )  # fmt: skip

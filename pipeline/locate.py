@@ -8,15 +8,15 @@ Shapes: Q photos, D dimensions, K candidates.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from pipeline.confidence import Confidence
 from pipeline.consensus import Consensus, consensus
 from pipeline.features import Floats
-from pipeline.index import Hit
+from pipeline.index import Hit, Searchable
 from pipeline.metrics import Doubles
+from pipeline.where import Where
 
 CONSIDERED = 10
 """Candidates that decide on place and probability, whatever number is shown: a calibration holds for one number only. Ten,
@@ -63,10 +63,10 @@ NOTHING = Answer(position=None, location=None, probability=None, known=False, ca
 
 
 def locate(
-    index: Any,
+    index: Searchable,
     embeddings_QD: Floats,
     k: int = CONSIDERED,
-    where: Any = None,
+    where: Where | None = None,
     confidence: Confidence | None = None,
     spacing_m: float | None = None,
 ) -> list[Answer]:
@@ -77,8 +77,7 @@ def locate(
     Raises InputError for a `where` that is none.
     """
     most = max(k, CONSIDERED)
-    found = index.search(embeddings_QD, most) if where is None else index.search(embeddings_QD, most, where)
-    return answers(found, k, confidence, spacing_m)
+    return answers(index.search(embeddings_QD, most, where), k, confidence, spacing_m)
 
 
 def answers(

@@ -3,6 +3,7 @@
 In: probabilities and what came true. Out: numbers and a picture. NumPy only, no I/O. Shapes: N examples, B bins.
 """
 
+import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -65,7 +66,7 @@ def diagram(bins: Sequence[Bin], title: str) -> str:
     )
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {SIDE + 20} {SIDE + 30}" width="{2 * SIDE}" role="img" '
-        f'aria-label="{title}" font-family="sans-serif" font-size="11" fill="#5d666f">'
+        f'aria-label="{html.escape(title)}" font-family="sans-serif" font-size="11" fill="#5d666f">'
         f'<rect width="100%" height="100%" fill="#fff"/><rect x="{x(0)}" y="{y(1)}" width="{inner}" height="{inner}" '
         f'fill="none" stroke="#e3e0d8"/><path d="M{x(0)} {y(0)}L{x(1)} {y(1)}" stroke="#5d666f" stroke-dasharray="3 4"/>'
         f'<g fill="#1f5c99" fill-opacity=".55" stroke="#1f5c99">{dots}</g>{ticks}'

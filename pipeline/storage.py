@@ -8,7 +8,7 @@ import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, Any
 
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
@@ -83,6 +83,12 @@ def is_folder(path: str) -> bool:
     return bool(filesystem.isdir(inner))
 
 
+def size(path: str) -> int:
+    """Bytes of a file."""
+    filesystem, inner = locate(path)
+    return int(filesystem.size(inner))
+
+
 def read_bytes(path: str) -> bytes:
     filesystem, inner = locate(path)
     data: bytes = filesystem.cat_file(inner)
@@ -108,26 +114,33 @@ def open_read(path: str) -> IO[bytes]:
 
 @contextmanager
 def atomic(path: str) -> Iterator[IO[bytes]]:
-    """A stream to write a file through, which appears under its name when complete or not at all.
+    """A stream to write a file through, which appears under its name when complete or not at all."""
+    with atomic_file(path) as local, open(local, "wb") as stream:
+        yield stream
+
+
+@contextmanager
+def atomic_file(path: str) -> Iterator[str]:
+    """A path on this machine to write a file to, which appears under its own name when complete or not at all.
 
     On a local disk: a hidden temporary neighbour, fsynced and renamed. Elsewhere: one upload at the end, which object
     stores make visible whole.
     """
     filesystem, inner = locate(path)
-    filesystem.makedirs(inner.rsplit("/", 1)[0], exist_ok=True)
     if not isinstance(filesystem, LocalFileSystem):
-        with tempfile.NamedTemporaryFile() as stream:
-            yield cast(IO[bytes], stream)
-            stream.flush()
-            filesystem.put_file(stream.name, inner)
+        filesystem.makedirs(inner.rsplit("/", 1)[0], exist_ok=True)
+        with tempfile.TemporaryDirectory() as scratch:
+            local = os.path.join(scratch, "file")
+            yield local
+            filesystem.put_file(local, inner)
         return
     target = Path(inner)
+    target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}")
     try:
-        with temporary.open("wb") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
+        yield str(temporary)
+        with temporary.open("rb") as written:
+            os.fsync(written.fileno())
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
@@ -168,6 +181,13 @@ def copy(source: str, target: str) -> None:
 def remove(path: str) -> None:
     filesystem, inner = locate(path)
     filesystem.rm_file(inner)
+
+
+def remove_folder(path: str) -> None:
+    """A folder with all that is in it; one that is not there is no fault."""
+    filesystem, inner = locate(path)
+    if filesystem.exists(inner):
+        filesystem.rm(inner, recursive=True)
 
 
 def write_bytes(path: str, data: bytes) -> None:

@@ -4,11 +4,12 @@ In: conditions and what is known of the rows. Out: per row whether it may answer
 Shapes: N rows.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from pipeline.feature_selection import Box
 from pipeline.metrics import Doubles
@@ -49,34 +50,26 @@ class Where:
     view: View | None = None
     locations: frozenset[str] | None = None
 
-    def mask(self, lats_N: Doubles, lons_N: Doubles, views_N: "Coded", locations_N: "Coded") -> Mask:
-        """Which rows are meant. Positions in degrees, NaN where unknown: no comparison with those is true."""
-        meant_N = np.ones(len(lats_N), np.bool_)
+    def mask(self, rows: pa.RecordBatch) -> Mask:
+        """Which rows are meant, by their `view`, `location`, `lat` and `lon`; unknown positions are null."""
+        meant_N = np.ones(len(rows), np.bool_)
         if self.view is not None:
-            meant_N &= views_N.any_of([str(self.view)])
+            meant_N &= _truth(pc.equal(rows["view"], str(self.view)))
         if self.locations is not None:
-            meant_N &= locations_N.any_of(self.locations)
-        if self.box:
-            meant_N &= (self.box.south <= lats_N) & (lats_N <= self.box.north)
-            meant_N &= np.any([(west <= lons_N) & (lons_N <= east) for west, east in self.box.spans()], axis=0)
-        if self.near:
-            meant_N &= _within(lats_N, lons_N, self.near, meant_N)
+            meant_N &= _truth(pc.is_in(rows["location"], pa.array(sorted(self.locations), pa.string())))
+        if self.box or self.near:
+            lats_N, lons_N = (rows[name].to_numpy(zero_copy_only=False) for name in ("lat", "lon"))  # null becomes NaN
+            if self.box:
+                meant_N &= (self.box.south <= lats_N) & (lats_N <= self.box.north)
+                meant_N &= np.any([(west <= lons_N) & (lons_N <= east) for west, east in self.box.spans()], axis=0)
+            if self.near:
+                meant_N &= _within(lats_N, lons_N, self.near, meant_N)
         return meant_N
 
 
-@dataclass(frozen=True, kw_only=True)
-class Coded:
-    """A column of names that repeat: each name once, and per row which it is."""
-
-    names: tuple[str, ...]
-    code_N: npt.NDArray[np.int32]
-
-    def any_of(self, wanted: Iterable[str]) -> Mask:
-        """Which rows have one of these names."""
-        chosen = set(wanted)
-        known = np.array([name in chosen for name in self.names], np.bool_)
-        found: Mask = known[self.code_N] if len(known) else np.zeros(len(self.code_N), np.bool_)
-        return found
+def _truth(found: pa.Array) -> Mask:
+    mask: Mask = found.to_numpy(zero_copy_only=False)
+    return mask
 
 
 def _within(lats_N: Doubles, lons_N: Doubles, near: Near, asked_N: Mask) -> Mask:

@@ -1,6 +1,9 @@
 """Filters: each condition against a loop over the rows, corners and poles included."""
 
+from collections.abc import Sequence
+
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -8,16 +11,22 @@ from hypothesis import strategies as st
 from pipeline.feature_selection import Box
 from pipeline.positions import haversine_m
 from pipeline.records import InputError, View
-from pipeline.where import Coded, Near, Where
+from pipeline.where import Near, Where
 
-NAMES = Coded(names=("a", "b", "c"), code_N=np.array([0, 1, 2, 0, 1], np.int32))
-VIEWS = Coded(names=("satellite", "drone"), code_N=np.array([0, 0, 0, 0, 1], np.int32))
-LATS = np.array([0.0, 10.0, -10.0, 89.9999, np.nan])
-LONS = np.array([179.999, 20.0, -179.0, 0.0, 5.0])
+LATS = [0.0, 10.0, -10.0, 89.9999, None]
+LONS = [179.999, 20.0, -179.0, 0.0, None]
+
+
+def rows_of(
+    lats: Sequence[float | None], lons: Sequence[float | None], views: list[str], names: list[str]
+) -> pa.RecordBatch:
+    columns = [pa.array(lats, pa.float64()), pa.array(lons, pa.float64()), pa.array(views), pa.array(names)]
+    return pa.RecordBatch.from_arrays(columns, ["lat", "lon", "view", "location"])
 
 
 def meant(where: Where) -> list[int]:
-    return np.flatnonzero(where.mask(LATS, LONS, VIEWS, NAMES)).tolist()
+    rows = rows_of(LATS, LONS, ["satellite"] * 4 + ["drone"], ["a", "b", "c", "a", "b"])
+    return np.flatnonzero(where.mask(rows)).tolist()
 
 
 def test_without_conditions_every_row_may_answer() -> None:
@@ -49,8 +58,8 @@ def test_a_circle_holds_what_is_within_its_radius(
     places: list[tuple[float, float]], lat: float, lon: float, radius: float
 ) -> None:
     places_N2 = np.array(places)
-    none = Coded(names=(), code_N=np.zeros(len(places), np.int32))
-    found_N = Where(near=Near(lat=lat, lon=lon, radius_m=radius)).mask(places_N2[:, 0], places_N2[:, 1], none, none)
+    rows = rows_of([lat for lat, _ in places], [lon for _, lon in places], ["drone"] * len(places), ["a"] * len(places))
+    found_N = Where(near=Near(lat=lat, lon=lon, radius_m=radius)).mask(rows)
     assert np.array_equal(found_N, haversine_m(places_N2, np.array([lat, lon])) <= radius)
 
 

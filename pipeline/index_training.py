@@ -1,0 +1,104 @@
+"""What an index learns before it holds anything: a sample of the table in, an empty trained FAISS index out.
+
+Shapes: S rows of the sample, D dimensions.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import faiss
+import numpy as np
+
+from pipeline.features import FeatureTable, Floats
+from pipeline.metrics import Whole
+from pipeline.records import InputError
+
+FAISS: Any = faiss  # whose types know nothing of its keyword arguments
+SPECTRUM_ROWS = 16_384
+"Rows by which the table's directions are weighed."
+ENERGY = 0.99
+"Of the vectors' squared length, what a projection has to keep."
+STEP = 32
+"Projections have a multiple of so many directions."
+
+
+def sample(table: FeatureTable, rows_of_part: dict[str, int], rows: int) -> tuple[Whole, Floats]:
+    """About `rows` row numbers (S,) with their vectors (S, D), of each part its share: the first ones, as parts are ordered by
+    hash. `rows_of_part`: of the table, in its order."""
+    share = min(1.0, rows / max(1, sum(rows_of_part.values())))
+    numbers, blocks = [np.empty(0, np.int64)], [np.empty((0, table.dimension), np.float32)]
+    begin, left = 0, rows
+    for part, held in rows_of_part.items():
+        wanted = min(left, math.ceil(held * share))
+        if wanted:
+            numbers.append(np.arange(begin, begin + wanted))
+            blocks.extend(_first(table.only([part]).blocks(wanted), wanted))
+        begin, left = begin + held, left - wanted
+    return np.concatenate(numbers), np.concatenate(blocks)
+
+
+def _first(blocks: Iterator[Floats], rows: int) -> Iterator[Floats]:
+    for block_BD in blocks:
+        yield block_BD[:rows]
+        rows -= len(block_BD)
+        if rows <= 0:
+            return
+
+
+def effective_dimension(sample_SD: Floats) -> int:
+    """Leading directions that hold ENERGY of the squared length, rounded up to a multiple of STEP."""
+    energy_D = np.maximum(_directions(sample_SD)[0], 0)
+    count = 1 + int(np.searchsorted(np.cumsum(energy_D), ENERGY * energy_D.sum()))
+    return min(int(sample_SD.shape[1]), math.ceil(count / STEP) * STEP)
+
+
+def new_index(factory: str, dimension: int) -> Any:
+    """An empty FAISS index of the inner product, not trained yet.
+
+    Raises InputError where FAISS cannot build it.
+    """
+    try:
+        return FAISS.index_factory(dimension, factory, FAISS.METRIC_INNER_PRODUCT)
+    except RuntimeError:
+        raise InputError(
+            f"--factory is {factory!r}, which FAISS cannot build over {dimension} dimensions; expected a factory string "
+            "such as Flat or IVF1024,PQ64"
+        ) from None
+
+
+def train(index: Any, factory: str, sample_SD: Floats) -> None:
+    """Train a new index on a sample.
+
+    Raises InputError where FAISS cannot, as from too few rows.
+    """
+    if isinstance(FAISS.downcast_index(index), FAISS.IndexPreTransform):
+        first = FAISS.downcast_VectorTransform(FAISS.downcast_index(index).chain.at(0))
+        if isinstance(first, FAISS.PCAMatrix):
+            _set_projection(first, sample_SD)
+    try:
+        index.train(sample_SD)
+    except RuntimeError as error:
+        reason = str(error).rsplit("Error: ", 1)[-1].splitlines()[0]
+        raise InputError(
+            f"--factory is {factory!r}, which FAISS cannot train on {len(sample_SD)} rows ({reason}); expected more rows, or a "
+            "factory string with fewer lists or smaller codes"
+        ) from None
+
+
+def _directions(sample_SD: Floats) -> tuple[Floats, Floats]:
+    """Energy (D,) of the directions and the directions (D, D) as rows, the strongest first.
+
+    Of the second moments, not the covariance: FAISS's own PCA takes the mean away, which changes inner products.
+    """
+    moments_DD = (sample_SD.T @ sample_SD) / len(sample_SD)
+    energy_D, axes_DD = np.linalg.eigh(moments_DD)
+    return energy_D[::-1], axes_DD.T[::-1]
+
+
+def _set_projection(transform: Any, sample_SD: Floats) -> None:
+    kept = np.ascontiguousarray(_directions(sample_SD)[1][: transform.d_out], np.float32)
+    FAISS.copy_array_to_vector(kept.ravel(), transform.A)
+    FAISS.copy_array_to_vector(np.zeros(transform.d_out, np.float32), transform.b)
+    transform.have_bias, transform.is_trained = False, True
+    transform.is_orthonormal = True

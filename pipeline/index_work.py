@@ -1,0 +1,137 @@
+"""The workshop of an index: units of work that survive a kill, made into the parts of an index.
+
+In: a trained index and a table. Out: the files of each part, in the folder of the index. Everything unfinished lies in its
+`_building`, with the plan that it is of; another plan begins anew.
+"""
+
+import json
+import math
+import os
+import tempfile
+from collections.abc import Sequence
+from typing import Any
+
+import faiss
+import ray
+
+from pipeline import cluster, storage
+from pipeline.features import FeatureTable
+from pipeline.index_facts import PartFacts, measure_file
+from pipeline.index_ids import COLUMNS, local_copy, write_ids
+from pipeline.index_part import read_faiss
+from pipeline.index_units import Unit, build_unit, merge, mergeable, units_of
+from pipeline.progress import progress
+
+BUILDING, PLAN, TRAINED = "_building", "plan.json", "trained.faiss"
+
+
+class Workshop:
+    """Where one index is built or grown."""
+
+    def __init__(self, out: str, table: FeatureTable, identity: dict[str, Any], workers: int) -> None:
+        """`identity`: what the work is of; unfinished work of another is thrown away. `workers`: Ray tasks, 0 for none."""
+        self._out, self._table, self._workers = out, table, workers
+        self._scratch = storage.join(out, BUILDING)
+        wanted = json.loads(json.dumps(identity))
+        plan = storage.join(self._scratch, PLAN)
+        if not storage.exists(plan) or storage.read_json(plan) != wanted:
+            self.clear()
+            storage.write_json(plan, wanted)
+
+    def clear(self) -> None:
+        storage.remove_folder(self._scratch)
+
+    def is_trained(self) -> bool:
+        return storage.exists(self._trained)
+
+    def keep_trained(self, index: Any) -> None:
+        with storage.atomic_file(self._trained) as local:
+            faiss.write_index(index, local)
+
+    @property
+    def _trained(self) -> str:
+        return storage.join(self._out, TRAINED)
+
+    def build(
+        self, rows_of_part: dict[str, int], unit_rows: int, part_rows: int, first_row: int = 0, first_part: int = 0
+    ) -> tuple[PartFacts, ...]:
+        """Index these parts of the table, and write the parts of the index, of `part_rows` rows at most.
+
+        `first_row`, `first_part`: how many of each the index has already.
+        """
+        with tempfile.TemporaryDirectory() as scratch:
+            trained = local_copy(self._trained, scratch)
+            whole = mergeable(read_faiss(trained, on_disk=False))
+            units = units_of(rows_of_part, min(unit_rows, part_rows) if whole else part_rows)
+            files = [storage.join(self._scratch, f"unit-{number:06d}.faiss") for number in range(len(units))]
+            self._build_units(units, files)
+            parts: list[PartFacts] = []
+            for group in _groups(units, part_rows, whole):
+                ending = _ending(first_part + len(parts))
+                out = storage.join(self._out, f"index{ending}.faiss")
+                if len(group) == 1:
+                    storage.copy(files[group[0]], out)
+                else:
+                    index = merge(trained, [local_copy(files[number], scratch) for number in group])
+                    with storage.atomic_file(out) as local:
+                        faiss.write_index(index, local)
+                    del index
+                parts.append(self._describe_part([units[number] for number in group], first_row, ending))
+                first_row += parts[-1].rows
+            return tuple(parts)
+
+    def _build_units(self, units: Sequence[Unit], files: Sequence[str]) -> None:
+        missing = [number for number, file in enumerate(files) if not storage.exists(file)]
+        with progress(sum(unit.rows for unit in units), "indexing", "rows") as meter:
+            meter.advance(sum(units[number].rows for number in range(len(units)) if number not in missing))
+            if not self._workers:
+                for number in missing:
+                    rows = build_unit(self._trained, self._table, units[number], files[number], os.cpu_count() or 1)
+                    meter.advance(rows)
+                return
+            cluster.connect()
+            task: Any = ray.remote(num_cpus=1)(build_unit)
+            table, trained = ray.put(self._table), storage.absolute(self._trained)
+
+            def submit(number: int) -> Any:
+                return task.remote(trained, table, units[number], storage.absolute(files[number]), 1)
+
+            for _, rows in cluster.bounded(submit, missing, self._workers):
+                meter.advance(rows)
+
+    def _describe_part(self, units: Sequence[Unit], first_row: int, ending: str) -> PartFacts:
+        """Write whose rows the vectors of a part are, and say what it holds."""
+        held = {name: number for number, name in enumerate(name for unit in units for name in unit.table_parts)}
+        table = self._table.only(list(held))
+        ids = {kind: f"ids{ending}.{kind}" for kind in ("parquet", "arrow")}
+        parquet, arrow = (storage.join(self._out, name) for name in ids.values())
+        write_ids(parquet, arrow, first_row, ((held[name], rows) for name, rows in table.numbered(COLUMNS)))
+        names = (f"index{ending}.faiss", *ids.values())
+        return PartFacts(
+            faiss=names[0], ids=ids["arrow"], first_row=first_row, rows=sum(unit.rows for unit in units),
+            table_parts={name: footer.shard_sha256 for name, footer in zip(table.parts, table.footers, strict=True)},
+            files={name: measure_file(self._out, name) for name in names},
+        )  # fmt: skip
+
+
+def _ending(number: int) -> str:
+    """Of the names of a part's files; the first one has the names that plain readers look for."""
+    return f"-{number:06d}" if number else ""
+
+
+def rows_by_part(table: FeatureTable) -> dict[str, int]:
+    """How many rows of a selection each part of the table holds; parts without any are left out."""
+    return {part: len(rows) for part, rows in table.numbered(["view"])}
+
+
+def _groups(units: Sequence[Unit], part_rows: int, whole: bool) -> list[list[int]]:
+    """Numbers of the units of each part: as many as fit, or one where units cannot be merged."""
+    groups: list[list[int]] = []
+    rows = math.inf
+    for number, unit in enumerate(units):
+        if not whole or rows + unit.rows > part_rows:
+            groups.append([])
+            rows = 0
+        groups[-1].append(number)
+        rows += unit.rows
+    return groups
