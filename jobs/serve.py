@@ -13,11 +13,14 @@ from jobs.cli import run
 from jobs.photo_encoder import PhotoEncoder
 from model.checkpoint import CheckpointError
 from pipeline import cluster, storage
-from pipeline.index import FACTS
+from pipeline.index_facts import FACTS
 from pipeline.progress import console
 from pipeline.records import InputError
-from pipeline.service.answerer import Answerer, Status
+from pipeline.service.answerer import Answerer
 from pipeline.service.app import Service
+from pipeline.service.batcher import Gone
+from pipeline.service.engine import NotReady
+from pipeline.service.live_index import LOOK_EVERY_S
 from pipeline.service.replicas import Crew, Replicas
 from pipeline.service.settings import ServiceSettings
 
@@ -46,11 +49,9 @@ class Settings(ServiceSettings):
 
 def load(checkpoint: str, index: str, shards: str | None, threads: int) -> Answerer:
     """What each replica calls. Raises InputError."""
-    import faiss
     import torch
 
-    torch.set_num_threads(threads)
-    faiss.omp_set_num_threads(threads)
+    torch.set_num_threads(threads)  # FAISS takes OMP_NUM_THREADS, which Ray sets to the replica's cores
 
     def encoder_for(facts: dict[str, Any]) -> PhotoEncoder:
         try:
@@ -83,8 +84,7 @@ async def serve(settings: Settings, token: str | None) -> None:
         Crew(replicas=settings.replicas, cpus=threads, gpus=1 if cluster.gpus() else 0),
         partial(load, storage.absolute(settings.checkpoint), storage.absolute(settings.index), shards, threads),
     )
-    service = Service(settings, replicas, token, abreast=settings.replicas)
-    runner = service.runner()
+    runner = Service(settings, replicas, token, abreast=settings.replicas).runner()
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
@@ -98,20 +98,32 @@ async def serve(settings: Settings, token: str | None) -> None:
                 f"cannot listen on {settings.host} port {settings.port}: {error.strerror}; choose another --port"
             ) from None
         console.print(f"http://{settings.host}:{site.port} listens; loading")
-        loading = asyncio.create_task(asyncio.to_thread(replicas.start))
+        working = asyncio.create_task(work(replicas))
         stopping = asyncio.create_task(stop.wait())
-        await asyncio.wait([loading, stopping], return_when=asyncio.FIRST_COMPLETED)
-        if loading.done():
-            told(loading.result())
-            await stopping
+        await asyncio.wait([working, stopping], return_when=asyncio.FIRST_COMPLETED)
+        if working.done():
+            working.result()  # it ends by an exception only
         console.print("stopping")
+        working.cancel()
     finally:
         await runner.cleanup()
         await asyncio.to_thread(replicas.stop)
 
 
-def told(status: Status) -> None:
-    console.print(f"ready: {status.rows} rows, {status.factory}, network {status.fingerprint[:12]}; Ctrl-C ends it")
+async def work(replicas: Replicas) -> None:
+    """Load, then tell whenever another index answers or one was refused; replicas themselves are silent."""
+    known = await asyncio.to_thread(replicas.start)
+    console.print(f"ready: {known.rows} rows, {known.factory}, network {known.fingerprint[:12]}; Ctrl-C ends it")
+    while True:
+        await asyncio.sleep(LOOK_EVERY_S)
+        try:
+            status = await replicas.status()
+        except (NotReady, Gone):  # another replica is on its way
+            continue
+        if status != known:
+            said = f"another index answers: {status.rows} rows, {status.factory}"
+            console.print(status.refused or said, style="yellow" if status.refused else None)
+            known = status
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from jobs.serve import Settings, load, main
 from model.checkpoint import Checkpoint, dumps
 from model.pvda import FeatureEncoder, PVDAConfig
 from pipeline.features import PartFooter, PartRows, write_part
-from pipeline.index import IndexSettings, build_index
+from pipeline.index_build import IndexSettings, build_index
 from pipeline.records import InputError
 from pipeline.service import replicas
 from pipeline.service.engine import NotReady

@@ -15,7 +15,7 @@ from test_service_question import bomb, photo
 
 from pipeline.index import Hit
 from pipeline.locate import Answer, Position
-from pipeline.records import InputError, Rejection
+from pipeline.records import InputError, Rejection, View
 from pipeline.service.answerer import Outcome, Status
 from pipeline.service.app import Service
 from pipeline.service.batcher import Gone
@@ -31,7 +31,14 @@ Client = TestClient[Any, Any]
 def answer_of(question: Question) -> Answer:
     """Made up, as many candidates as were asked for."""
     hits = tuple(
-        Hit(key=f"gallery-{n}", location=f"{n:04d}", lat=47.0 + n / 1000, lon=8.0, score=0.9 - n / 100)
+        Hit(
+            key=f"gallery-{n}",
+            location=f"{n:04d}",
+            view=View.SATELLITE,
+            lat=47.0 + n / 1000,
+            lon=8.0,
+            score=0.9 - n / 100,
+        )
         for n in range(question.top)
     )
     return Answer(
@@ -315,6 +322,9 @@ def test_where_there_is_a_token_only_pages_and_health_go_without() -> None:
         assert (await post(client, photo(), Authorization=f"Bearer {TOKEN}")).status == 200
         for path in ("/", "/page.js", "/style.css", "/api", "/openapi.json", "/health"):
             assert (await client.get(path)).status == 200
+        assert await (await client.get("/health")).json() == {"ready": True}
+        trusted = await client.get("/health", headers={"Authorization": f"Bearer {TOKEN}"})
+        assert (await trusted.json())["rows"] == 3
 
     served(test, token=TOKEN)
 

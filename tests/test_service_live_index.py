@@ -15,7 +15,7 @@ from aiohttp.test_utils import TestClient, TestServer
 from test_service_question import photo
 
 from pipeline.features import Floats, PartFooter, PartRows, write_part
-from pipeline.index import IndexSettings, build_index
+from pipeline.index_build import IndexSettings, build_index
 from pipeline.locate import Answer
 from pipeline.records import InputError, Rejection
 from pipeline.service import live_index
@@ -84,7 +84,7 @@ def test_a_new_index_is_taken_over_and_a_search_under_way_keeps_the_old_one(path
     assert live.current is held
     replace(path, make_index(tmp_path / "new", 5))
     live.look()
-    assert (live.current.index.facts["rows"], live.refused) == (5, None)
+    assert (len(live.current.index), live.refused) == (5, None)
     assert held.index.search(np.eye(1, DIMENSION, 2, dtype=np.float32), 1)[0][0].key == "gallery-2"
 
 
@@ -123,7 +123,7 @@ def test_another_networks_index_is_refused(path: Path, tmp_path: Path) -> None:
     live = LiveIndex(str(path))
     replace(path, make_index(tmp_path / "new", 5, fingerprint="e" * 64))
     live.look()
-    assert live.current.index.facts["rows"] == 3
+    assert len(live.current.index) == 3
     assert "made by network eeeeeeeeeeee" in str(live.refused)
 
 
@@ -140,10 +140,10 @@ def test_a_refused_index_is_not_opened_at_each_look_but_again_after_a_while(
     hidden.rename(path / "index.faiss")
     replace(path, new)
     live.look()
-    assert live.current.index.facts["rows"] == 3
+    assert len(live.current.index) == 3
     monkeypatch.setattr(live_index, "RETRY_S", 0.0)
     live.look()
-    assert live.current.index.facts["rows"] == 5
+    assert len(live.current.index) == 5
     assert not live.refused
 
 
@@ -163,9 +163,9 @@ def test_an_index_written_once_more_while_it_is_opened_is_left_for_the_next_look
 
     monkeypatch.setattr(live_index, "open_whole", slow)
     live.look()
-    assert live.current.index.facts["rows"] == 3
+    assert len(live.current.index) == 3
     live.look()
-    assert live.current.index.facts["rows"] == 5
+    assert len(live.current.index) == 5
 
 
 def test_without_an_index_nothing_starts(tmp_path: Path) -> None:

@@ -65,11 +65,10 @@ class Answerer:
 
     def status(self) -> Status:
         opened = self.live.current
-        facts = opened.index.facts
         return Status(
-            fingerprint=facts["fingerprint"],
-            rows=facts["rows"],
-            factory=facts["factory"],
+            fingerprint=opened.index.told.fingerprint,
+            rows=len(opened.index),
+            factory=opened.index.told.factory,
             calibrated=opened.confidence is not None,
             refused=self.live.refused,
         )

@@ -109,12 +109,14 @@ class Service:
         """Raise Refusal where this request is nobody's business, whatever it asks."""
         if request.headers.get("Sec-Fetch-Site") == "cross-site" and request.path not in OPEN:
             raise Refusal(403, "another site's page asks, expected the service's own; open the service itself")
-        if self._token is None or request.path in OPEN:
-            return
-        given = request.headers.get("Authorization", "")
-        if not hmac.compare_digest(given.encode("utf-8", "surrogateescape"), f"Bearer {self._token}".encode()):
-            found = "another token" if given else "no token"
+        if request.path not in OPEN and not self._trusted(request):
+            found = "another token" if "Authorization" in request.headers else "no token"
             raise Refusal(401, f"found {found}, expected the header Authorization: Bearer with the service's token")
+
+    def _trusted(self, request: web.BaseRequest) -> bool:
+        """Whether a request brings the token, where there is one; compared in a time that tells nothing of it."""
+        given = request.headers.get("Authorization", "").encode("utf-8", "surrogateescape")
+        return self._token is None or hmac.compare_digest(given, f"Bearer {self._token}".encode())
 
     async def _expect(self, request: web.Request) -> None:
         """A client that asks before it sends (`Expect: 100-continue`) is told to; one that will be refused is not."""
@@ -169,8 +171,10 @@ class Service:
                 status = await self._engine.status()
         except (NotReady, Gone, TimeoutError) as error:
             why = str(error) or "no answer from the replicas"
-            return web.json_response({"ready": False, "why": why}, status=503, headers={"Retry-After": "5"})
-        return web.json_response({"ready": True} | dataclasses.asdict(status))
+            body = {"ready": False} | ({"why": why} if self._trusted(request) else {})
+            return web.json_response(body, status=503, headers={"Retry-After": "5"})
+        details = dataclasses.asdict(status) if self._trusted(request) else {}  # they name paths of this machine
+        return web.json_response({"ready": True} | details)
 
     async def _metrics(self, request: web.Request) -> web.Response:
         return web.Response(body=self.metrics.text(), headers={"Content-Type": CONTENT_TYPE})

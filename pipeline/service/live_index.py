@@ -7,15 +7,14 @@ holds a reference, so nothing is taken from under a search.
 import threading
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from pipeline import confidence, storage
 from pipeline.confidence import Confidence, find_confidence
-from pipeline.gallery_map import read_gallery_map
-from pipeline.index import FACTS, Index
-from pipeline.progress import console
+from pipeline.gallery_map import gallery_map
+from pipeline.index import Index
+from pipeline.index_facts import FACTS, check_files
 from pipeline.records import InputError
 
 LOOK_EVERY_S = 2.0
@@ -44,7 +43,7 @@ def open_whole(path: str) -> Opened:
     """Raises InputError when there is no index at `path`, or a calibration that is another's."""
     index = Index(path)
     calibration = find_confidence(path, index.facts)
-    spacing_m = None if calibration else read_gallery_map(path).spacing_m
+    spacing_m = None if calibration else gallery_map(index).spacing_m
     return Opened(index=index, confidence=calibration, spacing_m=spacing_m)
 
 
@@ -72,7 +71,7 @@ class LiveIndex:
             return
         try:
             fresh = open_whole(self._path)
-            prove(fresh.index, self.current.index.facts)
+            prove(fresh.index, self.current.index)
         except Exception as error:  # FAISS, Arrow, JSON and file systems each raise their own over broken files
             self._refuse(said, error)
             return
@@ -80,7 +79,6 @@ class LiveIndex:
             return
         self.current, self.refused = fresh, None
         self._taken = self._seen = said
-        console.print(f"a new index at {self._path} is in use: {fresh.index.facts['rows']} rows")
 
     def _refuse(self, said: Said, error: Exception) -> None:
         why = str(error).strip().split("\n")[0] or type(error).__name__
@@ -100,14 +98,16 @@ def _read(path: str) -> bytes | None:
         return None
 
 
-def prove(fresh: Index, old: dict[str, Any]) -> None:
-    """Raises InputError where an index cannot stand in for one with the facts `old`, and whatever a trial search raises."""
-    made_by, expected = fresh.facts["fingerprint"], old["fingerprint"]
+def prove(fresh: Index, old: Index) -> None:
+    """Raises InputError where an index cannot stand in for the old one, and whatever a trial search raises."""
+    made_by, expected = fresh.told.fingerprint, old.told.fingerprint
     if made_by != expected:
         raise InputError(
             f"it was made by network {made_by[:12]}, the service's is {expected[:12]}, expected the same; start the service "
             "again with the other network"
         )
-    trial_1D = np.full((1, fresh.facts["dimension"]), fresh.facts["dimension"] ** -0.5, np.float32)
+    for part in fresh.told.parts:
+        check_files(fresh.path, part.files, whole=True)  # every byte: a damaged list is met by few searches, and late
+    trial_1D = np.full((1, fresh.dimension), fresh.dimension**-0.5, np.float32)
     if not fresh.search(trial_1D, 1)[0]:
         raise InputError("a trial search found nothing, expected a row; build the index again")

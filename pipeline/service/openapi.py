@@ -38,8 +38,8 @@ def describe(settings: ServiceSettings) -> dict[str, Any]:
     kinds = ("image/jpeg", "image/png", "image/webp", "application/octet-stream")
     locate = {
         "summary": "Where was this photo taken?",
-        "description": "The photo is the whole body, with the fields in the query; or a form's field `photo`, with the fields "
-        f"beside it. JPEG, PNG or WebP, at most {settings.max_megabytes:g} MB and {settings.max_megapixels:g} megapixels. "
+        "description": "The photo is the whole body, with the fields in the query; or the field photo of a form, with the "
+        f"others beside it. JPEG, PNG or WebP, at most {settings.max_megabytes:g} MB and {settings.max_megapixels:g} megapixels. "
         "Rough position: all of lat, lon and radius_m or none.",
         "parameters": [
             {"name": name, "in": "query", "required": False, "description": schema["description"],
@@ -56,9 +56,12 @@ def describe(settings: ServiceSettings) -> dict[str, Any]:
     }  # fmt: skip
     health = {
         "summary": "Is it ready?",
-        "description": "Ready when network and index are loaded. `refused` says why a newer index at the path is not in use.",
+        "description": "Ready when network and index are loaded. Where there is a token, only who brings it is told more.",
         "security": [],
-        "responses": {"200": _answers("Ready.", "Health"), "503": _answers("Not ready yet; `why` says why.", "Health")},
+        "responses": {
+            "200": _answers("Ready.", "Health"),
+            "503": _answers("Not ready yet; the field why says why.", "Health"),
+        },
     }
     metrics = {
         "summary": "What it counts",
@@ -104,6 +107,7 @@ def _schemas() -> dict[str, Any]:
     )
     candidate = _object(
         key=_says(TEXT, "The gallery image."), location=_says(TEXT, "The place that it shows."),
+        view=_says(TEXT, "From where it was taken: satellite, drone, street or google."),
         lat=MAYBE, lon=MAYBE, score=_says(NUMBER, "Cosine similarity, -1 to 1."),
     )  # fmt: skip
     answer = _object(

@@ -19,7 +19,7 @@ function take(file) {
   shown.src = URL.createObjectURL(file);
   shown.hidden = false;
   $("invitation").hidden = true;
-  $("name").textContent = `${file.name || "pasted photo"}, ${(file.size / 1e6).toFixed(1)} MB`;
+  $("name").textContent = `${file.name || "pasted photo"}, ${file.size < 1e6 ? `${Math.ceil(file.size / 1e3)} kB` : `${(file.size / 1e6).toFixed(1)} MB`}`;
   $("ask").disabled = false;
   ask();
 }
@@ -60,8 +60,8 @@ function show(answer) {
   $("confidence").textContent = probability === null ? "not calibrated" : `${Math.round(100 * probability)} %`;
   $("confidence").className = probability === null ? "" : answer.known ? "sure" : "unknown";
   $("candidates").replaceChildren(...candidates.map((candidate, at) => row(candidate, at, position)));
-  draw(answer);
   $("answer").hidden = false;
+  draw(answer);
 }
 
 function row(candidate, at, position) {
@@ -82,7 +82,7 @@ function row(candidate, at, position) {
   bar.append(document.createElement("i"));
   bar.firstChild.style.width = `${100 * Math.max(0, Math.min(1, candidate.score))}%`;
   cell(candidate.score.toFixed(3)).append(bar);
-  cell(position && candidate.lat !== null ? metres(distance(position, candidate)) : "");
+  cell(position && candidate.lat !== null ? metres(distance(position, candidate)) : "", "away");
   return line;
 }
 
@@ -99,46 +99,50 @@ function distance(a, b) {
   return ((2 * 180) / Math.PI) * PER_DEGREE * Math.asin(Math.min(1, Math.sqrt(h)));
 }
 
-// The map: metres east and north of the answer, north up, as large as all candidates and the circles need.
-const WIDE = 640, HIGH = 400, EDGE = 46;
+// The map: metres east and north of the answer, north up, as large as all candidates and the circle need.
+const HIGH = 380, EDGE = 46;
+let drawn; // the answer on the map, to be drawn again where the window changes
 
-function draw({ position, candidates, location }) {
+function draw(answer) {
+  drawn = answer;
+  const { position, candidates, location } = answer;
   const placed = candidates.filter((candidate) => candidate.lat !== null);
   const middle = position || placed[0];
-  $("map").classList.toggle("empty", !middle);
   $("map").toggleAttribute("hidden", !middle);
   if (!middle) return;
+  const wide = $("map").parentElement.clientWidth;
+  $("map").setAttribute("viewBox", `0 0 ${wide} ${HIGH}`);
   const east = (lon) => ((((lon - middle.lon + 540) % 360) - 180) * Math.cos(radians(middle.lat))) * PER_DEGREE;
   const at = (point) => ({ x: east(point.lon), y: (point.lat - middle.lat) * PER_DEGREE });
   const points = placed.map((candidate) => ({ ...at(candidate), candidate, rank: candidates.indexOf(candidate) + 1 }));
   const reach = Math.max(position ? position.radius_m : 0, 10);
   const xs = [-reach, reach, ...points.map((p) => p.x)], ys = [-reach, reach, ...points.map((p) => p.y)];
   const [left, right, low, high] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
-  const scale = Math.min((WIDE - 2 * EDGE) / (right - left), (HIGH - 2 * EDGE) / (high - low)); // pixels per metre
-  const to = ({ x, y }) => ({ x: WIDE / 2 + (x - (left + right) / 2) * scale, y: HIGH / 2 - (y - (low + high) / 2) * scale });
-  const drawn = [];
+  const scale = Math.min((wide - 2 * EDGE) / (right - left), (HIGH - 2 * EDGE) / (high - low)); // pixels per metre
+  const to = ({ x, y }) => ({ x: wide / 2 + (x - (left + right) / 2) * scale, y: HIGH / 2 - (y - (low + high) / 2) * scale });
+  const shapes = [];
   const rule = nice(110 / scale);
   const origin = to({ x: 0, y: 0 });
-  for (let x = origin.x % (rule * scale); x < WIDE; x += rule * scale) drawn.push(shape("line", { class: "grid", x1: x, x2: x, y1: 0, y2: HIGH }));
-  for (let y = origin.y % (rule * scale); y < HIGH; y += rule * scale) drawn.push(shape("line", { class: "grid", x1: 0, x2: WIDE, y1: y, y2: y }));
+  for (let x = origin.x % (rule * scale); x < wide; x += rule * scale) shapes.push(shape("line", { class: "grid", x1: x, x2: x, y1: 0, y2: HIGH }));
+  for (let y = origin.y % (rule * scale); y < HIGH; y += rule * scale) shapes.push(shape("line", { class: "grid", x1: 0, x2: wide, y1: y, y2: y }));
   const rough = { lat: Number(value("lat")), lon: Number(value("lon")), radius_m: Number(value("radius_m")) };
   if (rough.radius_m > 0) {
     const centre = to(at(rough));
-    drawn.push(shape("circle", { class: "near", cx: centre.x, cy: centre.y, r: rough.radius_m * scale }));
+    shapes.push(shape("circle", { class: "near", cx: centre.x, cy: centre.y, r: rough.radius_m * scale }));
   }
-  if (position) drawn.push(shape("circle", { class: "radius", cx: origin.x, cy: origin.y, r: Math.max(11, position.radius_m * scale) }));
+  if (position) shapes.push(shape("circle", { class: "radius", cx: origin.x, cy: origin.y, r: Math.max(11, position.radius_m * scale) }));
   for (const point of points.reverse()) {
     const { x, y } = to(point);
     const dot = shape("circle", { class: point.candidate.location === location ? "dot best" : "dot", cx: x, cy: y, r: 8 });
     dot.append(shape("title", {}, `${point.rank}: ${point.candidate.location}, similarity ${point.candidate.score.toFixed(3)}`));
-    drawn.push(dot, shape("text", { class: "rank", x, y: y + 3.5 }, point.rank));
+    shapes.push(dot, shape("text", { class: "rank", x, y: y + 3.5 }, point.rank));
   }
-  if (position) drawn.push(shape("path", { class: "here", d: `M${origin.x - 16} ${origin.y}h6m20 0h6M${origin.x} ${origin.y - 16}v6m0 20v6` }));
-  drawn.push(shape("line", { class: "rule", x1: 16, x2: 16 + rule * scale, y1: HIGH - 16, y2: HIGH - 16 }));
-  drawn.push(shape("text", { x: 16, y: HIGH - 23 }, metres(rule)));
-  drawn.push(shape("path", { class: "north", d: `M${WIDE - 24} 14l6 16-6-4-6 4z` }), shape("text", { x: WIDE - 28, y: 44 }, "N"));
+  if (position) shapes.push(shape("path", { class: "here", d: `M${origin.x - 16} ${origin.y}h6m20 0h6M${origin.x} ${origin.y - 16}v6m0 20v6` }));
+  shapes.push(shape("line", { class: "rule", x1: 16, x2: 16 + rule * scale, y1: HIGH - 16, y2: HIGH - 16 }));
+  shapes.push(shape("text", { x: 16, y: HIGH - 23 }, metres(rule)));
+  shapes.push(shape("path", { class: "north", d: `M${wide - 24} 14l6 16-6-4-6 4z` }), shape("text", { x: wide - 28, y: 44 }, "N"));
   $("map-title").textContent = `Map of the answer and ${placed.length} candidates with positions; the line is ${metres(rule)}`;
-  $("drawn").replaceChildren(...drawn);
+  $("drawn").replaceChildren(...shapes);
 }
 
 function nice(length) {
@@ -158,6 +162,7 @@ $("form").addEventListener("submit", (event) => {
   event.preventDefault();
   if (photo) ask();
 });
+addEventListener("resize", () => $("answer").hidden || draw(drawn));
 addEventListener("paste", (event) => take(event.clipboardData.files[0]));
 for (const kind of ["dragenter", "dragover", "dragleave", "drop"])
   addEventListener(kind, (event) => {
@@ -167,7 +172,8 @@ for (const kind of ["dragenter", "dragover", "dragleave", "drop"])
   });
 fetch("/health")
   .then((response) => response.json())
-  .then((health) => {
-    $("index").textContent = health.ready ? `${health.rows.toLocaleString("en")} images in the gallery, network ${health.fingerprint.slice(0, 12)}` : `Not ready yet: ${health.why}.`;
+  .then(({ ready, rows, fingerprint, why }) => {
+    const known = rows === undefined ? "Ready" : `${rows.toLocaleString("en")} images in the gallery, network ${fingerprint.slice(0, 12)}`;
+    $("index").textContent = ready ? known : `Not ready yet${why ? `: ${why}` : ""}.`;
   })
   .catch(() => ($("index").textContent = "The service does not answer."));
