@@ -21,7 +21,7 @@ from pipeline import answer_files, rejects, storage
 from pipeline.answer_files import Located
 from pipeline.answer_page import Place, Surroundings, render
 from pipeline.confidence import Confidence, find_confidence, read_confidence
-from pipeline.flight import settle
+from pipeline.flight import motion_over, settle
 from pipeline.gallery_map import gallery_map
 from pipeline.index import Index
 from pipeline.locate import Answer, locate
@@ -59,6 +59,8 @@ class Settings:
     "The photos are of one flight: each is placed in the light of all, and GeoJSON begins with the flight's line."
     max_speed: float = 25.0
     "Of the flight, metres per second over the ground; 25 is beyond most multicopters."
+    elsewhere: float = 0.1
+    "Of the flight, the share of photos expected to show no place of the gallery."
     times: str | None = None
     "CSV table with the columns photo and time (seconds or ISO 8601); by default the camera's own times."
     interval: float | None = None
@@ -81,7 +83,7 @@ class Settings:
             )
         if self.interval is not None and not self.interval > 0:
             raise InputError(f"--interval is {self.interval}, expected seconds above 0")
-        Motion(max_speed=self.max_speed)
+        Motion(max_speed=self.max_speed, elsewhere=self.elsewhere)  # which checks them
 
 
 def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None) -> list[Located]:
@@ -111,7 +113,7 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
         times = times_of(asked, settings)
         asked = [replace(query, taken_at=time) for query, time in zip(asked, times, strict=True)]
         start = Start(lat=near.lat, lon=near.lon, radius_m=near.radius_m) if near else None
-        motion = Motion(max_speed=settings.max_speed, slack_m=gallery.spacing_m or 0.0)
+        motion = motion_over(gallery, settings.max_speed, settings.elsewhere)
         answers = settle(answers, [seconds(time) for time in times], confidence, motion, start)
     answered = dict(zip((query.name for query in asked), zip(asked, answers, strict=True), strict=True))
     located = [

@@ -1,7 +1,7 @@
 """The images of an index on the map: where they lie, and how far apart.
 
 In: an opened index. Out: keys, locations and positions of its rows, and the gallery's spacing.
-Shapes: N rows, 2 = latitude and longitude in degrees (NaN where unknown).
+Shapes: N rows, P distinct positions, 2 = latitude and longitude in degrees (NaN where unknown).
 """
 
 from dataclasses import dataclass
@@ -30,18 +30,26 @@ class GalleryMap:
     "Of the whole index, of which these may be a sample."
 
     @cached_property
+    def distinct_P2(self) -> Doubles:
+        """Positions (P, 2) that are known, each once."""
+        return np.unique(self.places_N2[~np.isnan(self.places_N2).any(axis=1)], axis=0)
+
+    @property
+    def distinct(self) -> float:
+        """How many there are in the whole index, about."""
+        return len(self.distinct_P2) * self.rows / max(len(self.keys), 1)
+
+    @cached_property
     def spacing_m(self) -> float | None:
         """Median distance from a position to the next other one, metres; None where no two are known.
 
         From a sample of n of N rows it is taken for sqrt(n / N) of what the sample shows, as on an area.
         """
-        known_N2 = self.places_N2[~np.isnan(self.places_N2).any(axis=1)]
-        distinct_N2 = np.unique(known_N2, axis=0)
-        if len(distinct_N2) < 2:
+        if len(self.distinct_P2) < 2:
             return None
-        points_N3 = on_sphere(distinct_N2)
-        apart_N2, _ = cKDTree(points_N3).query(points_N3, k=2)
-        return float(np.median(apart_N2[:, 1]) * np.sqrt(len(self.keys) / self.rows))
+        points_P3 = on_sphere(self.distinct_P2)
+        apart_P2, _ = cKDTree(points_P3).query(points_P3, k=2)
+        return float(np.median(apart_P2[:, 1]) * np.sqrt(len(self.keys) / self.rows))
 
     def nearest(self, lat: float, lon: float, count: int) -> Whole:
         """Numbers of the rows nearest to a position, nearest first, at most `count`."""

@@ -7,6 +7,7 @@ all chains are weighed, by the Viterbi and the forward-backward recursions over 
 Shapes: T photos, K candidates of one, N candidates of all photos in time order, M of those of the photos before one.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -32,12 +33,24 @@ class Motion:
     "Metres per second over the ground; 25 is beyond most multicopters, fixed wings fly faster."
     slack_m: float = 0.0
     "Metres added to every way: how far a photo may lie from its gallery image's position, at both ends."
+    places: float = 1.0
+    "Of the gallery: a photo by itself may show any of them."
+    spacing_m: float = math.inf
+    "Of the gallery: a square of this side for each place."
+    elsewhere: float = 0.1
+    "Share of the photos that are expected to show no place of the gallery."
 
     def __post_init__(self) -> None:
         if not self.max_speed > 0:
             raise InputError(f"--max-speed is {self.max_speed}, expected metres per second above 0")
-        if not self.slack_m >= 0:
-            raise InputError(f"the slack of the motion is {self.slack_m} m, expected 0 or more")
+        if not 0 < self.elsewhere < 1:
+            raise InputError(f"--elsewhere is {self.elsewhere}, expected a share above 0 and below 1")
+
+    def gain(self, way_m: Doubles) -> Doubles:
+        """Log of how much likelier a place is for lying within so many metres of where the UAV was: the gallery's places over
+        those within reach, at least 1. A photo's own chances suppose that it may be anywhere."""
+        within = np.pi * (way_m / self.spacing_m) ** 2
+        return np.asarray(np.log(np.maximum(self.places / np.maximum(within, 1.0), 1.0)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,8 +91,8 @@ class Smoothed:
 def smooth(photos: Sequence[Photo], motion: Motion, start: Start | None = None) -> list[Smoothed]:
     """The likeliest track through photos that are in time order.
 
-    A chain's weight is the product of its photos' chances; one that is faster than the motion allows has none. Takes time and
-    memory for all pairs of candidates: a flight of 1,000 photos some seconds.
+    A chain's weight is the product of its photos' chances and of what the ways between them gain; one that is faster than the
+    motion allows has none. Takes time for all pairs of candidates: a flight of 1,000 photos some seconds.
     """
     if not photos:
         return []
@@ -108,7 +121,7 @@ class _Flight:
     time_N: Doubles
     gain_N: Doubles
     entry_N: Doubles
-    "0 where a chain may begin, else -inf."
+    "What beginning a chain at a candidate gains by the rough start; -inf where none may begin."
     spans: tuple[tuple[int, int], ...]
     "Of each photo's candidates."
     motion: Motion
@@ -123,22 +136,24 @@ class _Flight:
         if start:
             begun_13 = on_sphere(np.array([[start.lat, start.lon]]))
             way_N = start.radius_m + motion.slack_m + motion.max_speed * (time_N - photos[0].time_s)
-            entry_N = np.where(_reach(begun_13, point_N3, way_N[None])[0], 0.0, -np.inf)
+            entry_N = np.where(_reach(begun_13, point_N3, way_N[None])[0], motion.gain(way_N), -np.inf)
         return _Flight(
             point_N3=point_N3, time_N=time_N, gain_N=np.where(np.isnan(place_N2).any(axis=1), -np.inf, gain_N),
             entry_N=entry_N, spans=tuple(zip([0, *ends[:-1]], ends, strict=True)), motion=motion,
         )  # fmt: skip
 
-    def reachable(self, some: slice, others: slice) -> npt.NDArray[np.bool_]:
-        """Which of the other candidates can be flown to from which of some."""
-        way = self.motion.max_speed * np.abs(self.time_N[others][None] - self.time_N[some][:, None])
-        return _reach(self.point_N3[some], self.point_N3[others], way + self.motion.slack_m)
+    def flown(self, some: slice, others: slice) -> Doubles:
+        """What flying from some candidates (M) to others (K) gains (M, K); -inf where it is too far."""
+        way_MK = (
+            self.motion.max_speed * np.abs(self.time_N[others][None] - self.time_N[some][:, None]) + self.motion.slack_m
+        )
+        return np.where(_reach(self.point_N3[some], self.point_N3[others], way_MK), self.motion.gain(way_MK), -np.inf)
 
     def forward(self, combine: Combine, trace: bool = False) -> tuple[Doubles, Whole]:
         """Weight of the chains up to and with each candidate, and for `trace` the candidate before it (-1: none)."""
         weight_N, came_from_N = np.full(len(self.gain_N), -np.inf), np.full(len(self.gain_N), -1)
         for begin, end in self.spans:
-            to_MK = np.where(self.reachable(slice(0, begin), slice(begin, end)), weight_N[:begin, None], -np.inf)
+            to_MK = weight_N[:begin, None] + self.flown(slice(0, begin), slice(begin, end))
             to_MK = np.concatenate([to_MK, self.entry_N[None, begin:end]])  # the last row: nothing came before
             weight_N[begin:end] = self.gain_N[begin:end] + combine(to_MK)
             if trace and end > begin:
@@ -152,7 +167,7 @@ class _Flight:
         for begin, end in reversed(self.spans):
             later = slice(end, len(self.gain_N))
             follow_N = (self.gain_N + weight_N)[later]
-            from_MK = np.where(self.reachable(later, slice(begin, end)), follow_N[:, None], -np.inf)
+            from_MK = follow_N[:, None] + self.flown(later, slice(begin, end))
             weight_N[begin:end] = _logsum(np.concatenate([from_MK, np.zeros((1, end - begin))]))
         return weight_N
 

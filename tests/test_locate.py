@@ -138,6 +138,13 @@ def test_a_flight_settles_a_doubtful_photo_whatever_the_order_of_its_answers() -
     assert found[1].known
 
 
+def test_the_fewer_photos_of_a_flight_are_expected_elsewhere_the_surer_the_others() -> None:
+    doubtful = [hit("a", 0.5), hit("z", 0.45, 50_000)]
+    single = answers([doubtful], 5, confidence())
+    rare, common = (settle(single, [0], confidence(), Motion(elsewhere=share))[0] for share in (0.01, 0.9))
+    assert (rare.known, common.known) == (True, False)
+
+
 def test_a_photo_that_the_track_passes_over_is_unknown() -> None:
     far = [hit("b", 0.9, 9000), hit("z", 0.2, 50_000)]
     near = [[hit(name, 0.9, north), hit("z", 0.2, 50_000)] for name, north in (("a", 0), ("c", 50), ("d", 100))]

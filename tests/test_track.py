@@ -99,8 +99,8 @@ def chains(flight: list[Photo], motion: Motion, start: Start | None) -> dict[tup
             here: Doubles = one.places_K2[at]
             if last is not None:
                 away = float(haversine_m(np.array(last[1:3]), here))
-                if away > motion.max_speed * (one.time_s - last[0]) + motion.slack_m + last[3]:
-                    weight = 0.0
+                way = motion.max_speed * (one.time_s - last[0]) + motion.slack_m + last[3]
+                weight *= float(np.exp(motion.gain(np.array(way)))) if away <= way else 0.0
             last = (one.time_s, float(here[0]), float(here[1]), 0.0)
         weights[chain] = weight
     return weights
@@ -114,7 +114,7 @@ def test_track_and_probabilities_are_those_of_all_chains(seed: int) -> None:
         count = int(rng.integers(0, 4))
         share = rng.dirichlet(np.ones(count + 1))
         flight.append(photo(float(time), rng.uniform(0, 600, count).tolist(), share[:count].tolist()))
-    motion = Motion(max_speed=12, slack_m=20)
+    motion = Motion(max_speed=12, slack_m=20, places=40 if seed % 3 else 1, spacing_m=50)
     start = Start(lat=300 * METRE, lon=8.0, radius_m=200) if seed % 2 else None
     weights = chains(flight, motion, start)
     total = sum(weights.values())
@@ -126,6 +126,22 @@ def test_track_and_probabilities_are_those_of_all_chains(seed: int) -> None:
             assert chance == pytest.approx(with_it / total, abs=1e-9)
 
 
-def test_a_motion_that_goes_nowhere_is_refused() -> None:
+def test_a_place_gains_by_how_few_others_are_within_reach() -> None:
+    """Of 100 places on squares of 10 m, 20 lie within a circle of 2,000 square metres: five times as likely. Beyond all and
+    within one there is nothing more to gain."""
+    motion = Motion(places=100, spacing_m=10)
+    ways = np.array([np.sqrt(2000 / np.pi), 1e6, 0.0])
+    assert np.exp(motion.gain(ways)) == pytest.approx([5, 1, 100])
+
+
+def test_near_places_are_likelier_than_elsewhere_though_no_photo_alone_says_so() -> None:
+    flight = [photo(10.0 * n, [100.0 * n, 9000], [0.2, 0.2]) for n in range(4)]
+    assert [one.chosen for one in smooth(flight, Motion())] == [None] * 4
+    assert [one.chosen for one in smooth(flight, Motion(places=1000, spacing_m=100))] == [0] * 4
+
+
+def test_a_motion_that_makes_no_sense_is_refused() -> None:
+    with pytest.raises(InputError, match="--elsewhere is 1"):
+        Motion(elsewhere=1)
     with pytest.raises(InputError, match="--max-speed is 0"):
         Motion(max_speed=0)
