@@ -237,12 +237,26 @@ def test_photos_beyond_the_queue_are_told_when_to_come_again_and_those_in_it_are
             await asyncio.sleep(0.01)  # the first went to work alone
         refused = await post(client, photo())
         assert 1 <= int(refused.headers["Retry-After"]) <= 60
-        assert "waiting" in await said(refused, 503)
+        assert "5 photos are before it" in await said(refused, 503)
         engine.gate.set()
         assert [response.status for response in await asyncio.gather(*asked)] == [200] * 5
         assert (await post(client, photo())).status == 200
 
     served(test, batch=2, waiting=3)
+
+
+def test_a_photo_whose_turn_would_come_too_late_is_told_so_at_once() -> None:
+    async def test(client: Client, engine: Engine) -> None:
+        engine.gate.clear()
+        asked = [asyncio.create_task(post(client, photo())) for _ in range(3)]
+        while "pvda_waiting_photos 2.0" not in await (await client.get("/metrics")).text():
+            await asyncio.sleep(0.01)
+        assert "before it" in await said(await post(client, photo()), 503)  # two batches of a guessed second each
+        engine.gate.set()
+        assert [response.status for response in await asyncio.gather(*asked)] == [200] * 3
+        assert (await post(client, photo())).status == 200
+
+    served(test, batch=1, timeout_s=1.9)
 
 
 def test_an_answer_that_takes_too_long_is_not_waited_for() -> None:

@@ -130,8 +130,8 @@ class Service:
 
     def _refuse_early(self, request: web.Request) -> None:
         """Raise Refusal for what can be refused before the body is read; so what waits is bounded in number and in bytes."""
-        if self._taken >= self._places:
-            raise Refusal(503, f"{self._taken} photos are waiting; send this one again later", self._batcher.wait_s)
+        if self._taken >= self._places or self._batcher.queue_s > self._settings.timeout_s:
+            raise Refusal(503, f"{self._taken} photos are before it; send this one again later", self._batcher.wait_s)
         refuse_by_head(request, self._settings.most_bytes)
 
     async def _locate(self, request: web.Request) -> web.Response:

@@ -49,10 +49,14 @@ class Batcher(Generic[Item, Result]):
         return len(self._waiting)
 
     @property
+    def queue_s(self) -> float:
+        """Seconds until a batch takes whoever comes now, about: none where nobody waits."""
+        return len(self._waiting) / (self._largest * self._abreast) * self._seconds
+
+    @property
     def wait_s(self) -> int:
         """Whole seconds after which those who wait now will be answered, about; 1 to 60."""
-        batches = len(self._waiting) / (self._largest * self._abreast) + 1
-        return min(60, max(1, math.ceil(batches * self._seconds)))
+        return min(60, max(1, math.ceil(self.queue_s + self._seconds)))
 
     async def ask(self, item: Item) -> Result:
         """The result of one item. Cancelled, it leaves the queue.

@@ -39,8 +39,8 @@ def describe(settings: ServiceSettings) -> dict[str, Any]:
     locate = {
         "summary": "Where was this photo taken?",
         "description": "The photo is the whole body, with the fields in the query; or the field photo of a form, with the "
-        f"others beside it. JPEG, PNG or WebP, at most {settings.max_megabytes:g} MB and {settings.max_megapixels:g} megapixels. "
-        "Rough position: all of lat, lon and radius_m or none.",
+        f"others beside it. JPEG, PNG or WebP, at most {settings.max_megabytes:g} MB and {settings.max_megapixels:g} "
+        "megapixels. Rough position: all of lat, lon and radius_m or none.",
         "parameters": [
             {"name": name, "in": "query", "required": False, "description": schema["description"],
              "schema": {key: value for key, value in schema.items() if key != "description"}}
