@@ -14,6 +14,7 @@ from jobs.photo_encoder import PhotoEncoder
 from model.checkpoint import CheckpointError
 from pipeline import cluster, storage
 from pipeline.index_facts import FACTS
+from pipeline.placement import place
 from pipeline.progress import console
 from pipeline.records import InputError
 from pipeline.service.answerer import Answerer
@@ -21,7 +22,7 @@ from pipeline.service.app import Service
 from pipeline.service.batcher import Gone
 from pipeline.service.engine import NotReady
 from pipeline.service.live_index import LOOK_EVERY_S
-from pipeline.service.replicas import Crew, Replicas
+from pipeline.service.replicas import Replicas
 from pipeline.service.settings import ServiceSettings
 
 
@@ -38,7 +39,7 @@ class Settings(ServiceSettings):
     replicas: int = 1
     "Processes that each load network and index."
     threads: int | None = None
-    "CPU cores of each; by default all cores of the cluster, shared among them."
+    "CPU cores of each; by default as many as let all of them fit on the nodes that are up."
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,14 +78,12 @@ def main(settings: Settings) -> None:
 
 async def serve(settings: Settings, token: str | None) -> None:
     """Listen at once, so that whoever asks for its health hears that it is loading; answer once it has loaded."""
-    threads = settings.threads or max(1, cluster.cpus() // settings.replicas)
+    placement = place(cluster.nodes(), settings.replicas, settings.replicas, settings.threads)
     shards = None if settings.shards is None else storage.absolute(settings.shards)
-    replicas = Replicas(
-        f"pvda-{os.getpid()}",
-        Crew(replicas=settings.replicas, cpus=threads, gpus=1 if cluster.gpus() else 0),
-        partial(load, storage.absolute(settings.checkpoint), storage.absolute(settings.index), shards, threads),
-    )
-    runner = Service(settings, replicas, token, abreast=settings.replicas).runner()
+    checkpoint, index = storage.absolute(settings.checkpoint), storage.absolute(settings.index)
+    make = partial(load, checkpoint, index, shards, placement.cpus)
+    replicas = Replicas(f"pvda-{os.getpid()}", placement, make)
+    runner = Service(settings, replicas, token, abreast=placement.workers).runner()
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)

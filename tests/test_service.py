@@ -201,6 +201,43 @@ def test_an_upload_without_a_length_is_cut_off_at_the_limit() -> None:
     served(test, max_megabytes=1)
 
 
+MALFORMED = {
+    "TLS": b"\x16\x03\x01\x02\x00\x01\r\n\r\n",
+    "a header without end": b"GET / HTTP/1.1\r\nHost: x\r\nA: " + b"b" * 20_000 + b"\r\n\r\n",
+    "headers without end": b"GET / HTTP/1.1\r\nHost: x\r\n" + b"A: b\r\n" * 5_000 + b"\r\n",
+    "a length below zero": HEAD + b"Content-Length: -5\r\n\r\nabc",
+    "two lengths": HEAD + b"Content-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\nabc",
+    "a chunk of no size": HEAD + b"Transfer-Encoding: chunked\r\n\r\nzz\r\nabc",
+}
+
+
+@pytest.mark.parametrize("data", MALFORMED.values(), ids=MALFORMED)
+def test_what_is_no_http_is_refused_without_a_word_on_the_terminal(
+    data: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def test(client: Client, engine: Engine) -> None:
+        assert b" 400 " in await raw(client, data)
+        assert (await post(client, photo())).status == 200
+        assert capsys.readouterr().err == ""
+
+    served(test)
+
+
+def test_an_upload_that_breaks_off_harms_nobody() -> None:
+    async def test(client: Client, engine: Engine) -> None:
+        for kind in (b"image/jpeg", b"multipart/form-data; boundary=x"):
+            head = HEAD.replace(b"image/jpeg", kind)
+            _, writer = await asyncio.open_connection(client.host, client.port)
+            writer.write(head + b"Content-Length: 9999\r\n\r\n--x\r\n")
+            await writer.drain()
+            await asyncio.sleep(0.02)
+            writer.close()
+        assert (await post(client, photo())).status == 200
+        assert "pvda_waiting_photos 0.0" in await (await client.get("/metrics")).text()
+
+    served(test)
+
+
 def test_a_client_that_asks_first_is_refused_before_it_sends_and_else_told_to_go_on() -> None:
     async def test(client: Client, engine: Engine) -> None:
         data = photo()

@@ -6,6 +6,7 @@ Nothing here knows Ray or the network; `engine` may be anything that answers bat
 import asyncio
 import dataclasses
 import hmac
+import logging
 import time
 import traceback
 from collections.abc import Awaitable, Callable
@@ -69,9 +70,13 @@ class Service:
 
     def runner(self) -> web.AppRunner:
         """What listens for this application."""
+        # aiohttp's own would print a traceback over each malformed request, and fill the disk of whoever keeps them.
+        quiet = logging.getLogger(f"{__name__}.malformed")
+        quiet.setLevel(logging.CRITICAL)
         return web.AppRunner(
             self.app,
             access_log=None,
+            logger=quiet,
             handler_cancellation=True,  # whoever has gone away leaves the queue
             keepalive_timeout=KEPT_S,
             lingering_time=LINGERING_S,

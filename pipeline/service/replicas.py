@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import ray
@@ -17,6 +16,7 @@ from ray import serve
 from ray.serve.exceptions import DeploymentUnavailableError
 
 from pipeline import cluster
+from pipeline.placement import Placement
 from pipeline.records import InputError
 from pipeline.service.answerer import Answerer, Outcome, Status
 from pipeline.service.batcher import Gone
@@ -80,23 +80,12 @@ class Replica:
             raise TimeoutError(f"a batch has taken {STUCK_S:.0f} s")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Crew:
-    """How many replicas of which size."""
-
-    replicas: int
-    cpus: int
-    "Of each."
-    gpus: float
-    "Of each."
-
-
 class Replicas:
     """The replicas of one service, from the process that asks them."""
 
-    def __init__(self, name: str, crew: Crew, make: Callable[[], Answerer]) -> None:
+    def __init__(self, name: str, placement: Placement, make: Callable[[], Answerer]) -> None:
         """Nothing is started yet. `name` is no other application's on this cluster; `make` is called on each replica."""
-        self._name, self._crew, self._make = name, crew, make
+        self._name, self._placement, self._make = name, placement, make
         self._handle: Any = None
         self._started = False
 
@@ -108,9 +97,9 @@ class Replicas:
         cluster.connect()
         logging.getLogger("ray.serve").setLevel(logging.ERROR)  # it warns at length of what is told here in a sentence
         deployment: serve.Deployment = serve.deployment(
-            num_replicas=self._crew.replicas,
+            num_replicas=self._placement.workers,
             max_ongoing_requests=CALLS,
-            ray_actor_options={"num_cpus": self._crew.cpus, "num_gpus": self._crew.gpus},
+            ray_actor_options={"num_cpus": self._placement.cpus, "num_gpus": self._placement.gpus},
             health_check_period_s=5,
             graceful_shutdown_wait_loop_s=0.2,
             graceful_shutdown_timeout_s=5,
