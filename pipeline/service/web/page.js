@@ -8,7 +8,8 @@ let asking = 0; // a newer question makes older answers stale
 
 function say(text, kind) {
   $("say").textContent = text;
-  $("say").className = kind || "soft";
+  $("say").className = kind;
+  $("say").scrollIntoView({ block: "nearest" }); // on a phone the answer is below the photo
 }
 
 function take(file) {
