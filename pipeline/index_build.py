@@ -17,11 +17,11 @@ from pipeline import storage
 from pipeline.feature_rows import readable
 from pipeline.features import FeatureTable, open_table
 from pipeline.index import Index
-from pipeline.index_facts import FACTS, Effort, IndexFacts, measure_file, read_facts, write_facts
+from pipeline.index_facts import FACTS, Effort, IndexFacts, read_facts, write_facts
 from pipeline.index_measure import Held, efforts, hold_queries, speed, tuned
 from pipeline.index_plan import Gallery, Plan, plan_factory, plan_index
 from pipeline.index_training import SPECTRUM_ROWS, effective_dimension, new_index, sample, train
-from pipeline.index_work import TRAINED, Workshop, rows_by_part
+from pipeline.index_work import Workshop, rows_by_part
 from pipeline.progress import console
 from pipeline.records import InputError, Split, View
 
@@ -116,7 +116,7 @@ def build_index(settings: IndexSettings) -> dict[str, Any]:
         effort=Effort(breadth=1), target_recall=settings.target_recall, training_sample=training_rows, build_seconds=0.0,
         bytes_per_vector=0.0, expected_bytes=plan.bytes or None, unit_rows=plan.unit_rows,
         part_rows=part_rows, measured={}, parts=parts,
-        trained={TRAINED: measure_file(settings.out, TRAINED)},
+        trained=workshop.hand_out_trained(),
     )  # fmt: skip
     others = table.select(Split.QUERY) if settings.split == Split.GALLERY else None
     return finish(settings.out, facts, hold_queries(chosen, rows_of_part, others), workshop, start)
@@ -181,9 +181,9 @@ def _finished(out: str, table: FeatureTable, asked: dict[str, Any]) -> dict[str,
     told = read_facts(out)
     held = {name: shard for part in told.parts for name, shard in part.table_parts.items()}
     now = {name: footer.shard_sha256 for name, footer in zip(table.parts, table.footers, strict=True)}
-    missing = sorted(now.keys() - held.keys())
+    missing = rows_by_part(table.only([name for name in table.parts if name not in held]))
     if told.asked == asked and told.fingerprint == table.fingerprint and held.items() <= now.items():
-        if not missing or not rows_by_part(table.only(missing)):
+        if not missing:
             console.print(f"{out} is complete: {told.rows} rows, {told.factory}; nothing to do")
             return Index(out).facts
         raise InputError(

@@ -72,7 +72,7 @@ class IndexFacts:
     unit_rows: int
     "Rows of a unit of work while it was built."
     part_rows: int
-    "Rows that a part of it has at most."
+    "Rows that a part of it has, about."
     training_sample: int
     "Rows that it was trained on."
     build_seconds: float

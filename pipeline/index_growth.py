@@ -46,6 +46,7 @@ def extend_index(table: str, out: str, workers: int = 0) -> dict[str, Any]:
     check_files(out, told.trained)
     identity = {"extends": [asdict(part) for part in told.parts], "by": chosen.only(missing).digest}
     workshop = Workshop(out=out, table=chosen, identity=identity, workers=workers)
+    workshop.take_trained()
     parts = workshop.build(added, told.unit_rows, told.part_rows, told.rows, len(told.parts))
     facts = replace(
         told, rows=told.rows + sum(added.values()), parts=told.parts + parts, table=storage.absolute(whole.path)

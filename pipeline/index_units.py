@@ -29,18 +29,24 @@ class Unit:
     rows: int
 
 
-def units_of(rows_of_part: dict[str, int], most: int) -> list[Unit]:
-    """The table's parts in their order, in units of at most so many rows, of one part at least."""
-    units: list[Unit] = []
-    names: list[str] = []
-    rows = 0
-    for name, held in rows_of_part.items():
-        if names and rows + held > most:
-            units.append(Unit(table_parts=tuple(names), rows=rows))
-            names, rows = [], 0
-        names.append(name)
-        rows += held
-    return [*units, Unit(table_parts=tuple(names), rows=rows)] if names else units
+def units_of(rows_of_part: dict[str, int], rows: int) -> list[Unit]:
+    """The table's parts in their order, in units of about so many rows."""
+    names = list(rows_of_part)
+    groups = even_groups(list(rows_of_part.values()), rows)
+    return [
+        Unit(table_parts=tuple(names[i] for i in group), rows=sum(rows_of_part[names[i]] for i in group))
+        for group in groups
+    ]
+
+
+def even_groups(sizes: Sequence[int], wanted: int) -> list[list[int]]:
+    """Numbers of consecutive items in groups of about `wanted` in all: each where its middle lies."""
+    groups: dict[int, list[int]] = {}
+    begin = 0
+    for number, size in enumerate(sizes):
+        groups.setdefault((2 * begin + size) // (2 * wanted), []).append(number)
+        begin += size
+    return list(groups.values())
 
 
 def build_unit(trained: str, table: FeatureTable, unit: Unit, out: str, threads: int) -> int:

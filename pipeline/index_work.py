@@ -5,7 +5,6 @@ In: a trained index and a table. Out: the files of each part, in the folder of t
 """
 
 import json
-import math
 import os
 import tempfile
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ from pipeline.features import FeatureTable
 from pipeline.index_facts import PartFacts, measure_file
 from pipeline.index_ids import COLUMNS, local_copy, write_ids
 from pipeline.index_part import read_faiss
-from pipeline.index_units import Unit, build_unit, merge, mergeable, units_of
+from pipeline.index_units import Unit, build_unit, even_groups, merge, mergeable, units_of
 from pipeline.progress import progress
 
 BUILDING, PLAN, TRAINED = "_building", "plan.json", "trained.faiss"
@@ -48,14 +47,24 @@ class Workshop:
         with storage.atomic_file(self._trained) as local:
             faiss.write_index(index, local)
 
+    def take_trained(self) -> None:
+        """Go on with the trained index of the finished one."""
+        if not self.is_trained():
+            storage.copy(storage.join(self._out, TRAINED), self._trained)
+
+    def hand_out_trained(self) -> dict[str, dict[str, Any]]:
+        """Put the trained index beside what was built; its name, size and hash."""
+        storage.copy(self._trained, storage.join(self._out, TRAINED))
+        return {TRAINED: measure_file(self._out, TRAINED)}
+
     @property
     def _trained(self) -> str:
-        return storage.join(self._out, TRAINED)
+        return storage.join(self._scratch, TRAINED)
 
     def build(
         self, rows_of_part: dict[str, int], unit_rows: int, part_rows: int, first_row: int = 0, first_part: int = 0
     ) -> tuple[PartFacts, ...]:
-        """Index these parts of the table, and write the parts of the index, of `part_rows` rows at most.
+        """Index these parts of the table, and write the parts of the index, of about `part_rows` rows.
 
         `first_row`, `first_part`: how many of each the index has already.
         """
@@ -66,7 +75,8 @@ class Workshop:
             files = [storage.join(self._scratch, f"unit-{number:06d}.faiss") for number in range(len(units))]
             self._build_units(units, files)
             parts: list[PartFacts] = []
-            for group in _groups(units, part_rows, whole):
+            sizes = [unit.rows for unit in units]
+            for group in even_groups(sizes, part_rows) if whole else [[number] for number in range(len(units))]:
                 ending = _ending(first_part + len(parts))
                 out = storage.join(self._out, f"index{ending}.faiss")
                 if len(group) == 1:
@@ -122,16 +132,3 @@ def _ending(number: int) -> str:
 def rows_by_part(table: FeatureTable) -> dict[str, int]:
     """How many rows of a selection each part of the table holds; parts without any are left out."""
     return {part: len(rows) for part, rows in table.numbered(["view"])}
-
-
-def _groups(units: Sequence[Unit], part_rows: int, whole: bool) -> list[list[int]]:
-    """Numbers of the units of each part: as many as fit, or one where units cannot be merged."""
-    groups: list[list[int]] = []
-    rows = math.inf
-    for number, unit in enumerate(units):
-        if not whole or rows + unit.rows > part_rows:
-            groups.append([])
-            rows = 0
-        groups[-1].append(number)
-        rows += unit.rows
-    return groups
