@@ -161,6 +161,7 @@ HOSTILE: list[tuple[str, int, str, Callable[[Client], Awaitable[Any]]]] = [
     ("many fields", 400, "fields", lambda c: c.post("/locate", data=form(**{f"f{n}": "1" for n in range(99)}))),
     ("a photo that kills twice", 422, "stopped twice", lambda c: post(c, photo(size=(13, 13)))),
     ("a photo damaged within", 422, "damaged", lambda c: post(c, photo(size=(14, 14)))),
+    ("a name made to lead here", 403, "expected localhost", lambda c: post(c, photo(), Host="evil.example:80")),
     ("another site's page", 403, "another site", lambda c: post(c, photo(), **{"Sec-Fetch-Site": "cross-site"})),
 ]  # fmt: skip
 
@@ -187,7 +188,7 @@ async def raw(client: Client, *pieces: bytes) -> bytes:
     return answered
 
 
-HEAD = b"POST /locate HTTP/1.1\r\nHost: x\r\nConnection: close\r\nContent-Type: image/jpeg\r\n"
+HEAD = b"POST /locate HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Type: image/jpeg\r\n"
 
 
 def test_an_upload_without_a_length_is_cut_off_at_the_limit() -> None:
@@ -203,8 +204,8 @@ def test_an_upload_without_a_length_is_cut_off_at_the_limit() -> None:
 
 MALFORMED = {
     "TLS": b"\x16\x03\x01\x02\x00\x01\r\n\r\n",
-    "a header without end": b"GET / HTTP/1.1\r\nHost: x\r\nA: " + b"b" * 20_000 + b"\r\n\r\n",
-    "headers without end": b"GET / HTTP/1.1\r\nHost: x\r\n" + b"A: b\r\n" * 5_000 + b"\r\n",
+    "a header without end": b"GET / HTTP/1.1\r\nHost: localhost\r\nA: " + b"b" * 20_000 + b"\r\n\r\n",
+    "headers without end": b"GET / HTTP/1.1\r\nHost: localhost\r\n" + b"A: b\r\n" * 5_000 + b"\r\n",
     "a length below zero": HEAD + b"Content-Length: -5\r\n\r\nabc",
     "two lengths": HEAD + b"Content-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\nabc",
     "a chunk of no size": HEAD + b"Transfer-Encoding: chunked\r\n\r\nzz\r\nabc",
@@ -374,6 +375,7 @@ def test_where_there_is_a_token_only_pages_and_health_go_without() -> None:
         for path in ("/", "/page.js", "/style.css", "/api", "/openapi.json", "/health"):
             assert (await client.get(path)).status == 200
         assert await (await client.get("/health")).json() == {"ready": True}
+        assert (await client.get("/health", headers={"Host": "drones.example"})).status == 200
         trusted = await client.get("/health", headers={"Authorization": f"Bearer {TOKEN}"})
         assert (await trusted.json())["rows"] == 3
 

@@ -23,7 +23,7 @@ from pipeline.service.engine import Engine, NotReady
 from pipeline.service.metrics import CONTENT_TYPE, Metrics
 from pipeline.service.openapi import describe, reference
 from pipeline.service.question import Question, Refusal, question_of, refusal_of
-from pipeline.service.settings import ServiceSettings
+from pipeline.service.settings import LOOPBACK, ServiceSettings
 from pipeline.service.uploads import read_upload, refuse_by_head
 
 WEB = Path(__file__).parent / "web"
@@ -112,6 +112,12 @@ class Service:
 
     def _admit(self, request: web.BaseRequest) -> None:
         """Raise Refusal where this request is nobody's business, whatever it asks."""
+        # A page whose name was made to lead to this machine is not another site's in its browser's eyes.
+        host = request.host.rsplit(":", 1)[0].strip("[]")
+        if self._token is None and host not in LOOPBACK:
+            raise Refusal(
+                403, f"the host is {host[:60]!r}, expected localhost; ask by that name, or start it with --token-file"
+            )
         if request.headers.get("Sec-Fetch-Site") == "cross-site" and request.path not in OPEN:
             raise Refusal(403, "another site's page asks, expected the service's own; open the service itself")
         if request.path not in OPEN and not self._trusted(request):

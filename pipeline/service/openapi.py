@@ -14,11 +14,12 @@ ERROR = {"application/json": {"schema": {"$ref": "#/components/schemas/Error"}}}
 REASONS = {
     "400": "Empty, or a field that is none.",
     "401": "A token is asked for and this is not it.",
-    "403": "Another site's page asks.",
+    "403": "Another site's page asks, or by a name that is not this machine's.",
     "408": "The photo did not arrive in time.",
     "413": "Too many bytes or pixels.",
     "415": "No JPEG, PNG or WebP.",
     "422": "A damaged photo.",
+    "500": "The service failed.",
     "503": "Not ready, or too many photos wait; Retry-After says for how many seconds.",
     "504": "No answer in time.",
 }
