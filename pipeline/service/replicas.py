@@ -100,7 +100,7 @@ class Replicas:
             num_replicas=self._placement.workers,
             max_ongoing_requests=CALLS,
             ray_actor_options={"num_cpus": self._placement.cpus, "num_gpus": self._placement.gpus},
-            health_check_period_s=5,
+            health_check_period_s=1,  # who asks while a replica is dead waits for so long besides the loading
             graceful_shutdown_wait_loop_s=0.2,
             graceful_shutdown_timeout_s=5,
         )(Replica)
