@@ -118,9 +118,11 @@ async def measure(given: argparse.Namespace, addresses: dict[str, str]) -> None:
     async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(limit=0)) as session:
         for address in addresses.values():
             await ready(session, address)
-            await load(session, address, photos, 8, 2)  # warm
+            await load(
+                session, address, photos, given.batch, given.seconds
+            )  # each size of batch is slow the first time
         print(f"{len(photos)} photos, {mean:.0f} kB in the mean; {given.rounds} rounds of {given.seconds:g} s by turns")
-        for clients in CLIENTS:
+        for clients in given.clients:
             found: dict[str, list[tuple[list[float], float, Counter[int]]]] = {name: [] for name in addresses}
             for _ in range(given.rounds):
                 for name, address in addresses.items():
@@ -134,10 +136,12 @@ def main() -> None:
     parser.add_argument("--checkpoint", required=True)
     parser.add_argument("--index", required=True)
     parser.add_argument("--photos", required=True, help="folder of JPEGs")
+    parser.add_argument("--clients", type=int, nargs="+", default=CLIENTS, help="that ask at the same time")
     parser.add_argument("--seconds", type=float, default=6, help="of a measurement")
     parser.add_argument("--rounds", type=int, default=2, help="of all in turn")
     parser.add_argument("--batch", type=int, default=8, help="photos of the larger batch")
     given = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # told to stop, it ends the services too
     with service(given, "--batch", "1") as alone, service(given, "--batch", str(given.batch)) as batched:
         asyncio.run(measure(given, {"one at a time": alone, f"batches of up to {given.batch}": batched}))
 
