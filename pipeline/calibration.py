@@ -123,14 +123,19 @@ def is_right(agreed: Consensus, example: Example, tolerance_m: float) -> bool:
 
 
 def best_radius(examples: Sequence[Example], tolerance_m: float, spacing_m: float | None) -> float:
-    """How far apart agreeing candidates may lie: the smallest of FACTORS that places most photos within the tolerance."""
+    """How far apart agreeing candidates may lie: the smallest of FACTORS, unless a larger one places surely more photos within
+    the tolerance: more by twice the standard error over locations, as photos of one place resemble each other."""
     if spacing_m is None:
         return 0.0
-    placed = []
-    for factor in FACTORS:
-        errors = [error_m(judged(one.inside, factor * spacing_m), one) for one in examples]
-        placed.append(sum(error is not None and error <= tolerance_m for error in errors))
-    return FACTORS[int(np.argmax(placed))] * spacing_m
+    _, location_N = np.unique([one.location for one in examples], return_inverse=True)
+    errors = [[error_m(judged(one.inside, factor * spacing_m), one) for one in examples] for factor in FACTORS]
+    placed_FN = np.array([[error is not None and error <= tolerance_m for error in row] for row in errors], np.float64)
+    best = 0
+    for larger in range(1, len(FACTORS)):
+        gain_L = np.bincount(location_N, placed_FN[larger] - placed_FN[best])
+        if gain_L.sum() > 2 * np.sqrt((gain_L**2).sum()):
+            best = larger
+    return FACTORS[best] * spacing_m
 
 
 def out_of_fold(x_NF: Doubles, yes_N: Doubles, weight_N: Doubles, locations_N: npt.NDArray[np.str_]) -> Doubles:

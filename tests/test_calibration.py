@@ -87,8 +87,8 @@ def test_an_answer_is_right_by_its_location_or_by_its_distance() -> None:
     assert is_right(judged(named.inside, 0), named, 25)
 
 
-def test_neighbours_agree_only_where_that_places_photos_better() -> None:
-    """Tiles every 40 m that overlap: the photo lies between four, each of which is off by 28 m."""
+def test_neighbours_agree_only_where_that_surely_places_photos_better() -> None:
+    """Tiles every 40 m that overlap: each photo lies between four, each of which is off by 28 m. One photo proves nothing."""
     d = 20 * METRE
     four = [(d, d), (d, -d), (-d, d), (-d, -d)]
     tiles = [
@@ -96,12 +96,15 @@ def test_neighbours_agree_only_where_that_places_photos_better() -> None:
         for n, (lat, lon) in enumerate(four)
     ]
     alone = Hit(key="k", location="far", view=View.SATELLITE, lat=1.0, lon=1.0, score=0.1)
-    overlapping = Example(location="photo", lat=0.0, lon=0.0, inside=(*tiles, alone), outside=())
+    overlapping = [
+        Example(location=f"photo{n}", lat=0.0, lon=0.0, inside=(*tiles, alone), outside=()) for n in range(5)
+    ]
     apart = Example(
         location="a", lat=0.0, lon=8.0, inside=(hit("a", 0.9), hit("b", 0.8, 60), hit("c", 0.7, 50)), outside=()
     )
-    assert best_radius([overlapping], 25, 40.0) == 1.5 * 40
-    assert best_radius([apart], 25, 40.0) == 0.5 * 40
+    assert best_radius(overlapping, 25, 40.0) == 1.5 * 40
+    assert best_radius(overlapping[:1], 25, 40.0) == 0.5 * 40
+    assert best_radius([apart] * 9, 25, 40.0) == 0.5 * 40
     assert best_radius([apart], 25, None) == 0
 
 
