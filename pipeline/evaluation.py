@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 
 from pipeline import report, storage, stream
 from pipeline.evaluation_files import Besides, Export, write_besides
+from pipeline.exclusive import one_at_a_time
 from pipeline.features import FeatureTable, open_table
 from pipeline.progress import console, progress
 from pipeline.records import InputError, Split, View
@@ -85,6 +86,7 @@ class EvaluationSettings:
             raise InputError(f"--workers is {self.workers}, expected 0 or more; leave it out to rank in this process")
 
 
+@one_at_a_time(lambda settings: settings.out)
 def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
     """Evaluate into `settings.out` and return the metric rows. A finished evaluation of the same inputs is left as it is.
 
