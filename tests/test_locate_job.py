@@ -14,6 +14,7 @@ from jobs.locate import Settings, locate_photos, main
 from jobs.photo_encoder import PhotoEncoder
 from model.checkpoint import Checkpoint, dumps, fingerprint, loads
 from model.pvda import FeatureEncoder, PVDAConfig
+from pipeline import storage
 from pipeline.confidence import Confidence, write_confidence
 from pipeline.features import PartFooter, PartRows, write_part
 from pipeline.index_build import IndexSettings, build_index
@@ -109,6 +110,21 @@ def test_a_damaged_photo_is_told_the_others_are_answered_and_the_exit_code_is_1(
     said = json.loads(Path(world["out"]).read_text())["features"]
     assert [len(feature["properties"]["rejected"]) for feature in said] == [0, 1, 0, 0, 0]
     assert [feature["geometry"] is None for feature in said] == [False, True, False, False, False]
+
+
+def test_a_photo_that_cannot_be_read_is_told_like_a_damaged_one(world: dict[str, str], monkeypatch: Any) -> None:
+    plain = storage.read_bytes
+
+    def failing(path: str) -> bytes:
+        if path.endswith("1.jpg"):
+            raise PermissionError("not yours")
+        return plain(path)
+
+    monkeypatch.setattr(storage, "read_bytes", failing)
+    located = locate_photos(settings(world))
+    assert [[(one.reason, one.found) for one in photo.rejected] for photo in located] == [
+        [], [("unreadable file", "not yours")], [], [],
+    ]  # fmt: skip
 
 
 def test_a_flight_is_placed_as_one_in_the_order_of_its_times(world: dict[str, str]) -> None:
