@@ -163,7 +163,7 @@ def confidence_of(settings: Settings, index: Index) -> Confidence | None:
         console.print("not calibrated: answers come without a probability, and none is unknown; see jobs/calibrate.py")
     elif confidence.gallery != len(index):
         console.print(
-            f"calibrated over {confidence.gallery} gallery images, the index has {index.facts['rows']}: probabilities are "
+            f"calibrated over {confidence.gallery} gallery images, the index has {len(index)}: probabilities are "
             "rough until jobs/calibrate.py is run again",
             style="yellow",
         )

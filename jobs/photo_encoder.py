@@ -50,7 +50,7 @@ class _Way:
 class PhotoEncoder:
     """The encoder that made an index's embeddings, for photos that come one by one or by the hundred.
 
-    Threads may share it where each calls `encode` alone at a time: torch computes on all cores anyway.
+    Not for several threads at once: torch spreads a batch over the cores itself.
     """
 
     def __init__(self, checkpoint: bytes, name: str, index_facts: dict[str, Any], shards: str | None = None) -> None:

@@ -67,8 +67,8 @@ def settings(world: dict[str, str], **changes: Any) -> Settings:
 def calibrated(world: dict[str, str]) -> None:
     sure = Logistic(mean_F=(0,) * 4, scale_F=(1,) * 4, coefficient_F=(0,) * 4, intercept=2.0)
     confidence = Confidence(
-        fingerprint=world["mark"], gallery=PLACES, spacing_m=111.0, within_m=50.0, tolerance_m=25.0, outside=0.5, model=sure,
-        threshold=0.4, sharpness=5000.0, elsewhere=0.0, photos=100, locations=20, right=0.7, right_kept=0.8,
+        fingerprint=world["mark"], gallery=PLACES, asked="", spacing_m=111.0, within_m=50.0, tolerance_m=25.0, outside=0.5,
+        model=sure, threshold=0.4, sharpness=5000.0, elsewhere=0.0, photos=100, locations=20, right=0.7, right_kept=0.8,
         outside_unknown=0.9, calibration_error=0.02, bins=(),
     )  # fmt: skip
     write_confidence(f"{world['index']}/calibration.json", confidence)
