@@ -99,7 +99,7 @@ def test_the_road_by_command_lines_and_again(
         ("drone->satellite", False), ("satellite->drone", False), ("drone->satellite", True),
     ]  # fmt: skip
     assert (metrics[0]["queries"], metrics[0]["gallery"]) == (9, 5)
-    assert "data:image/jpeg" in (out / "report.html").read_text()
+    assert "data:image/webp" in (out / "report.html").read_text()
     photos = tiny_world / "test" / "query_drone"
     done = call("locate", "--checkpoint", run / "last.pt", "--index", index, "--out", tmp_path / "o.geojson", photos)
     assert done.returncode == 0, done.stderr
