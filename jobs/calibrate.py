@@ -13,7 +13,7 @@ from jobs.cli import run
 from jobs.photo_encoder import PhotoEncoder
 from model.checkpoint import loads
 from pipeline import storage
-from pipeline.calibration import Judging, calibrate
+from pipeline.calibration import Gallery, Judging, calibrate
 from pipeline.calibration_examples import Labelled, examples
 from pipeline.confidence import FILE, Confidence, read_confidence, write_confidence
 from pipeline.foreign import open_manifest
@@ -56,18 +56,17 @@ class Settings(Judging):
 
 
 def calibrate_index(settings: Settings) -> Confidence:
-    """Calibrate an index, unless its calibration is there; returns it.
+    """Calibrate an index, unless its calibration is there; one of another gallery or settings is replaced. Returns it.
 
     Raises InputError and CheckpointError on unusable input.
     """
     out = settings.out or storage.join(settings.index, FILE)
     index = Index(settings.index)
-    rows = len(index)
-    judging = Judging(tolerance=settings.tolerance, outside=settings.outside)
+    asked = f"{settings.split} {settings.view} -> {settings.gallery_view}, at most {settings.photos} photos"
     if storage.exists(out):
         confidence = read_confidence(out, index.facts)
-        asked = (rows, settings.tolerance, settings.outside)
-        if (confidence.gallery, confidence.tolerance_m, confidence.outside) == asked:
+        there = (confidence.asked, confidence.gallery, confidence.tolerance_m, confidence.outside)
+        if there == (asked, len(index), settings.tolerance, settings.outside):
             console.print(f"{out} is complete; nothing to do")
             return confidence
     if not storage.exists(settings.checkpoint):
@@ -80,9 +79,9 @@ def calibrate_index(settings: Settings) -> Confidence:
     photos = embedded(settings, encoder, settings.view, trained_on, settings.photos)
     overhead = embedded(settings, encoder, settings.gallery_view, trained_on, None)
     spacing_m = gallery_map(index).spacing_m
-    confidence = calibrate(
-        examples(photos, overhead, index, spacing_m, settings.tolerance), judging, spacing_m, encoder.fingerprint, rows
-    )
+    found = examples(photos, overhead, index, spacing_m, settings.tolerance)
+    gallery = Gallery(fingerprint=encoder.fingerprint, rows=len(index), spacing_m=spacing_m, asked=asked)
+    confidence = calibrate(found, settings, gallery)
     write_confidence(out, confidence)
     picture = f"{out.removesuffix('.json')}.svg"
     storage.write_bytes(picture, diagram(confidence.bins, f"Reliability over {confidence.photos} photos").encode())
@@ -106,7 +105,7 @@ def embedded(
         if sample.facts["location"] not in trained_on
     )
     facts, blocks = [], [np.empty((0, encoder.dimension), np.float32)]
-    with progress(most or sum(shard.samples for shard in shards), f"{view} images", "images") as meter:
+    with progress(None, f"{view} images", "images") as meter:
         wanted = islice(samples, most)
         while batch := list(islice(wanted, BATCH)):
             block_BD, rejected = encoder.encode([sample.data for sample in batch])

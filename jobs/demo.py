@@ -98,6 +98,7 @@ def demo(settings: Settings) -> list[dict[str, Any]]:
                     shards=shards,
                     run=trained if name == "trained" else None,
                     beside=storage.join(out, "evaluation-untrained") if name == "trained" else None,
+                    by=("altitude_m",),
                     title=f"PVDA on simulated flights, {name}",
                 )
             )

@@ -1,9 +1,10 @@
 """Evaluate features exactly: every task that a table allows (--table), or one of two tables (--queries and --gallery).
 
-Writes metrics.json, metrics.parquet, queries.parquet, views.json and report.html to --out, what --by and --exports ask for
-beside them, and prints the measures in percent.
+Writes metrics.json, metrics.parquet, queries.parquet, views.json, parts.json, view_gap.json and report.html to --out, what
+--by, --exports and --figures ask for beside them, and prints the measures in percent.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 from rich import box
@@ -11,10 +12,10 @@ from rich.console import Console
 from rich.table import Table
 
 from jobs.cli import run
-from pipeline import storage
 from pipeline.evaluation import EvaluationSettings, evaluate
-from pipeline.evaluation_files import GROUPS, VIEWS
+from pipeline.part_measures import part_label
 from pipeline.published import ABLATION, TABLE
+from pipeline.report_inputs import read_besides
 
 MEASURES = {"r1": "R@1", "r5": "R@5", "r10": "R@10", "r1p": "R@1%", "ap": "AP"}
 SURE = ("r1", "r5", "ap")
@@ -30,10 +31,11 @@ def main(settings: EvaluationSettings, published: bool = False) -> None:
     rows = evaluate(settings)
     print_table(rows)
     print_positions(rows)
-    for name, first in ((VIEWS, "views"), (GROUPS, "value")):
-        path = storage.join(settings.out, name)
-        if storage.exists(path):
-            print_groups(storage.read_json(path), first)
+    besides = read_besides(settings.out)
+    print_groups(besides["views"], "views")
+    print_groups(besides["groups"], "value")
+    print_groups([row | {"by": "part", "value": part_label(row)} for row in besides["parts"]], "value")
+    print_gaps(besides["gaps"])
     if published:
         print_published(list(dict.fromkeys(row["task"] for row in rows)))
 
@@ -86,8 +88,21 @@ def print_positions(rows: list[dict[str, Any]]) -> None:
     Console().print(table)
 
 
-def print_groups(rows: list[dict[str, Any]], first: str) -> None:
-    """Measures by number of views or by group."""
+def print_gaps(gaps: Sequence[dict[str, Any]]) -> None:
+    """How far apart the views lie in the embedding."""
+    if not gaps:
+        return
+    table = _table("view gap: cosines with their 5 to 95 %, distance of means in spreads")
+    for heading in ("task", "true pairs", "other pairs", "distance"):
+        table.add_column(heading, justify="left" if heading == "task" else "right", no_wrap=True)
+    for gap in gaps:
+        said = (f"{of['mean']:.3f} ({of['low']:.2f} to {of['high']:.2f})" for of in (gap["true"], gap["other"]))
+        table.add_row(gap["task"], *said, f"{gap['distance']:.3f}")
+    Console().print(table)
+
+
+def print_groups(rows: Sequence[dict[str, Any]], first: str) -> None:
+    """Measures by number of views, by group or by part."""
     headings = dict.fromkeys((row["task"], row.get("by", "views a query")) for row in rows)
     for task, heading in headings:
         table = _table(task)

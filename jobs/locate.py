@@ -21,8 +21,8 @@ from pipeline import answer_files, rejects, storage
 from pipeline.answer_files import Located
 from pipeline.answer_page import Place, Surroundings, render
 from pipeline.confidence import Confidence, find_confidence, read_confidence
-from pipeline.flight import motion_over, settle
-from pipeline.gallery_map import gallery_map
+from pipeline.flight import LIKELIER, motion_over, settle
+from pipeline.gallery_map import GalleryMap, gallery_map
 from pipeline.index import Index
 from pipeline.locate import Answer, locate
 from pipeline.photo_files import find_photos, read_times, seconds
@@ -105,16 +105,9 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
     if settings.together:
         queries = together(queries)
     asked = [query for query in queries if query.embedding_D is not None]
-    embeddings_QD = np.array([query.embedding_D for query in asked], np.float32).reshape(-1, encoder.dimension)
-    where = Where(near=near) if near and not settings.track else None
-    k = max(settings.top, TRACKED) if settings.track else settings.top
-    answers = locate(index, embeddings_QD, k, where, confidence, gallery.spacing_m)
-    if settings.track and confidence:
-        times = times_of(asked, settings)
-        asked = [replace(query, taken_at=time) for query, time in zip(asked, times, strict=True)]
-        start = Start(lat=near.lat, lon=near.lon, radius_m=near.radius_m) if near else None
-        motion = motion_over(gallery, settings.max_speed, settings.elsewhere)
-        answers = settle(answers, [seconds(time) for time in times], confidence, motion, start)
+    if settings.track:
+        asked = timed(asked, settings)
+    answers = ask(asked, index, gallery, confidence, near, settings)
     answered = dict(zip((query.name for query in asked), zip(asked, answers, strict=True), strict=True))
     located = [
         _located(*answered[query.name], settings.top) if query.name in answered else _located(query, None, settings.top)
@@ -124,7 +117,7 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
         located.sort(key=lambda one: (one.taken_at is None, seconds(one.taken_at or "0")))
     about = {
         "index": settings.index, "fingerprint": encoder.fingerprint, "together": settings.together,
-        "threshold": confidence.threshold if confidence else None,
+        "threshold": LIKELIER if settings.track else confidence.threshold if confidence else None,
     }  # fmt: skip
     storage.write_bytes(settings.out, answer_files.geojson(located, about, settings.track))
     if settings.csv:
@@ -136,6 +129,21 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
         )  # fmt: skip
         storage.write_bytes(settings.page, page(located, around, settings.shards).encode("utf-8", "replace"))
     return located
+
+
+def ask(
+    queries: Sequence[Query], index: Index, gallery: GalleryMap, confidence: Confidence | None, near: Near | None,
+    settings: Settings,
+) -> list[Answer]:  # fmt: skip
+    """An answer per query, in the light of the whole flight with --track."""
+    embeddings_QD = np.array([query.embedding_D for query in queries], np.float32).reshape(-1, index.dimension)
+    if not settings.track or confidence is None:
+        where = Where(near=near) if near else None
+        return locate(index, embeddings_QD, settings.top, where, confidence, gallery.spacing_m)
+    single = locate(index, embeddings_QD, max(settings.top, TRACKED), None, confidence)
+    start = Start(lat=near.lat, lon=near.lon, radius_m=near.radius_m) if near else None
+    motion = motion_over(gallery, settings.max_speed, settings.elsewhere)
+    return settle(single, [seconds(query.taken_at or "0") for query in queries], confidence, motion, start)
 
 
 def confidence_of(settings: Settings, index: Index) -> Confidence | None:
@@ -155,32 +163,32 @@ def confidence_of(settings: Settings, index: Index) -> Confidence | None:
         console.print("not calibrated: answers come without a probability, and none is unknown; see jobs/calibrate.py")
     elif confidence.gallery != len(index):
         console.print(
-            f"calibrated over {confidence.gallery} gallery images, the index has {index.facts['rows']}: probabilities are "
+            f"calibrated over {confidence.gallery} gallery images, the index has {len(index)}: probabilities are "
             "rough until jobs/calibrate.py is run again",
             style="yellow",
         )
     return confidence
 
 
-def times_of(queries: Sequence[Query], settings: Settings) -> list[str]:
-    """When each photo was taken: by the table, else by the interval, else as the cameras say.
+def timed(queries: Sequence[Query], settings: Settings) -> list[Query]:
+    """The photos with when each was taken: by the table, else by the interval, else as the cameras say.
 
     Raises InputError where that is not known of all.
     """
     names = [query.name for query in queries]
     if settings.times:
         said = read_times(settings.times, names)
-        return [said[name] for name in names]
-    if settings.interval:
-        place = {name: number for number, name in enumerate(sorted(names))}
-        return [str(place[name] * settings.interval) for name in names]
-    unknown = [query.name for query in queries if query.taken_at is None]
+    elif settings.interval:
+        said = {name: str(number * settings.interval) for number, name in enumerate(sorted(names))}
+    else:
+        said = {query.name: query.taken_at for query in queries if query.taken_at is not None}
+    unknown = [name for name in names if name not in said]
     if unknown:
         raise InputError(
             f"{len(unknown)} of {len(names)} photos do not say when they were taken, {unknown[0]} among them; expected times "
             "for --track; give --times TABLE or --interval SECONDS"
         )
-    return [query.taken_at or "" for query in queries]
+    return [replace(query, taken_at=said[query.name]) for query in queries]
 
 
 def _located(query: Query, answer: Answer | None, top: int) -> Located:

@@ -38,6 +38,8 @@ class _Way:
     mirror: bool
     resizer: Resizer
     precision: InEffect
+    probe_B3HW: Bytes
+    "Images to check the encoder by."
     calibration_B3HW: Bytes | None = None
 
     def fingerprint(self, checkpoint: Checkpoint) -> str:
@@ -50,7 +52,7 @@ class _Way:
 class PhotoEncoder:
     """The encoder that made an index's embeddings, for photos that come one by one or by the hundred.
 
-    Threads may share it where each calls `encode` alone at a time: torch computes on all cores anyway.
+    Not for several threads at once: torch spreads a batch over the cores itself.
     """
 
     def __init__(self, checkpoint: bytes, name: str, index_facts: dict[str, Any], shards: str | None = None) -> None:
@@ -81,7 +83,7 @@ class PhotoEncoder:
         calibration = way.calibration_B3HW
         self._encode = make_fast(
             encoder,
-            probe_B3HW=torch.from_numpy(made_probes(self.image_size)),
+            probe_B3HW=torch.from_numpy(way.probe_B3HW),
             batch_size=BATCH,
             precision=way.precision,
             mirror=way.mirror,
@@ -124,14 +126,21 @@ def _ways(shards: str | None, size: int) -> Iterator[_Way]:
     """All ways to embed, the likely ones first."""
     precisions: tuple[InEffect, ...] = ("float32", "bfloat16")
     resizers: tuple[Resizer, ...] = ("torch", "pillow")
+    made_B3HW = made_probes(size)
     for precision, mirror, resizer in product(precisions, (True, False), resizers):
-        yield _Way(mirror=mirror, resizer=resizer, precision=precision)
+        yield _Way(mirror=mirror, resizer=resizer, precision=precision, probe_B3HW=made_B3HW)
     if shards is None:
         return
     manifest = open_manifest(shards)
     for resizer, mirror in product(resizers, (True, False)):
         some_B3HW = some_images(shards, manifest, size, resizer, PROBES + CALIBRATING)
-        yield _Way(mirror=mirror, resizer=resizer, precision="int8", calibration_B3HW=some_B3HW[PROBES:])
+        yield _Way(
+            mirror=mirror,
+            resizer=resizer,
+            precision="int8",
+            probe_B3HW=some_B3HW[:PROBES],
+            calibration_B3HW=some_B3HW[PROBES:],
+        )
 
 
 def made_probes(size: int) -> Bytes:

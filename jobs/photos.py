@@ -39,8 +39,10 @@ def read_photos(photos: Sequence[str], encoder: PhotoEncoder) -> list[Query]:
     with progress(len(photos), "photos", "photos") as meter:
         for begin in range(0, len(photos), BATCH):
             names = photos[begin : begin + BATCH]
-            held = list(ahead(storage.read_bytes, names, READERS, 2 * READERS))
-            embeddings_QD, rejected = encoder.encode(held, names)
+            read = list(ahead(_read, names, READERS, 2 * READERS))
+            held = [b"" if isinstance(data, Rejection) else data for data in read]
+            embeddings_QD, refusals = encoder.encode(held, names)
+            rejected = [one if isinstance(one, Rejection) else two for one, two in zip(read, refusals, strict=True)]
             rows = iter(embeddings_QD)
             queries += [
                 Query(
@@ -51,6 +53,13 @@ def read_photos(photos: Sequence[str], encoder: PhotoEncoder) -> list[Query]:
             ]  # fmt: skip
             meter.advance(len(names))
     return queries
+
+
+def _read(photo: str) -> bytes | Rejection:
+    try:
+        return storage.read_bytes(photo)
+    except OSError as error:
+        return Rejection(path=photo, reason="unreadable file", found=str(error))
 
 
 def together(queries: Sequence[Query]) -> list[Query]:

@@ -26,6 +26,7 @@ from model.checkpoint import CheckpointError
 from model.pvda import FeatureEncoder
 from model.weights import load_backbone, read_state_dict
 from pipeline import cluster, storage
+from pipeline.exclusive import one_at_a_time
 from pipeline.progress import Meter, console, progress
 from pipeline.records import InputError, Unfinished
 
@@ -72,6 +73,7 @@ class Settings(Conduct):
         )  # fmt: skip
 
 
+@one_at_a_time(lambda settings: settings.out)
 def train(settings: Settings) -> str:
     """Train a recipe to its end and return the checkpoint's path; a finished run is left as it is.
 

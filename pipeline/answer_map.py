@@ -14,7 +14,6 @@ from pipeline.gallery_map import GalleryMap
 from pipeline.locate import Answer
 from pipeline.metrics import Doubles
 from pipeline.positions import EARTH_M
-from pipeline.report_charts import nice_ticks
 
 SIDE = 320
 "Pixels of a map's side, before it is scaled to the page."
@@ -49,8 +48,9 @@ class Frame:
 
     @property
     def bar_m(self) -> float:
-        """A round number of metres that takes about a quarter of the side."""
-        return nice_ticks(0, self.half_m / 2, 1)[1]
+        """A round number of metres that takes a tenth to a quarter of the side."""
+        power = 10.0 ** math.floor(math.log10(self.half_m / 2))
+        return max(times * power for times in (1, 2, 5) if times * power <= self.half_m / 2)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.confidence import FEATURES, Confidence, features
+from pipeline.confidence import Confidence, features
 from pipeline.consensus import Consensus
 from pipeline.index import Hit
 from pipeline.locate import judged, levelled, scores_of
@@ -61,9 +61,20 @@ class Judging:
             raise InputError(f"--outside is {self.outside}, expected a share above 0 and below 1")
 
 
-def calibrate(
-    examples: Sequence[Example], judging: Judging, spacing_m: float | None, fingerprint: str, gallery: int
-) -> Confidence:
+@dataclass(frozen=True, kw_only=True)
+class Gallery:
+    """What was asked, as the calibration says it of itself."""
+
+    fingerprint: str
+    "Of the network that made it."
+    rows: int
+    spacing_m: float | None
+    "Median distance of a position to the next one; None where no two are known."
+    asked: str = ""
+    "Which photos it was asked for, in words."
+
+
+def calibrate(examples: Sequence[Example], judging: Judging, gallery: Gallery) -> Confidence:
     """Fit what these examples teach.
 
     Raises InputError where they show too few places, or where all answers are right or all wrong.
@@ -75,7 +86,7 @@ def calibrate(
             f"{len(examples)} photos of {count} locations to calibrate on, expected at least {LEAST_LOCATIONS} locations that "
             "the network was not trained on; train with --hold-out 0.1, or name another --split"
         )
-    within_m = best_radius(examples, judging.tolerance, spacing_m)
+    within_m = best_radius(examples, judging.tolerance, gallery.spacing_m)
     inside = [judged(one.inside, within_m) for one in examples]
     outside = [judged(one.outside, within_m) for one in examples]
     right_N = np.array([
@@ -86,13 +97,10 @@ def calibrate(
             f"{right_N.sum()} of {len(right_N)} photos are answered rightly, expected some right and some wrong; calibrate on "
             "more photos, or check that --shards and --index are of one data set"
         )
+    hits_N = [one.inside for one in examples] + [one.outside for one in examples]
     x_NF = np.array([
-        features(agreed, scores_of(hits))
-        for agreed, hits in [
-            *zip(inside, (one.inside for one in examples), strict=True),
-            *zip(outside, (one.outside for one in examples), strict=True),
-        ]
-    ]).reshape(-1, len(FEATURES))  # fmt: skip
+        features(agreed, scores_of(hits)) for agreed, hits in zip([*inside, *outside], hits_N, strict=True)
+    ])  # fmt: skip
     yes_N = np.concatenate([right_N, np.zeros(len(examples))])
     weight_N = 2 * np.repeat([1 - judging.outside, judging.outside], len(examples))
     said_N = out_of_fold(x_NF, yes_N, weight_N, np.tile(locations, 2))
@@ -100,9 +108,10 @@ def calibrate(
     threshold = best_threshold(said_N, yes_N, weight_N)
     sharpness, elsewhere = fit_track(examples, weight_N)
     return Confidence(
-        fingerprint=fingerprint, gallery=gallery, spacing_m=spacing_m, within_m=within_m, tolerance_m=judging.tolerance,
-        outside=judging.outside, model=fit_logistic(x_NF, yes_N, weight_N), threshold=threshold,
-        sharpness=sharpness, elsewhere=elsewhere, photos=len(examples), locations=count, right=float(right_N.mean()),
+        fingerprint=gallery.fingerprint, gallery=gallery.rows, asked=gallery.asked, spacing_m=gallery.spacing_m,
+        within_m=within_m, tolerance_m=judging.tolerance, outside=judging.outside,
+        model=fit_logistic(x_NF, yes_N, weight_N), threshold=threshold, sharpness=sharpness, elsewhere=elsewhere,
+        photos=len(examples), locations=count, right=float(right_N.mean()),
         right_kept=float((said_N[yes_N > 0] >= threshold).mean()),
         outside_unknown=float((said_N[len(examples) :] < threshold).mean()),
         calibration_error=calibration_error(bins), bins=tuple(bins),
@@ -123,14 +132,19 @@ def is_right(agreed: Consensus, example: Example, tolerance_m: float) -> bool:
 
 
 def best_radius(examples: Sequence[Example], tolerance_m: float, spacing_m: float | None) -> float:
-    """How far apart agreeing candidates may lie: the smallest of FACTORS that places most photos within the tolerance."""
+    """How far apart agreeing candidates may lie: the smallest of FACTORS, unless a larger one places surely more photos within
+    the tolerance: more by twice the standard error over locations, as photos of one place resemble each other."""
     if spacing_m is None:
         return 0.0
-    placed = []
-    for factor in FACTORS:
-        errors = [error_m(judged(one.inside, factor * spacing_m), one) for one in examples]
-        placed.append(sum(error is not None and error <= tolerance_m for error in errors))
-    return FACTORS[int(np.argmax(placed))] * spacing_m
+    _, location_N = np.unique([one.location for one in examples], return_inverse=True)
+    errors = [[error_m(judged(one.inside, factor * spacing_m), one) for one in examples] for factor in FACTORS]
+    placed_FN = np.array([[error is not None and error <= tolerance_m for error in row] for row in errors], np.float64)
+    best = 0
+    for larger in range(1, len(FACTORS)):
+        gain_L = np.bincount(location_N, placed_FN[larger] - placed_FN[best])
+        if gain_L.sum() > 2 * np.sqrt((gain_L**2).sum()):
+            best = larger
+    return FACTORS[best] * spacing_m
 
 
 def out_of_fold(x_NF: Doubles, yes_N: Doubles, weight_N: Doubles, locations_N: npt.NDArray[np.str_]) -> Doubles:

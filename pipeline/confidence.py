@@ -2,10 +2,9 @@
 
 In: what the candidates of a photo agree on. Out: a probability, by a small logistic model that `pipeline/calibration.py` fits
 and `calibration.json` beside an index holds. It is of one network and one gallery: another network's is refused.
-Shapes: Q photos, K candidates, F features.
+Shapes: K candidates, F features.
 """
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -38,6 +37,8 @@ class Confidence:
     "Of the network and its preprocessing."
     gallery: int
     "Rows of the index."
+    asked: str
+    "Which photos it was fitted on, in words."
     spacing_m: float | None
     "Median distance of a gallery position to the next one; None where no two are known."
     within_m: float
@@ -68,10 +69,9 @@ class Confidence:
     bins: tuple[Bin, ...]
     "The reliability diagram's."
 
-    def probabilities(self, agreed: Sequence[Consensus], scores: Sequence[Doubles]) -> Doubles:
-        """That each place is right (Q,)."""
-        x_QF = np.array([features(one, scores_K) for one, scores_K in zip(agreed, scores, strict=True)])
-        return self.model.probabilities(x_QF.reshape(-1, len(FEATURES)))
+    def probability(self, agreed: Consensus, scores_K: Doubles) -> float:
+        """That the place is right, by the candidates considered."""
+        return float(self.model.probabilities(features(agreed, scores_K)[None])[0])
 
 
 def write_confidence(path: str, confidence: Confidence) -> None:

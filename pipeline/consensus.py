@@ -36,12 +36,13 @@ class Consensus:
 
 
 def weights(scores_K: Doubles) -> Doubles:
-    """How much each candidate counts, 0 to 1: its score above the last one's, in shares of the best one's.
+    """How much each candidate counts, 0 to 1: the square of its score above the last one's, in shares of the best one's.
 
-    The last of some ten candidates is what the gallery holds by chance. Equal scores count alike.
+    The last of some ten candidates is what the gallery holds by chance. Squared, since many that are little above it, and
+    stand together by chance, must not outweigh one that stands out. Equal scores count alike.
     """
     level, best = scores_K.min(), scores_K.max()
-    return np.ones_like(scores_K) if best <= level else np.asarray((scores_K - level) / (best - level))
+    return np.ones_like(scores_K) if best <= level else np.asarray(((scores_K - level) / (best - level)) ** 2)
 
 
 def agree(locations_K: Sequence[str], places_K2: Doubles, within_m: float) -> Flags:

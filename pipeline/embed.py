@@ -15,6 +15,7 @@ import ray
 
 from pipeline import cluster, rejects, storage
 from pipeline.crew import CannotWork, Crew, NobodyCame, SetAside, Terms
+from pipeline.exclusive import one_at_a_time
 from pipeline.feature_parts import REJECTED, PartHeader, list_rejected, part_names, read_header, read_headers
 from pipeline.foreign import open_manifest
 from pipeline.placement import Node, Placement, place
@@ -77,6 +78,7 @@ class Incomplete(Unfinished):
     """Embedding has done what it could, and some shards could not be done. One sentence, with their names."""
 
 
+@one_at_a_time(lambda settings, network: settings.out)
 def embed_gallery(settings: EmbeddingSettings, network: Network) -> int:
     """Embed every shard that has no finished part yet; returns how many images were embedded.
 

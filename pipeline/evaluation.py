@@ -5,24 +5,30 @@ In: one table with query and gallery rows, or one table for each. Out: `queries.
 `metrics.json`: where that file is, the evaluation is complete.
 """
 
-import hashlib
-import json
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline import report, storage, stream
+from pipeline import storage, stream
+from pipeline.chosen_rows import vectors_by_key
 from pipeline.evaluation_files import Besides, Export, write_besides
-from pipeline.features import FeatureTable, open_table
+from pipeline.exclusive import one_at_a_time
+from pipeline.features import FeatureTable, Floats, open_table
 from pipeline.progress import console, progress
 from pipeline.records import InputError, Split, View
-from pipeline.retrieval import METRICS_SCHEMA, Protocol, Task, possible_tasks, retrieve
+from pipeline.report import render
+from pipeline.report_inputs import Extras, Findings, Format, no_pictures, read_besides, read_extras, read_findings
+from pipeline.report_panels import PANELS
+from pipeline.retrieval import METRICS_SCHEMA, Protocol, Task, possible_tasks, retrieve, side_of
 from pipeline.shards import read_manifest
 
 ViewName = Literal["drone", "satellite", "street", "google"]
+SHOWN = ("title", "shards", "panels", "views", "parts", "by", "exports", "figures", "answer_order")
+"Settings that change what is written besides the ranking."
 METRICS, RESULTS, INPUTS = "metrics.json", "queries.parquet", "evaluation.json"
 
 
@@ -54,14 +60,20 @@ class EvaluationSettings:
     "Folder of another evaluation on the same images, shown beside this one, such as the untrained network's."
     title: str = "Retrieval evaluation"
     "Headline of the report."
+    panels: int = PANELS
+    "Hits, and as many misses, that the report shows of each task; the first few are open, the others unfold."
     workers: int = 0
     "Ray tasks that rank, of one core each, each for some of the queries; 0: this process ranks, on all cores."
     views: bool = True
     "Whether to measure drone->satellite by the number of views a query is the mean of."
+    parts: bool = True
+    "Whether to measure what each part of the embedding finds alone, and all but it: for four parts, the time of four rankings."
     by: tuple[str, ...] = ()
     "Columns of the shards' records to break the measures down by, such as altitude_m or heading_deg; with --shards."
     exports: tuple[Export, ...] = ()
     "answer: the challenge's answer.txt. mat: the features as pytorch_result.mat."
+    figures: tuple[Format, ...] = ()
+    "Formats, png or pdf, in which to write figures for a paper, into the folder figures/."
     answer_order: str | None = None
     "Text file with the queries' file names in the challenge's order, one a line; with --exports answer and --shards."
 
@@ -81,10 +93,13 @@ class EvaluationSettings:
                 "found --answer-order, expected one task (--queries and --gallery), --exports answer and --shards with it; "
                 "add them"
             )
+        if self.panels < 0:
+            raise InputError(f"--panels is {self.panels}, expected 0 or more; leave it out for {PANELS}")
         if self.workers < 0:
             raise InputError(f"--workers is {self.workers}, expected 0 or more; leave it out to rank in this process")
 
 
+@one_at_a_time(lambda settings: settings.out)
 def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
     """Evaluate into `settings.out` and return the metric rows. A finished evaluation of the same inputs is left as it is.
 
@@ -92,16 +107,13 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
     """
     queries, gallery, tasks = plan(settings)
     ranked = {
-        "fingerprint": queries.fingerprint, "queries": identity(queries), "gallery": identity(gallery),
+        "fingerprint": queries.fingerprint, "queries": queries.digest, "gallery": gallery.digest,
         "protocol": settings.protocol, "tasks": [str(task) for task in tasks],
     }  # fmt: skip
     if settings.shards:
         read_manifest(settings.shards)  # that there are none is better said before the ranking than after it
-    extras = report.read_extras(settings.title, settings.run, settings.beside)
-    shown = {
-        "title": settings.title, "shards": settings.shards, "extras": extras.sha256, "views": settings.views,
-        "by": list(settings.by), "exports": list(settings.exports), "answer_order": settings.answer_order,
-    }  # fmt: skip
+    extras = read_extras(settings.title, settings.run, settings.beside)
+    shown = {name: _plain(getattr(settings, name)) for name in SHOWN} | {"extras": extras.sha256}
     earlier = _earlier(settings.out)
     if earlier and earlier["ranked"] != ranked:
         different = ", ".join(name for name, value in ranked.items() if earlier["ranked"].get(name) != value)
@@ -112,9 +124,8 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
     if earlier and earlier["shown"] == shown:
         console.print(f"{settings.out} is complete: the same features were evaluated before; nothing to do")
     elif earlier:
-        findings = report.read_findings(settings.out)
-        _write_besides(settings, queries, gallery, tasks, findings.results)
-        _write_report(settings, replace(findings, views=report.read_views(settings.out)), extras)
+        _write_besides(settings, queries, gallery, tasks, read_findings(settings.out).results)
+        _write_report(settings, queries, gallery, read_findings(settings.out), extras)
         storage.write_json(storage.join(settings.out, INPUTS), {"ranked": ranked, "shown": shown})
         console.print(f"{settings.out}: ranked before; wrote report.html and what goes with it anew")
     else:
@@ -156,15 +167,9 @@ def plan(settings: EvaluationSettings) -> tuple[FeatureTable, FeatureTable, list
     return queries, gallery, [replace(possible[0], multi_query=settings.multi_query)]
 
 
-def identity(table: FeatureTable) -> str:
-    """Hash of what a table holds, from its parts' footers: the same for a copy elsewhere."""
-    said = [[footer.fingerprint, footer.shard_sha256, footer.rows] for footer in table.footers]
-    return hashlib.sha256(json.dumps([table.dimension, list(table.parts), said]).encode()).hexdigest()
-
-
 def _evaluate(
     settings: EvaluationSettings, queries: FeatureTable, gallery: FeatureTable, tasks: list[Task],
-    inputs: dict[str, Any], extras: report.Extras,
+    inputs: dict[str, Any], extras: Extras,
 ) -> None:  # fmt: skip
     begin = time.monotonic()
     found, spent = [], {}
@@ -183,10 +188,8 @@ def _evaluate(
     _write_besides(settings, queries, gallery, tasks, results)
     spent["views, groups and exports"] = time.monotonic() - started
     started = time.monotonic()
-    findings = report.Findings(
-        name=settings.title, metrics=rows, results=results, views=report.read_views(settings.out)
-    )
-    _write_report(settings, findings, extras)
+    findings = Findings(name=settings.title, metrics=rows, results=results, **read_besides(settings.out))
+    _write_report(settings, queries, gallery, findings, extras)
     spent["report"] = time.monotonic() - started
     storage.write_json(storage.join(settings.out, INPUTS), inputs)
     storage.write_json(storage.join(settings.out, METRICS), rows)
@@ -199,17 +202,35 @@ def _write_besides(
 ) -> None:
     write_besides(
         Besides(
-            out=settings.out, protocol=settings.protocol, workers=settings.workers, views=settings.views, by=settings.by,
-            exports=settings.exports, shards=settings.shards, answer_order=settings.answer_order,
+            out=settings.out, protocol=settings.protocol, workers=settings.workers, views=settings.views, parts=settings.parts,
+            by=settings.by, exports=settings.exports, shards=settings.shards, answer_order=settings.answer_order,
         ),
         queries, gallery, tasks, results,
     )  # fmt: skip
 
 
-def _write_report(settings: EvaluationSettings, findings: report.Findings, extras: report.Extras) -> None:
+def _write_report(
+    settings: EvaluationSettings, queries: FeatureTable, gallery: FeatureTable, findings: Findings, extras: Extras
+) -> None:
     shards = settings.shards
-    page = report.render(findings, extras, (lambda keys: stream.fetch(shards, keys)) if shards else report.no_pictures)
+
+    def vectors(keys: Iterable[str]) -> dict[str, Floats]:
+        wanted = set(keys)
+        sides = side_of(queries.select(Split.QUERY)), side_of(gallery.select(Split.GALLERY))
+        return {key: vector_D for side in sides for key, vector_D in vectors_by_key(side, wanted).items()}
+
+    pictures = (lambda keys: stream.fetch(shards, keys)) if shards else no_pictures
+    page = render(findings, extras, pictures, vectors, settings.panels)
     storage.write_bytes(storage.join(settings.out, "report.html"), page.encode())
+    if settings.figures:
+        from pipeline.figures import write_figures  # here: matplotlib takes half a second, for this alone
+
+        write_figures(findings, pictures, storage.join(settings.out, "figures"), settings.figures)
+
+
+def _plain(value: Any) -> Any:
+    """A setting as JSON gives it back."""
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _earlier(out: str) -> dict[str, Any] | None:

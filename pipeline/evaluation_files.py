@@ -1,24 +1,29 @@
-"""What an evaluation holds besides measures and report: R@1 by views, measures by group, files for other programs.
+"""What an evaluation holds besides measures and report: R@1 by views, measures by group and by part, the gap between the
+views, files for other programs.
 
 In: the tables and the per-query rows. Out: `views.json` (rows of view_curve.VIEWS_SCHEMA), `groups.json` (rows of
-breakdowns.break_down), `answer.txt` and `pytorch_result.mat`, one of each task where there are several.
+breakdowns.break_down), `parts.json` (rows of part_measures.measure_parts), `view_gap.json` (of each pair of views
+view_gap.describe), `answer.txt` and `pytorch_result.mat`, one of each task where there are several.
 """
 
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipeline import breakdowns, exports, storage
+from pipeline import breakdowns, exports, storage, view_gap
+from pipeline.chosen_rows import taken
 from pipeline.features import FeatureTable
+from pipeline.part_measures import measure_parts
 from pipeline.progress import progress
 from pipeline.records import View
-from pipeline.retrieval import Protocol, Task
+from pipeline.retrieval import Protocol, Task, sides_of
 from pipeline.view_curve import view_curve
 
 Export = Literal["answer", "mat"]
-VIEWS, GROUPS = "views.json", "groups.json"
+VIEWS, GROUPS, PARTS, GAP = "views.json", "groups.json", "parts.json", "view_gap.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +34,7 @@ class Besides:
     protocol: Protocol
     workers: int
     views: bool
+    parts: bool
     by: tuple[str, ...]
     exports: tuple[Export, ...]
     shards: str | None
@@ -54,6 +60,17 @@ def write_besides(
         for column in wanted.by:
             groups += breakdowns.break_down(results, column, breakdowns.read_column(wanted.shards, column))
         storage.write_json(storage.join(wanted.out, GROUPS), groups)
+    if wanted.parts:
+        with progress(None, "by part of the embedding", "scores") as meter:
+            parts = [
+                row
+                for task in single
+                for row in measure_parts(task, queries, gallery, wanted.protocol, wanted.workers, meter.advance)
+            ]
+        if parts:
+            storage.write_json(storage.join(wanted.out, PARTS), parts)
+    if gaps := _gaps(single, queries, gallery):
+        storage.write_json(storage.join(wanted.out, GAP), gaps)
     for task in single:
         _export(
             wanted,
@@ -63,6 +80,21 @@ def write_besides(
             gallery,
             results,
         )
+
+
+def _gaps(tasks: list[Task], queries: FeatureTable, gallery: FeatureTable) -> list[dict[str, Any]]:
+    """Of each pair of views the gap, once, whichever asks for the other; none where they have not two places in common."""
+    gaps: dict[frozenset[View], dict[str, Any]] = {}
+    for task in tasks:
+        views = frozenset((task.query_view, task.gallery_view))
+        if views in gaps:
+            continue
+        sides = sides_of(task, queries, gallery, "full")
+        rows = view_gap.choose(sides[0].locations, sides[1].locations)
+        asked, given = (taken(side, rows_N) for side, rows_N in zip(sides, rows, strict=True))
+        if len(np.unique(asked.locations_N)) > 1:
+            gaps[views] = {"task": task.name} | view_gap.describe(asked, given)
+    return list(gaps.values())
 
 
 def _export(

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.io
 
 from pipeline import storage
+from pipeline.exclusive import one_at_a_time
 from pipeline.features import Floats, PartFooter, PartRows, write_part
 from pipeline.records import InputError, Split, View, make_key
 
@@ -43,6 +44,7 @@ class _Side:
     "Empty where the file has none."
 
 
+@one_at_a_time(lambda settings: settings.out)
 def import_features(settings: ImportSettings) -> dict[str, tuple[str, int]]:
     """Write OUT/queries and OUT/gallery; returns, for each, its path and rows. What is there already is left as it is.
 

@@ -14,6 +14,7 @@ from typing import Any
 import faiss
 
 from pipeline import storage
+from pipeline.exclusive import one_at_a_time
 from pipeline.feature_rows import readable
 from pipeline.features import FeatureTable, open_table
 from pipeline.index import Index
@@ -79,6 +80,7 @@ def parse_bytes(text: str) -> int:
     return int(float(match[1]) * UNITS[unit])
 
 
+@one_at_a_time(lambda settings: settings.out)
 def build_index(settings: IndexSettings) -> dict[str, Any]:
     """Build the index of a table, or of one split or view of it; a finished one is left as it is. Returns its facts.
 
@@ -126,7 +128,7 @@ def make_plan(settings: IndexSettings, table: FeatureTable, rows_of_part: dict[s
     """The planner's answer for a table, or what the user asked for."""
     gallery = Gallery(
         rows=sum(rows_of_part.values()), dimension=table.dimension, budget=parse_bytes(settings.memory_budget),
-        target_recall=settings.target_recall, rows_readable=readable(table.path),
+        target_recall=settings.target_recall, rows_readable=readable(table.path), workers=settings.workers,
     )  # fmt: skip
     if settings.factory:
         return plan_factory(gallery, settings.factory, "table" if settings.refine else "none")

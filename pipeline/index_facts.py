@@ -14,7 +14,7 @@ from pipeline.records import InputError
 
 SCHEMA_VERSION = 2
 FACTS = "index.json"
-AGAIN = "build the index again with jobs/build_index.py"
+AGAIN = "delete it and build the index again with jobs/build_index.py"
 
 
 @dataclass(frozen=True, kw_only=True)

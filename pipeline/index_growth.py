@@ -14,6 +14,7 @@ import faiss
 import numpy as np
 
 from pipeline import storage
+from pipeline.exclusive import one_at_a_time
 from pipeline.features import FeatureTable, open_table
 from pipeline.index import Index
 from pipeline.index_build import finish
@@ -26,6 +27,7 @@ from pipeline.records import InputError, Split, View
 from pipeline.where import Where
 
 
+@one_at_a_time(lambda table, out, workers=0: out)
 def extend_index(table: str, out: str, workers: int = 0) -> dict[str, Any]:
     """Add the rows of those parts of a table that an index does not hold yet; with none it is left as it is.
 
@@ -56,6 +58,7 @@ def extend_index(table: str, out: str, workers: int = 0) -> dict[str, Any]:
     return finish(out, facts, hold_queries(now, rows_by_part(now), others), workshop, start)
 
 
+@one_at_a_time(lambda out, locations: out)
 def remove_locations(out: str, locations: Iterable[str]) -> dict[str, Any]:
     """Make locations of an index answer no more. Their vectors stay in its files until it is built again.
 

@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline import storage
+from pipeline.index_facts import AGAIN
 from pipeline.metrics import Whole
 from pipeline.records import InputError
 from pipeline.where import Mask, Where
@@ -70,7 +71,7 @@ class Ids:
                 reader = pa.ipc.open_file(source)
                 self._batches = [reader.get_batch(i) for i in range(reader.num_record_batches)]
         except (pa.ArrowException, OSError) as error:
-            raise InputError(f"{path} is damaged ({error}); build the index again with jobs/build_index.py") from None
+            raise InputError(f"{path} is damaged ({error}); {AGAIN}") from None
         self._begin = np.cumsum([0, *(len(batch) for batch in self._batches)])
 
     def __len__(self) -> int:

@@ -24,7 +24,7 @@ MASK_BYTES = 1.125
 "Of a row while a filter is looked at: a truth value and a bit. Names and positions are mapped from the disk."
 TRAINING_SHARE = 0.25
 "Of the memory, for the rows that an index is trained on."
-COPIED = 1.5
+COPIED = 1.75
 "FAISS's residuals and reduced copies of them, the rows themselves included."
 MOST_TRAINING_ROWS = 2_000_000
 ROWS_PER_LIST = 50  # that train a centroid: FAISS warns below 39 and uses no more than 256
@@ -51,6 +51,8 @@ class Gallery:
     cores: int = 1
     effective_dimension: int | None = None
     "Leading directions that hold nearly all of the vectors' length; None where not known."
+    workers: int = 0
+    "Other processes that build units, on machines with as much memory for all of them together."
     rows_readable: bool = True
     "Whether single vectors can be read from the table while searching."
 
@@ -167,18 +169,20 @@ def _plan(family: _Family, gallery: Gallery) -> Plan:
     code = family.code_bytes(reduced)
     fixed = PROCESS_BYTES + lists * (4.0 * reduced + 64) + 4.0 * gallery.dimension * (reduced if family.reduces else 0)
     codes, masks = gallery.rows * code, MASK_BYTES * gallery.rows
-    unit = min(gallery.rows, max(LEAST_UNIT_ROWS, int(gallery.budget * UNIT_SHARE / code)))
+    unit = min(gallery.rows, max(LEAST_UNIT_ROWS, int(gallery.budget * UNIT_SHARE / code / max(1, gallery.workers))))
     if not family.inverted:
         unit = gallery.rows  # a graph is built in one piece
     part = max(unit, int(gallery.budget * PART_SHARE / code)) if family.on_disk else gallery.rows
     merging = part * code if family.on_disk else 2 * codes if family.name in ("PQfs", "HNSW32,SQ8", "Flat") else codes
-    growing = fixed + BLOCK_BYTES + max(2 * unit * code, merging)
+    growing = max(1, gallery.workers) * (fixed + BLOCK_BYTES + 2 * unit * code) + (
+        PROCESS_BYTES if gallery.workers else 0
+    )
     return Plan(
         factory=(f"PCA{reduced}," if family.reduces else "") + form_of(family.form, lists, reduced),
         refine=family.refine, on_disk=family.on_disk, training_rows=trained, unit_rows=unit,
         part_rows=part,
         search_bytes=fixed + masks + (0 if family.on_disk else codes),
-        build_bytes=max(growing, fixed + BLOCK_BYTES + COPIED * 4.0 * trained * gallery.dimension),
+        build_bytes=max(growing, fixed + BLOCK_BYTES + max(merging, COPIED * 4.0 * trained * gallery.dimension)),
         expected_recall=family.ceiling,
         why=_reason(family, gallery, reduced, code),
     )  # fmt: skip

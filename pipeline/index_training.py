@@ -17,6 +17,7 @@ from pipeline.records import InputError
 FAISS: Any = faiss  # whose types know nothing of its keyword arguments
 SPECTRUM_ROWS = 16_384
 "Rows by which the table's directions are weighed."
+SAMPLED_AT_ONCE = 4_096
 ENERGY = 0.99
 "Of the vectors' squared length, what a projection has to keep."
 STEP = 32
@@ -27,22 +28,26 @@ def sample(table: FeatureTable, rows_of_part: dict[str, int], rows: int) -> tupl
     """About `rows` row numbers (S,) with their vectors (S, D), of each part its share: the first ones, as parts are ordered by
     hash. `rows_of_part`: of the table, in its order."""
     share = min(1.0, rows / max(1, sum(rows_of_part.values())))
-    numbers, blocks = [np.empty(0, np.int64)], [np.empty((0, table.dimension), np.float32)]
-    begin, left = 0, rows
+    numbers_S = np.empty(min(rows, sum(rows_of_part.values())), np.int64)
+    vectors_SD = np.empty((len(numbers_S), table.dimension), np.float32)
+    begin = taken = 0
     for part, held in rows_of_part.items():
-        wanted = min(left, math.ceil(held * share))
+        wanted = min(len(numbers_S) - taken, math.ceil(held * share))
         if wanted:
-            numbers.append(np.arange(begin, begin + wanted))
-            blocks.extend(_first(table.only([part]).blocks(wanted), wanted))
-        begin, left = begin + held, left - wanted
-    return np.concatenate(numbers), np.concatenate(blocks)
+            numbers_S[taken : taken + wanted] = np.arange(begin, begin + wanted)
+            _fill(vectors_SD[taken : taken + wanted], table.only([part]).blocks(min(wanted, SAMPLED_AT_ONCE)))
+        begin, taken = begin + held, taken + wanted
+    return numbers_S[:taken], vectors_SD[:taken]
 
 
-def _first(blocks: Iterator[Floats], rows: int) -> Iterator[Floats]:
+def _fill(vectors_SD: Floats, blocks: Iterator[Floats]) -> None:
+    """The first rows of the blocks."""
+    at = 0
     for block_BD in blocks:
-        yield block_BD[:rows]
-        rows -= len(block_BD)
-        if rows <= 0:
+        here = min(len(block_BD), len(vectors_SD) - at)
+        vectors_SD[at : at + here] = block_BD[:here]
+        at += here
+        if at == len(vectors_SD):
             return
 
 

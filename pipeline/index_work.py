@@ -68,27 +68,33 @@ class Workshop:
 
         `first_row`, `first_part`: how many of each the index has already.
         """
+        whole = self._can_merge()
+        units = units_of(rows_of_part, min(unit_rows, part_rows) if whole else part_rows)
+        files = [storage.join(self._scratch, f"unit-{number:06d}.faiss") for number in range(len(units))]
+        self._build_units(units, files)
+        parts: list[PartFacts] = []
+        for group in (
+            even_groups([unit.rows for unit in units], part_rows) if whole else [[i] for i in range(len(units))]
+        ):
+            ending = _ending(first_part + len(parts))
+            self._merge([files[number] for number in group], storage.join(self._out, f"index{ending}.faiss"))
+            parts.append(self._describe([units[number] for number in group], first_row, ending))
+            first_row += parts[-1].rows
+        return tuple(parts)
+
+    def _can_merge(self) -> bool:
         with tempfile.TemporaryDirectory() as scratch:
-            trained = local_copy(self._trained, scratch)
-            whole = mergeable(read_faiss(trained, on_disk=False))
-            units = units_of(rows_of_part, min(unit_rows, part_rows) if whole else part_rows)
-            files = [storage.join(self._scratch, f"unit-{number:06d}.faiss") for number in range(len(units))]
-            self._build_units(units, files)
-            parts: list[PartFacts] = []
-            sizes = [unit.rows for unit in units]
-            for group in even_groups(sizes, part_rows) if whole else [[number] for number in range(len(units))]:
-                ending = _ending(first_part + len(parts))
-                out = storage.join(self._out, f"index{ending}.faiss")
-                if len(group) == 1:
-                    storage.copy(files[group[0]], out)
-                else:
-                    index = merge(trained, [local_copy(files[number], scratch) for number in group])
-                    with storage.atomic_file(out) as local:
-                        faiss.write_index(index, local)
-                    del index
-                parts.append(self._describe_part([units[number] for number in group], first_row, ending))
-                first_row += parts[-1].rows
-            return tuple(parts)
+            return mergeable(read_faiss(local_copy(self._trained, scratch), on_disk=False))
+
+    def _merge(self, files: Sequence[str], out: str) -> None:
+        """Make units one file of the index."""
+        if len(files) == 1:
+            storage.copy(files[0], out)
+            return
+        with tempfile.TemporaryDirectory() as scratch, storage.atomic_file(out) as local:
+            faiss.write_index(
+                merge(local_copy(self._trained, scratch), [local_copy(file, scratch) for file in files]), local
+            )
 
     def _build_units(self, units: Sequence[Unit], files: Sequence[str]) -> None:
         missing = [number for number, file in enumerate(files) if not storage.exists(file)]
@@ -109,7 +115,7 @@ class Workshop:
             for _, rows in cluster.bounded(submit, missing, self._workers):
                 meter.advance(rows)
 
-    def _describe_part(self, units: Sequence[Unit], first_row: int, ending: str) -> PartFacts:
+    def _describe(self, units: Sequence[Unit], first_row: int, ending: str) -> PartFacts:
         """Write whose rows the vectors of a part are, and say what it holds."""
         held = {name: number for number, name in enumerate(name for unit in units for name in unit.table_parts)}
         table = self._table.only(list(held))

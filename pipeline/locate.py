@@ -74,7 +74,7 @@ def locate(
 
     `where` narrows the search; `confidence` is the calibration of this index. Without one `spacing_m`, the gallery's, says how
     far apart candidates may lie that agree; without either they agree where they are of one location.
-    Raises InputError for a `where` that is none.
+    Raises InputError where the embeddings are not the index's.
     """
     most = max(k, CONSIDERED)
     return answers(index.search(embeddings_QD, most, where), k, confidence, spacing_m)
@@ -86,26 +86,13 @@ def answers(
     """What the candidates of each photo, best first, amount to; `k` of them go into the answer."""
     spacing = (confidence.spacing_m if confidence else spacing_m) or 0.0
     within_m = confidence.within_m if confidence else UNCALIBRATED * spacing
-    agreed = [judged(hits, within_m) if hits else None for hits in found]
-    probabilities = iter(
-        confidence.probabilities([one for one in agreed if one], [scores_of(hits) for hits in found if hits]).tolist()
-        if confidence
-        else []
-    )
-    return [
-        _answer(one, hits, k, next(probabilities, None), confidence, spacing) if one else NOTHING
-        for one, hits in zip(agreed, found, strict=True)
-    ]
+    return [_answer(hits, judged(hits, within_m), k, confidence, spacing) if hits else NOTHING for hits in found]
 
 
 def _answer(
-    agreed: Consensus,
-    hits: Sequence[Hit],
-    k: int,
-    probability: float | None,
-    confidence: Confidence | None,
-    spacing: float,
-) -> Answer:
+    hits: Sequence[Hit], agreed: Consensus, k: int, confidence: Confidence | None, spacing: float
+) -> Answer:  # fmt: skip
+    probability = confidence.probability(agreed, scores_of(hits)) if confidence else None
     position = None
     if agreed.lat is not None and agreed.lon is not None:
         radius_m = math.hypot(agreed.spread_m, spacing / 2)

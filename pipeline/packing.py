@@ -14,6 +14,7 @@ import ray
 
 from pipeline import cluster, rejects, storage
 from pipeline.duplicates import COLUMNS, find_duplicates
+from pipeline.exclusive import one_at_a_time
 from pipeline.extension import new_records, next_numbers
 from pipeline.progress import console, progress
 from pipeline.records import ImageRecord, InputError, Rejection, Split, Unfinished
@@ -73,6 +74,7 @@ class Haul:
     "Images that the set held already."
 
 
+@one_at_a_time(lambda source, settings: settings.out)
 def pack(source: Source, settings: PackingSettings) -> Manifest:
     """Pack a source's imagery; a finished set is left as it is, an unfinished one is gone on with.
 

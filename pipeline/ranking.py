@@ -10,15 +10,17 @@ Shapes: B gallery rows of a block, Q queries, P pairs of a query and a true matc
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from pipeline import metrics, scoring
+from pipeline.ahead import ready
 from pipeline.features import Floats, Words
 from pipeline.metrics import Doubles, Whole
 from pipeline.scoring import LAST_ROW, NO_KEY, WRONG, on_grid
 
-PAIR_ROWS = 128  # true matches scored at once: four megabytes of float64 at 2,048 dimensions stay near the core
+BLOCKS_AHEAD = 1  # read while another is ranked; each takes 34 MB at 2,048 dimensions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +119,7 @@ def _rank_held(
     best_QK = np.full((queries, top), NO_KEY)
     room = np.empty(cut.query_rows * cut.gallery_rows, np.float32)
     begin = 0
-    for block_BD in _regrouped(gallery.blocks(cut.gallery_rows), cut.gallery_rows):
+    for block_BD in ready(_regrouped(gallery.blocks(cut.gallery_rows), cut.gallery_rows), BLOCKS_AHEAD):
         end = begin + len(block_BD)
         for first in range(0, queries, cut.query_rows):
             part = slice(first, min(first + cut.query_rows, queries))
@@ -129,12 +131,11 @@ def _rank_held(
             scores_QB[
                 owner[here], row_P[pairs][here] - begin
             ] = -np.inf  # true matches are known: wrong rows are counted
-            flat_N = scoring.doubtful(
-                scores_QB, owner, low_P[pairs], high_P[pairs], _floors(scores_QB, best_QK[part], bound)
-            )
-            exact_N = scoring.exact_entries(part_QD, block_BD, flat_N)
-            scores_QB.reshape(-1)[flat_N] = exact_N
-            ahead_P[pairs] += scoring.count_ahead(scores_QB, owner, score_P[pairs])
+            flat_N, exact_N, ahead = scoring.settle(
+                scores_QB, owner, score_P[pairs], (low_P[pairs], high_P[pairs]), _floors(scores_QB, best_QK[part], bound),
+                partial(scoring.exact_entries, part_QD, block_BD),
+            )  # fmt: skip
+            ahead_P[pairs] += ahead
             query_N, in_block_N = np.divmod(flat_N, len(block_BD))
             key_N = scoring.order_keys(exact_N) | WRONG | (LAST_ROW - begin - in_block_N)
             better = key_N > best_QK[part][query_N, 0] if top else np.zeros(len(key_N), np.bool_)
@@ -163,8 +164,8 @@ def _scores_of_pairs(held_QD: Floats, gallery: Side, owner_P: Whole, row_P: Whol
     sorted_P, score_P, begin = row_P[by_row], np.zeros(len(row_P), np.float32), 0
     for block_BD in _regrouped(gallery.blocks(cut.gallery_rows), cut.gallery_rows):
         low, high = np.searchsorted(sorted_P, [begin, begin + len(block_BD)])
-        for first in range(low, high, PAIR_ROWS):
-            pairs = by_row[first : min(first + PAIR_ROWS, high)]
+        for first in range(low, high, scoring.PAIR_ROWS):
+            pairs = by_row[first : min(first + scoring.PAIR_ROWS, high)]
             score_P[pairs] = scoring.exact_pairs(held_QD[owner_P[pairs]], block_BD[row_P[pairs] - begin])
         begin += len(block_BD)
     return score_P

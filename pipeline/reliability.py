@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.metrics import Doubles
 
 BINS = 10
-SIDE, EDGE = 260, 44
+SIDE, EDGE = 260, 56
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +55,7 @@ def diagram(bins: Sequence[Bin], title: str) -> str:
         return f"{inner + 10 - value * inner:.1f}"
 
     ticks = "".join(
-        f'<text x="{x(at)}" y="{SIDE + 2}" text-anchor="middle">{at:g}</text>'
+        f'<text x="{x(at)}" y="{inner + 27}" text-anchor="middle">{at:g}</text>'
         f'<text x="{EDGE - 7}" y="{y(at)}" dy="4" text-anchor="end">{at:g}</text>'
         for at in (0, 0.25, 0.5, 0.75, 1)
     )
@@ -65,11 +65,11 @@ def diagram(bins: Sequence[Bin], title: str) -> str:
         for one in bins
     )
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {SIDE + 20} {SIDE + 30}" width="{2 * SIDE}" role="img" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {SIDE + 20} {inner + 56}" width="{2 * SIDE}" role="img" '
         f'aria-label="{html.escape(title)}" font-family="sans-serif" font-size="11" fill="#5d666f">'
         f'<rect width="100%" height="100%" fill="#fff"/><rect x="{x(0)}" y="{y(1)}" width="{inner}" height="{inner}" '
         f'fill="none" stroke="#e3e0d8"/><path d="M{x(0)} {y(0)}L{x(1)} {y(1)}" stroke="#5d666f" stroke-dasharray="3 4"/>'
         f'<g fill="#1f5c99" fill-opacity=".55" stroke="#1f5c99">{dots}</g>{ticks}'
-        f'<text x="{x(0.5)}" y="{SIDE + 22}" text-anchor="middle">probability said</text>'
+        f'<text x="{x(0.5)}" y="{inner + 46}" text-anchor="middle">probability said</text>'
         f'<text transform="translate(12 {y(0.5)}) rotate(-90)" text-anchor="middle">share that was right</text></svg>\n'
     )

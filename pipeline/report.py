@@ -10,27 +10,30 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
-import numpy as np
 
-from pipeline import metrics
-from pipeline.metrics import Whole
-from pipeline.report_charts import HEIGHT, WIDTH, Chart, recall_chart, training_charts
+from pipeline import report_charts, report_map, report_scatter
+from pipeline.features import Floats
+from pipeline.report_choice import Choice, choose
 from pipeline.report_evidence import scores_chart, views_chart
-from pipeline.report_inputs import Extras, Findings, Pictures, no_pictures, read_extras, read_findings, read_views
-from pipeline.report_panels import PANELS, distance, is_hit, keys_shown, make_panel, spread, sureness
+from pipeline.report_inputs import Extras, Findings, Pictures, Vectors, no_vectors
+from pipeline.report_map import distance_chart, error_map
+from pipeline.report_panels import PANELS, Album, make_panel
+from pipeline.report_scatter import scatter
+from pipeline.report_tables import group_tables, part_tables
+from pipeline.report_tasks import MEASURES, task_view
 
-__all__ = ["Extras", "Findings", "Pictures", "no_pictures", "read_extras", "read_findings", "read_views", "render"]
-
-MEASURES = {"r1": "R@1", "r5": "R@5", "r10": "R@10", "r1p": "R@1%", "ap": "AP"}
 PROTOCOLS = {
     "full": "the official protocol: the whole gallery is ranked, with its distractors",
     "queried-only": "the reduced protocol: gallery images of places that are not queried are left out, so its figures do "
     "not compare with those of the official one",
 }
+AT_ONCE = 6  # panels of a kind that are open from the start; the others unfold
 
 
-def render(findings: Findings, extras: Extras, pictures: Pictures) -> str:
-    """The page.
+def render(
+    findings: Findings, extras: Extras, pictures: Pictures, vectors: Vectors = no_vectors, panels: int = PANELS
+) -> str:
+    """The page, with at most `panels` hits and as many misses of each task, and as many places asked for in both ways.
 
     Raises InputError when the evaluation beside ranked other images.
     """
@@ -41,10 +44,23 @@ def render(findings: Findings, extras: Extras, pictures: Pictures) -> str:
     environment.filters |= {
         "percent": lambda value: f"{100 * value:.2f}",
         "points": lambda value: f"{100 * value:+.2f}",
+        "metres": report_map.metres,
     }
-    rows_of = [findings.results_of(row) for row in findings.metrics]
-    tasks = [_task(row, rows, extras) for row, rows in zip(findings.metrics, rows_of, strict=True)]
-    panels = [(task, rows) for task, rows in zip(tasks, rows_of, strict=True) if not task["multi_query"]]
+    tasks = [task_view(row, findings.results_of(row), extras) for row in findings.metrics]
+    single = [task for task in tasks if not task.row["multi_query"]]
+    names = {task.row["task"]: task.name for task in single}
+    r1 = {task.row["task"]: task.row["r1"] for task in single}
+    evidence = [
+        *(views_chart(f"{task.name}, R@1 by views a query", [row for row in findings.views if row["task"] == task.row["task"]])
+          for task in single),
+        *(scores_chart(f"{task.name}, scores", task.rows) for task in single),
+        *(distance_chart(f"{task.name}, distance", task.rows) for task in single),
+    ]  # fmt: skip
+    choices = choose(tasks, panels)
+    keys = sorted(set[str]().union(*(choice.keys for choice in choices)))
+    parts = {row["task"]: row["parts"] for row in findings.parts}
+    album, known = Album(pictures(keys)), vectors(keys) if parts else {}
+    maps = [error_map(task.name, task.rows) for task in single]
     return environment.get_template("report.html").render(
         title=extras.title,
         fingerprint=findings.metrics[0]["fingerprint"],
@@ -52,61 +68,26 @@ def render(findings: Findings, extras: Extras, pictures: Pictures) -> str:
         measures=MEASURES,
         tasks=tasks,
         beside=extras.beside.name if extras.beside else None,
-        evidence=_evidence(findings, tasks, rows_of),
-        training=training_charts(extras.training),
-        sections=[_section(task, rows, pictures) for task, rows in panels],
-        width=WIDTH,
-        height=HEIGHT,
-    )
+        evidence=[chart for chart in evidence if chart],
+        groups=group_tables(findings.groups, names, r1),
+        parts=part_tables(findings.parts, names, r1),
+        gaps=[scatter(gap) for gap in findings.gaps],
+        maps=[each for each in maps if each],
+        training=report_charts.training_charts(extras.training),
+        sections=[_section(choice, album, known, parts.get(choice.task.row["task"], 1)) for choice in choices],
+        at_once=AT_ONCE,
+        charts=report_charts, scatters=report_scatter, map_size=report_map,
+    )  # fmt: skip
 
 
-def _task(row: Mapping[str, Any], rows: list[dict[str, Any]], extras: Extras) -> dict[str, Any]:
-    """A line of the table and its recall curve."""
-    query_view, gallery_view = row["task"].split("->")
-    other = extras.beside.of(dict(row)) if extras.beside else None
-    matches_Q = np.array([each["matches"] for each in rows], np.int64)
-    name = f"{query_view} → {gallery_view}" + (", multi-query" if row["multi_query"] else "")
-    return {
-        **row, "name": name, "anchor": name.replace(" → ", "-").replace(", ", "-"),
-        "query_view": query_view, "gallery_view": gallery_view, "other": other,
-        "first": sum(is_hit(each) for each in rows), "unmatched": int(np.count_nonzero(matches_Q == 0)),
-        "chance": metrics.chance(matches_Q, row["gallery"]), "one_percent": metrics.one_percent(row["gallery"]),
-        "sure": {name: (row[f"{name}_low"], row[f"{name}_high"]) for name in MEASURES if row.get(f"{name}_low") is not None},
-        "geo": row if row.get("geo_queries") else None,
-        "chart": _recall_chart(name, row, rows, extras if other else None),
-    }  # fmt: skip
-
-
-def _evidence(findings: Findings, tasks: list[dict[str, Any]], rows_of: list[list[dict[str, Any]]]) -> list[Chart]:
-    """R@1 by number of views, and for each task of single queries how the scores of right and wrong answers part."""
-    single = [(task, rows) for task, rows in zip(tasks, rows_of, strict=True) if not task["multi_query"]]
-    of_views = [
-        views_chart(
-            f"{task['name']}, R@1 by views a query", [row for row in findings.views if row["task"] == task["task"]]
-        )
-        for task, _ in single
+def _section(choice: Choice, album: Album, known: Mapping[str, Floats], parts: int) -> dict[str, Any]:
+    """A task's panels."""
+    hits, misses = ([make_panel(row, album, known, parts) for row in rows] for rows in (choice.hits, choice.misses))
+    pairs = [
+        (make_panel(pair.single, album), make_panel(pair.merged, album, merged=pair.images))
+        for pair in choice.pairs.shown
     ]
-    charts = [*of_views, *(scores_chart(f"{task['name']}, scores", rows) for task, rows in single)]
-    return [chart for chart in charts if chart]
-
-
-def _recall_chart(name: str, row: Mapping[str, Any], rows: list[dict[str, Any]], extras: Extras | None) -> Chart:
-    beside = extras.beside if extras else None
-    beside_Q = _first_ranks(beside.results_of(dict(row))) if beside else None
-    note = f"{row['queries']:,} queries, {row['gallery']:,} in the gallery"
-    return recall_chart(name, note, _first_ranks(rows), row["gallery"], beside_Q, beside.name if beside else "")
-
-
-def _first_ranks(rows: list[dict[str, Any]]) -> Whole:
-    return np.array([row["first_match_rank"] or 0 for row in rows], np.int64)
-
-
-def _section(task: dict[str, Any], rows: list[dict[str, Any]], pictures: Pictures) -> dict[str, Any]:
-    """A task's hits, from the surest to the least sure, and its misses, from the farthest off to the nearly right."""
-    hits = spread([row for row in rows if is_hit(row)], PANELS, sureness)
-    misses = spread([row for row in rows if not is_hit(row)], PANELS, distance)
-    images = pictures(sorted(keys_shown([*hits, *misses])))
     return {
-        "task": task, "pictures": bool(images),
-        "hits": [make_panel(row, images) for row in hits], "misses": [make_panel(row, images) for row in misses],
+        "task": choice.task, "pictures": bool(album), "parts": parts, "hits": hits, "misses": misses, "pairs": pairs,
+        "merged": choice.pairs,
     }  # fmt: skip

@@ -36,8 +36,7 @@ def scores_chart(title: str, rows: Sequence[Mapping[str, Any]]) -> Chart | None:
 
     A wrong answer that is not among the top ten is worth less than these, and is left out.
     """
-    right = [row["first_match_score"] for row in rows if row["first_match_score"] is not None]
-    wrong = [score for row in rows if (score := _best_wrong(row)) is not None]
+    right, wrong = best_scores(rows)
     if not right or not wrong:
         return None
     low, high = min(*right, *wrong), max(*right, *wrong)
@@ -60,6 +59,12 @@ def scores_chart(title: str, rows: Sequence[Mapping[str, Any]]) -> Chart | None:
         x_ticks=tuple(Tick(at=frame.x(x), label=f"{x:g}") for x in x_ticks),
         y_ticks=tuple(Tick(at=frame.y(y), label=f"{100 * y:g} %") for y in y_ticks),
     )  # fmt: skip
+
+
+def best_scores(rows: Sequence[Mapping[str, Any]]) -> tuple[list[float], list[float]]:
+    """Scores of the best true match and of the best wrong answer, of the queries that have one."""
+    right = [row["first_match_score"] for row in rows if row["first_match_score"] is not None]
+    return right, [score for row in rows if (score := _best_wrong(row)) is not None]
 
 
 def _best_wrong(row: Mapping[str, Any]) -> float | None:

@@ -4,20 +4,33 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from pipeline import storage
+from pipeline.evaluation_files import GAP, GROUPS, PARTS, VIEWS
+from pipeline.features import Floats
 from pipeline.records import InputError
 
 Pictures = Callable[[Iterable[str]], dict[str, bytes]]
 "Encoded images by key; keys that are not known are absent."
 
 
+Format = Literal["png", "pdf"]
+"Of the figures for a paper."
+Vectors = Callable[[Iterable[str]], dict[str, Floats]]
+"Embeddings (D,) by key; keys that are not known are absent."
+BESIDES = {"views": VIEWS, "groups": GROUPS, "parts": PARTS, "gaps": GAP}
+
+
 def no_pictures(keys: Iterable[str]) -> dict[str, bytes]:
+    return {}
+
+
+def no_vectors(keys: Iterable[str]) -> dict[str, Floats]:
     return {}
 
 
@@ -32,6 +45,12 @@ class Findings:
     "Rows of retrieval.RESULTS_SCHEMA, of all tasks."
     views: tuple[dict[str, Any], ...] = ()
     "Rows of view_curve.VIEWS_SCHEMA."
+    groups: tuple[dict[str, Any], ...] = ()
+    "Rows of breakdowns.break_down."
+    parts: tuple[dict[str, Any], ...] = ()
+    "Rows of part_measures.measure_parts."
+    gaps: tuple[dict[str, Any], ...] = ()
+    "Of each pair of views view_gap.describe."
 
     def of(self, row: dict[str, Any]) -> dict[str, Any] | None:
         """This evaluation's metric row for the task of another's row; None where it has none.
@@ -75,14 +94,14 @@ def read_findings(folder: str) -> Findings:
         name=folder.rstrip("/").rsplit("/", 1)[-1],
         metrics=storage.read_json(storage.join(folder, "metrics.json")),
         results=results,
-        views=read_views(folder),
+        **read_besides(folder),
     )
 
 
-def read_views(folder: str) -> tuple[dict[str, Any], ...]:
-    """The measures by number of views; none where they were not taken."""
-    path = storage.join(folder, "views.json")
-    return tuple(storage.read_json(path)) if storage.exists(path) else ()
+def read_besides(folder: str) -> dict[str, tuple[dict[str, Any], ...]]:
+    """What an evaluation holds besides its measures, by the names of Findings' fields; empty where it was not taken."""
+    paths = {name: storage.join(folder, file) for name, file in BESIDES.items()}
+    return {name: tuple(storage.read_json(path)) if storage.exists(path) else () for name, path in paths.items()}
 
 
 @dataclass(frozen=True, kw_only=True)

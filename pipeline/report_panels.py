@@ -1,4 +1,7 @@
-"""Which queries the report shows, and their pictures: per-query rows in, panels with thumbnails out."""
+"""Which queries the report shows, and their pictures: per-query rows in, panels with thumbnails out.
+
+Shapes: P parts of an embedding, D its dimensions.
+"""
 
 import base64
 import io
@@ -9,12 +12,17 @@ from typing import Any
 
 from PIL import Image
 
+from pipeline.chosen_rows import evenly
+from pipeline.embedding_parts import cosines_by_part
+from pipeline.features import Floats
 from pipeline.transforms import DecodeError, decode
 
 QUERY_PX = 360
 ANSWER_PX = 180
+QUALITY, EFFORT = 78, 2  # of WebP: two thirds of JPEG's bytes at a like look
 PANELS = 4  # hits and as many misses for each task
 ANSWERS = 5
+MOSAIC, MOSAIC_PX = 9, 96  # images that stand for a merged query, three a row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +36,8 @@ class Answer:
     right: bool
     picture: str | None
     "A data URI; None where the picture is not at hand."
+    parts: tuple[float, ...] = ()
+    "Cosine with the query part by part; empty where the embedding has no parts."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +46,8 @@ class Panel:
 
     key: str
     location: str
-    picture: str | None
+    pictures: tuple[str | None, ...]
+    "One; of a merged query, up to nine of the images that it is the mean of."
     answers: tuple[Answer, ...]
     first_match_rank: int | None
     truth: Answer | None
@@ -69,13 +80,11 @@ def spread(
     for row in ordered:
         first_of_location.setdefault(row["location"], row)
     pool = list(first_of_location.values()) if len(first_of_location) >= count else ordered
-    if len(pool) <= count:
-        return pool
-    return [pool[round(i * (len(pool) - 1) / (count - 1))] for i in range(count)]
+    return [pool[i] for i in evenly(len(pool), count)]
 
 
 def keys_shown(rows: Iterable[Mapping[str, Any]]) -> set[str]:
-    """Keys of all pictures on the panels of these rows."""
+    """Keys of all images on the panels of these rows."""
     keys: set[str] = set()
     for row in rows:
         keys |= {row["query"], *row["top_keys"][:ANSWERS]}
@@ -83,27 +92,52 @@ def keys_shown(rows: Iterable[Mapping[str, Any]]) -> set[str]:
     return keys
 
 
-def make_panel(row: Mapping[str, Any], images: Mapping[str, bytes]) -> Panel:
-    """One query's panel."""
-    best = zip(row["top_keys"], row["top_locations"], row["top_scores"], strict=True)
-    answers = tuple(
-        Answer(rank=rank, key=key, location=location, score=score, right=location == row["location"],
-               picture=thumbnail(images.get(key), ANSWER_PX))
-        for rank, (key, location, score) in enumerate(best, 1) if rank <= ANSWERS
-    )  # fmt: skip
+class Album:
+    """Thumbnails by key, each made once."""
+
+    def __init__(self, images: Mapping[str, bytes]) -> None:
+        self._images = images
+        self._made: dict[tuple[str, int], str | None] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._images)
+
+    def get(self, key: str, pixels: int) -> str | None:
+        """A data URI; None where the picture is not at hand."""
+        if (key, pixels) not in self._made:
+            self._made[key, pixels] = thumbnail(self._images.get(key), pixels)
+        return self._made[key, pixels]
+
+
+def make_panel(
+    row: Mapping[str, Any], album: Album, vectors: Mapping[str, Floats] | None = None, parts: int = 1,
+    merged: Sequence[str] = (),
+) -> Panel:  # fmt: skip
+    """One query's panel. `vectors`: embeddings (D,) by key, of `parts` parts; `merged`: keys of the images that the query is
+    the mean of."""
+
+    def answer(rank: int, key: str, location: str, score: float) -> Answer:
+        asked, given = (vectors or {}).get(row["query"]), (vectors or {}).get(key)
+        return Answer(
+            rank=rank, key=key, location=location, score=score, right=location == row["location"],
+            picture=album.get(key, ANSWER_PX),
+            parts=() if parts < 2 or asked is None or given is None
+            else tuple(cosines_by_part(asked[None], given[None], parts)[0].tolist()),
+        )  # fmt: skip
+
+    best = zip(row["top_keys"][:ANSWERS], row["top_locations"], row["top_scores"], strict=False)
     first, key = row["first_match_rank"], row["first_match_key"]
-    truth = None
-    if first is not None and first > ANSWERS:
-        truth = Answer(rank=first, key=key, location=row["location"], score=row["first_match_score"], right=True,
-                       picture=thumbnail(images.get(key), ANSWER_PX))  # fmt: skip
+    apart = first is not None and first > ANSWERS
+    shown = [(key, MOSAIC_PX) for key in merged] or [(row["query"], QUERY_PX)]
     return Panel(
-        key=row["query"], location=row["location"], picture=thumbnail(images.get(row["query"]), QUERY_PX),
-        answers=answers, first_match_rank=first, truth=truth,
+        key=row["query"], location=row["location"], pictures=tuple(album.get(*each) for each in shown),
+        answers=tuple(answer(rank, *each) for rank, each in enumerate(best, 1)), first_match_rank=first,
+        truth=answer(first, key, row["location"], row["first_match_score"]) if apart else None,
     )  # fmt: skip
 
 
 def thumbnail(data: bytes | None, pixels: int) -> str | None:
-    """A small JPEG as a data URI; None without a picture that can be read."""
+    """A small WebP as a data URI; None without a picture that can be read."""
     if data is None:
         return None
     try:
@@ -112,5 +146,5 @@ def thumbnail(data: bytes | None, pixels: int) -> str | None:
         return None
     image.thumbnail((pixels, pixels), Image.Resampling.LANCZOS)
     stream = io.BytesIO()
-    image.save(stream, "JPEG", quality=82, optimize=True)
-    return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
+    image.save(stream, "WEBP", quality=QUALITY, method=EFFORT)
+    return f"data:image/webp;base64,{base64.b64encode(stream.getvalue()).decode()}"

@@ -15,7 +15,7 @@ import pyarrow as pa
 from pipeline import metrics, positions
 from pipeline.features import FeatureTable, Floats, Words
 from pipeline.intervals import intervals
-from pipeline.metrics import Whole
+from pipeline.metrics import Doubles, Whole
 from pipeline.ranking import Blocks, Ranking, Side
 from pipeline.ranking_workers import rank_spread
 from pipeline.records import InputError, Split, View
@@ -43,6 +43,8 @@ RESULTS_SCHEMA = pa.schema([
     ("first_match_key", pa.string()), ("first_match_score", pa.float32()),
     ("ap", pa.float64()), ("top_keys", pa.list_(pa.string())), ("top_scores", pa.list_(pa.float32())),
     ("top_locations", pa.list_(pa.string())),
+    # Where the query's place and the best answer lie, WGS84, and how far apart; null where unknown, as of merged queries.
+    *((name, pa.float64()) for name in ("lat", "lon", "answer_lat", "answer_lon", "distance_m")),
 ])  # fmt: skip
 
 
@@ -155,16 +157,20 @@ def _metric_row(
     for name, (low, high) in zip(MEASURES, bounds.T.tolist(), strict=True):
         row |= {f"{name}_low": low, f"{name}_high": high}
     unknown = np.full((len(queries.keys), 2), np.nan)
-    asked = unknown if queries.positions is None else queries.positions
-    given = np.full((len(gallery.keys), 2), np.nan) if gallery.positions is None else gallery.positions
-    if np.isnan(given).any():
-        asked = unknown
+    given = _positions(gallery)
+    asked = unknown if np.isnan(given).any() else _positions(queries)
     return row | positions.measures(asked, given[found.top_rows_QK])
+
+
+def _positions(side: Side) -> Doubles:
+    return np.full((len(side.keys), 2), np.nan) if side.positions is None else side.positions
 
 
 def _result_rows(task: Task, protocol: Protocol, queries: Side, gallery: Side, found: Ranking) -> pa.Table:
     unmatched_Q = found.first_rank_Q == 0
     count, kept = found.top_rows_QK.shape
+    asked_Q2, answer_Q2 = _positions(queries), _positions(gallery)[found.top_rows_QK[:, 0]]
+    places_5Q = [*asked_Q2.T, *answer_Q2.T, positions.haversine_m(asked_Q2, answer_Q2)]
     ends = pa.array(np.arange(count + 1) * kept, pa.int32())
 
     def lists(values_QK: Whole | Words | Floats, kind: pa.DataType) -> pa.ListArray:
@@ -178,5 +184,6 @@ def _result_rows(task: Task, protocol: Protocol, queries: Side, gallery: Side, f
         pa.array(found.first_score_Q, mask=unmatched_Q), pa.array(found.ap_Q),
         lists(gallery.keys[found.top_rows_QK], pa.string()), lists(found.top_scores_QK, pa.float32()),
         lists(gallery.locations[found.top_rows_QK], pa.string()),
+        *(pa.array(place_Q, pa.float64(), from_pandas=True) for place_Q in places_5Q),  # NaN becomes null
     ]  # fmt: skip
     return pa.Table.from_arrays(columns, schema=RESULTS_SCHEMA)

@@ -12,9 +12,10 @@ gallery row falls. Only rows in doubt, those nearer to a match than the bound an
 scored exactly; where many are in doubt (a network that gives all images nearly one vector) the queries concerned are
 multiplied in float64 as a whole. The outcome is bit for bit that of float64 throughout. benchmarks/evaluate.py measures it.
 
-Shapes: Q queries, B gallery rows of a block, P pairs of a query and a true match, N entries of a block, D dimensions.
+Shapes: Q queries, B gallery rows of a block, P pairs of a query and a true match, N or C entries of a block, D dimensions.
 """
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -31,6 +32,11 @@ ROW_BITS = 31  # an order key: 32 bits of score, 1 bit "wrong location", 31 bits
 LAST_ROW = 2**ROW_BITS - 1
 WRONG = 1 << ROW_BITS
 NO_KEY = np.iinfo(np.int64).min
+PAIR_ROWS = 128  # pairs scored at once: four megabytes of float64 at 2,048 dimensions stay near the core
+PAIRS_UP_TO = 3  # measured: below so many entries a query, scoring pairs beats going query by query
+FEW = (
+    1 / 12
+)  # of a block's entries: up to so many, fewer where each has many matches to be held against, are taken apart
 WHOLE_FROM = 1 / 32  # measured: from this share of doubts, a float64 product of everything beats row by row
 FEW_BANDS = (
     12  # measured: to so many matches with rows in doubt, looking for these rows beats sorting all of them again
@@ -96,10 +102,59 @@ def exact_entries(queries_QD: Floats, gallery_BD: Floats, flat_N: Whole) -> Floa
         scores = queries_QD[asked].astype(np.float64) @ gallery_BD.astype(np.float64).T
         return np.asarray(scores[np.searchsorted(asked, query_N), row_N], np.float32)
     scores_N = np.empty(len(flat_N), np.float32)
+    if len(flat_N) < PAIRS_UP_TO * len(asked):
+        for first in range(0, len(flat_N), PAIR_ROWS):
+            some = slice(first, first + PAIR_ROWS)
+            scores_N[some] = exact_pairs(queries_QD[query_N[some]], gallery_BD[row_N[some]])
+        return scores_N
     for query, (begin, end) in zip(asked, pairwise([*starts.tolist(), len(flat_N)]), strict=True):
         rows_ND = gallery_BD[row_N[begin:end]].astype(np.float64)
         scores_N[begin:end] = rows_ND @ queries_QD[query].astype(np.float64)
     return scores_N
+
+
+def settle(
+    scores_QB: Floats, owner_P: Whole, score_P: Floats, bounds_P: tuple[Floats, Floats], floor_Q: Floats,
+    exact: Callable[[Whole], Floats],
+) -> tuple[Whole, Floats, Whole]:  # fmt: skip
+    """A block's part in the ranking: flat indices of its entries in doubt (N,), their exact scores (N,), and for each match
+    the entries of its query that score as it does or better (P,).
+
+    `scores_QB`: float32 products, minus infinity at true matches; overwritten. `score_P`, `bounds_P`: of each match its score
+    and what `below` and `above` make of it. `floor_Q`: what a product must reach to count for the best k. `exact`:
+    `exact_entries` of this block.
+
+    Most entries are neither in doubt nor ahead of a match, so those that reach a query's lowest bound are picked first, in one
+    look at the block. Where they are many, it costs less to look at all entries again.
+    """
+    lowest_Q = floor_Q.copy()
+    np.minimum.at(lowest_Q, owner_P, bounds_P[0])
+    reach_QB = scores_QB >= lowest_Q[:, None]
+    if np.count_nonzero(reach_QB) * (1 + _most(owner_P) / 32) <= FEW * reach_QB.size:
+        return _settle_few(scores_QB, np.flatnonzero(reach_QB), owner_P, score_P, bounds_P, floor_Q, exact)
+    flat_N = doubtful(scores_QB, owner_P, *bounds_P, floor_Q)
+    exact_N = exact(flat_N)
+    scores_QB.reshape(-1)[flat_N] = exact_N
+    return flat_N, exact_N, count_ahead(scores_QB, owner_P, score_P)
+
+
+def _settle_few(
+    scores_QB: Floats, flat_C: Whole, owner_P: Whole, score_P: Floats, bounds_P: tuple[Floats, Floats], floor_Q: Floats,
+    exact: Callable[[Whole], Floats],
+) -> tuple[Whole, Floats, Whole]:  # fmt: skip
+    """`settle` from the C entries alone that reach their query's lowest bound."""
+    score_C, query_C = scores_QB.reshape(-1)[flat_C], flat_C // scores_QB.shape[1]
+    doubt_C = score_C >= floor_Q[query_C]
+    for low_Q1, high_Q1 in zip(*(_columns(owner_P, p, len(scores_QB)) for p in bounds_P), strict=True):
+        doubt_C |= (score_C >= low_Q1[query_C, 0]) & (score_C <= high_Q1[query_C, 0])
+    exact_N = exact(flat_C[doubt_C])
+    score_C[doubt_C] = exact_N
+    ahead_P = np.empty(len(owner_P), np.int64)
+    nth_P = _nth(owner_P)
+    for m, at_Q1 in enumerate(_columns(owner_P, score_P, len(scores_QB))):
+        ahead_Q = np.bincount(query_C[score_C >= at_Q1[query_C, 0]], minlength=len(scores_QB))
+        ahead_P[nth_P == m] = ahead_Q[owner_P[nth_P == m]]
+    return flat_C[doubt_C], exact_N, ahead_P
 
 
 def doubtful(scores_QB: Floats, owner_P: Whole, low_P: Floats, high_P: Floats, floor_Q: Floats) -> Whole:

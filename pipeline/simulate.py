@@ -22,6 +22,7 @@ import numpy as np
 import ray
 
 from pipeline import cluster, storage
+from pipeline.exclusive import one_at_a_time
 from pipeline.progress import console, progress
 from pipeline.records import InputError
 from pipeline.worlds.layout import Job, Role, make_location, part, write_tables
@@ -66,6 +67,7 @@ class SimulationSettings:
             raise InputError(f"--texture-metres-per-pixel is {self.texture_metres_per_pixel}; expected more than 0")
 
 
+@one_at_a_time(lambda settings: settings.out)
 def simulate(settings: SimulationSettings) -> Path:
     """Make the data set, or what is missing of it; its folder.
 

@@ -39,6 +39,9 @@ class Motion:
     "Of the gallery: a square of this side for each place."
     elsewhere: float = 0.1
     "Share of the photos that are expected to show no place of the gallery."
+    remembered: int = 60
+    """Photos over which the limit holds: with as many between two places, the UAV may have come from anywhere, and mostly could
+    have. It bounds the time that a long flight takes."""
 
     def __post_init__(self) -> None:
         if not self.max_speed > 0:
@@ -92,7 +95,7 @@ def smooth(photos: Sequence[Photo], motion: Motion, start: Start | None = None) 
     """The likeliest track through photos that are in time order.
 
     A chain's weight is the product of its photos' chances and of what the ways between them gain; one that is faster than the
-    motion allows has none. Takes time for all pairs of candidates: a flight of 1,000 photos some seconds.
+    motion allows has none. Takes time for all pairs of candidates within `remembered` photos.
     """
     if not photos:
         return []
@@ -152,23 +155,30 @@ class _Flight:
     def forward(self, combine: Combine, trace: bool = False) -> tuple[Doubles, Whole]:
         """Weight of the chains up to and with each candidate, and for `trace` the candidate before it (-1: none)."""
         weight_N, came_from_N = np.full(len(self.gain_N), -np.inf), np.full(len(self.gain_N), -1)
-        for begin, end in self.spans:
-            to_MK = weight_N[:begin, None] + self.flown(slice(0, begin), slice(begin, end))
-            to_MK = np.concatenate([to_MK, self.entry_N[None, begin:end]])  # the last row: nothing came before
+        for number, (begin, end) in enumerate(self.spans):
+            first = self.spans[max(0, number - self.motion.remembered)][0]
+            near_MK = weight_N[first:begin, None] + self.flown(slice(first, begin), slice(begin, end))
+            far_1K = np.full((1, end - begin), _whole(combine, weight_N[:first]))
+            to_MK = np.concatenate(
+                [near_MK, far_1K, self.entry_N[None, begin:end]]
+            )  # the last row: nothing came before
             weight_N[begin:end] = self.gain_N[begin:end] + combine(to_MK)
             if trace and end > begin:
-                last_K = to_MK.argmax(axis=0)
-                came_from_N[begin:end] = np.where(last_K == begin, -1, last_K)
+                last_K = first + to_MK.argmax(axis=0)
+                far = int(weight_N[:first].argmax()) if first else -1
+                came_from_N[begin:end] = np.where(last_K < begin, last_K, np.where(last_K == begin, far, -1))
         return weight_N, came_from_N
 
     def backward(self) -> Doubles:
         """Weight of what may follow each candidate, nothing included."""
         weight_N = np.zeros(len(self.gain_N))
-        for begin, end in reversed(self.spans):
-            later = slice(end, len(self.gain_N))
-            follow_N = (self.gain_N + weight_N)[later]
-            from_MK = follow_N[:, None] + self.flown(later, slice(begin, end))
-            weight_N[begin:end] = _logsum(np.concatenate([from_MK, np.zeros((1, end - begin))]))
+        for number in range(len(self.spans) - 1, -1, -1):
+            begin, end = self.spans[number]
+            last = self.spans[min(len(self.spans) - 1, number + self.motion.remembered)][1]
+            follow_N = self.gain_N[end:] + weight_N[end:]
+            near_MK = follow_N[: last - end, None] + self.flown(slice(end, last), slice(begin, end))
+            far_1K = np.full((1, end - begin), _whole(_logsum, follow_N[last - end :]))
+            weight_N[begin:end] = _logsum(np.concatenate([near_MK, far_1K, np.zeros((1, end - begin))]))
         return weight_N
 
     def traced(self, best_N: Doubles, came_from_N: Whole) -> list[int | None]:
@@ -188,6 +198,11 @@ def _reach(some_M3: Doubles, others_K3: Doubles, way_MK: Doubles) -> npt.NDArray
     squared_MK = 2 * (EARTH_M**2 - some_M3 @ others_K3.T)
     chord_MK = 2 * EARTH_M * np.sin(np.minimum(way_MK / (2 * EARTH_M), np.pi / 2))
     return np.asarray(squared_MK <= chord_MK**2 + 1.0)  # a metre's square: the product's rounding
+
+
+def _whole(combine: Combine, weight_M: Doubles) -> float:
+    """All of them as one; -inf of none."""
+    return float(combine(weight_M[:, None])[0]) if len(weight_M) else -math.inf
 
 
 def _logsum(x_MK: Doubles) -> Doubles:

@@ -109,7 +109,7 @@ def test_the_map_puts_metres_where_they_belong() -> None:
     x, y = frame.pixels(np.array([[60 + 100 * METRE, 8 + 200 * METRE]]))[0]
     assert (x, y) == pytest.approx((0.75 * SIDE, 0.25 * SIDE), abs=0.1)
     assert frame.length(200) == SIDE / 2
-    assert frame.bar_m == 100
+    assert [Frame(lat=0, lon=0, half_m=half).bar_m for half in (200, 3700, 9, 101)] == [100, 1000, 2, 50]
 
 
 def test_the_map_crosses_the_meridian_of_180_degrees() -> None:

@@ -5,18 +5,28 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.calibration import Example, Judging, best_radius, best_threshold, calibrate, is_right, out_of_fold
+from pipeline.calibration import (
+    Example,
+    Gallery,
+    Judging,
+    best_radius,
+    best_threshold,
+    calibrate,
+    is_right,
+    out_of_fold,
+)
 from pipeline.calibration_examples import Labelled, examples
 from pipeline.confidence import Confidence
 from pipeline.features import Floats
 from pipeline.index import Hit
-from pipeline.locate import answers, judged
+from pipeline.locate import answers, judged, scores_of
 from pipeline.logistic import sigmoid
 from pipeline.records import InputError, View
 from pipeline.track import TRACKED
 from pipeline.where import Where
 
 METRE = 1 / 111_195.08  # degrees of latitude
+GALLERY = Gallery(fingerprint="f" * 64, rows=40, spacing_m=300.0)
 
 
 def hit(location: str, score: float, north_m: float | None = 0.0) -> Hit:
@@ -41,7 +51,7 @@ def made(count: int, rng: np.random.Generator) -> list[Example]:
 
 @pytest.fixture(scope="module")
 def fitted() -> Confidence:
-    return calibrate(made(900, np.random.default_rng(0)), Judging(), 300.0, "f" * 64, 40)
+    return calibrate(made(900, np.random.default_rng(0)), Judging(), GALLERY)
 
 
 def test_probabilities_of_photos_never_seen_mean_what_they_say(fitted: Confidence) -> None:
@@ -67,9 +77,9 @@ def test_photos_from_elsewhere_are_unknown_at_the_threshold_and_what_it_costs_is
 
 def test_fewer_photos_from_elsewhere_make_the_same_score_surer(fitted: Confidence) -> None:
     data = made(900, np.random.default_rng(0))
-    rare = calibrate(data, Judging(outside=0.1), 300.0, "f" * 64, 40)
-    agreed, scores = [judged(data[0].inside, 0)], [np.array([one.score for one in data[0].inside[:10]])]
-    assert rare.probabilities(agreed, scores)[0] > fitted.probabilities(agreed, scores)[0]
+    rare = calibrate(data, Judging(outside=0.1), GALLERY)
+    agreed, scores_K = judged(data[0].inside, 0), scores_of(data[0].inside)
+    assert rare.probability(agreed, scores_K) > fitted.probability(agreed, scores_K)
 
 
 def test_the_threshold_keeps_most_right_and_fewest_wrong() -> None:
@@ -87,8 +97,8 @@ def test_an_answer_is_right_by_its_location_or_by_its_distance() -> None:
     assert is_right(judged(named.inside, 0), named, 25)
 
 
-def test_neighbours_agree_only_where_that_places_photos_better() -> None:
-    """Tiles every 40 m that overlap: the photo lies between four, each of which is off by 28 m."""
+def test_neighbours_agree_only_where_that_surely_places_photos_better() -> None:
+    """Tiles every 40 m that overlap: each photo lies between four, each of which is off by 28 m. One photo proves nothing."""
     d = 20 * METRE
     four = [(d, d), (d, -d), (-d, d), (-d, -d)]
     tiles = [
@@ -96,12 +106,15 @@ def test_neighbours_agree_only_where_that_places_photos_better() -> None:
         for n, (lat, lon) in enumerate(four)
     ]
     alone = Hit(key="k", location="far", view=View.SATELLITE, lat=1.0, lon=1.0, score=0.1)
-    overlapping = Example(location="photo", lat=0.0, lon=0.0, inside=(*tiles, alone), outside=())
+    overlapping = [
+        Example(location=f"photo{n}", lat=0.0, lon=0.0, inside=(*tiles, alone), outside=()) for n in range(5)
+    ]
     apart = Example(
         location="a", lat=0.0, lon=8.0, inside=(hit("a", 0.9), hit("b", 0.8, 60), hit("c", 0.7, 50)), outside=()
     )
-    assert best_radius([overlapping], 25, 40.0) == 1.5 * 40
-    assert best_radius([apart], 25, 40.0) == 0.5 * 40
+    assert best_radius(overlapping, 25, 40.0) == 1.5 * 40
+    assert best_radius(overlapping[:1], 25, 40.0) == 0.5 * 40
+    assert best_radius([apart] * 9, 25, 40.0) == 0.5 * 40
     assert best_radius([apart], 25, None) == 0
 
 
@@ -120,7 +133,7 @@ def test_no_photo_is_judged_by_a_model_that_has_seen_its_location() -> None:
 def test_too_few_places_and_answers_that_are_all_right_are_refused() -> None:
     few = [one for one in made(60, np.random.default_rng(0)) if one.location in {"p1", "p2"}]
     with pytest.raises(InputError, match=r"4 photos of 2 locations.*--hold-out"):
-        calibrate(few, Judging(), 300.0, "f", 40)
+        calibrate(few, Judging(), GALLERY)
     sure = [
         Example(
             location=f"p{n}",
@@ -132,7 +145,7 @@ def test_too_few_places_and_answers_that_are_all_right_are_refused() -> None:
         for n in range(20)
     ]
     with pytest.raises(InputError, match="20 of 20 photos are answered rightly"):
-        calibrate(sure, Judging(), 300.0, "f", 40)
+        calibrate(sure, Judging(), GALLERY)
 
 
 @pytest.mark.parametrize(

@@ -15,23 +15,30 @@ def at(*places: tuple[float | None, float | None]) -> Doubles:
 
 
 def test_a_candidate_weighs_its_score_above_the_last_one_s() -> None:
-    assert weights(np.array([0.9, 0.7, 0.5])) == pytest.approx([1, 0.5, 0])
+    assert weights(np.array([0.9, 0.7, 0.5])) == pytest.approx([1, 0.25, 0])
     assert weights(np.array([0.4, 0.4])).tolist() == [1, 1]
 
 
 def test_three_that_stand_together_outweigh_a_better_one_alone() -> None:
-    """Weights 1, 0.6, 0.6, 0.4, 0: the three have 1.6 within 100 m of the middle one, the best has 1."""
+    """Weights 1, 0.64, 0.64, 0.36, 0: the three have 1.64 within 100 m of the middle one, the best has 1."""
     places = at((10, 20), (50, 60), (50.0005, 60), (49.9995, 60), (-30, 0))
-    found = consensus(np.array([0.9, 0.7, 0.7, 0.6, 0.4]), list("abcde"), places, 100)
+    found = consensus(np.array([0.9, 0.8, 0.8, 0.7, 0.4]), list("abcde"), places, 100)
     assert found.members_K.tolist() == [False, True, True, True, False]
     assert (found.leader, found.elsewhere) == (1, 0.9)
     assert haversine_m(at((found.lat, found.lon)), at((50, 60)))[0] < 60
 
 
+def test_many_that_stand_together_by_chance_do_not_outweigh_one_that_stands_out() -> None:
+    """Weights 1 and four times 0.04: by their share unsquared the four would have 0.8."""
+    places = at((10, 20), *[(50, 60)] * 4, (-30, 0))
+    found = consensus(np.array([0.9, 0.5, 0.5, 0.5, 0.5, 0.4]), list("abcdef"), places, 100)
+    assert (found.leader, found.lat, found.elsewhere) == (0, 10, 0.5)
+
+
 def test_images_of_one_location_agree_wherever_they_are() -> None:
-    """Without positions names decide: weights 1, 0.75, 0.5, 0, and b has 1.25."""
+    """Without positions names decide: weights 1, 0.77, 0.56, 0, and b has 1.33."""
     nowhere = at(*[(None, None)] * 4)
-    found = consensus(np.array([0.9, 0.8, 0.7, 0.5]), list("abbc"), nowhere, 100)
+    found = consensus(np.array([0.9, 0.85, 0.8, 0.5]), list("abbc"), nowhere, 100)
     assert (found.leader, found.lat, found.lon, found.spread_m) == (1, None, None, 0)
     assert found.elsewhere == 0.9
 

@@ -49,6 +49,9 @@ def test_a_table_is_evaluated_on_every_task_that_it_allows(tmp_path: Path) -> No
     assert storage.read_json(str(out / "metrics.json")) == rows == pq.read_table(out / "metrics.parquet").to_pylist()
     assert len(pq.read_table(out / "queries.parquet")) == 25
     assert "drone → satellite" in (out / "report.html").read_text()
+    [gap] = storage.read_json(str(out / "view_gap.json"))  # one for both directions
+    assert (gap["task"], len(gap["points"]), gap["true"]["pairs"]) == ("drone->satellite", 20, 20)
+    assert not (out / "parts.json").exists()  # these embeddings have none
 
 
 def test_pictures_come_from_the_shards_by_key(tmp_path: Path) -> None:

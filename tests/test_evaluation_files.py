@@ -54,6 +54,7 @@ def test_asking_for_more_writes_it_without_ranking_again(tmp_path: Path) -> None
         ({"by": ("altitude_m",)}, r"found --by altitude_m without --shards"),
         ({"answer_order": "x"}, r"expected one task .*--exports answer and --shards"),
         ({"workers": -1}, r"--workers is -1"),
+        ({"panels": -1}, r"--panels is -1"),
     ],
 )
 def test_what_cannot_go_together_is_refused(asked: dict[str, Any], sentence: str) -> None:
@@ -108,7 +109,8 @@ def test_positions_of_the_table_become_distances(tmp_path: Path, capsys: pytest.
                      lats=[30.0 + off, 31.0 + off], lons=[120.0, 120.0], embeddings_BD=np.eye(2, dtype=np.float32)),
             PartFooter(fingerprint="f", shard_sha256=split, rows=2),
         )  # fmt: skip
-    job.main(EvaluationSettings(table=str(tmp_path / "t"), out=str(tmp_path / "o")), published=True)
+    asked_for = EvaluationSettings(table=str(tmp_path / "t"), out=str(tmp_path / "o"), figures=("pdf",))
+    job.main(asked_for, published=True)
     [row, merged] = storage.read_json(str(tmp_path / "o" / "metrics.json"))
     assert (row["geo_queries"], row["within_25m"], row["within_100m"]) == (2, 0.0, 1.0)
     assert row["distance_median_m"] == pytest.approx(55.6, abs=0.05)
@@ -116,6 +118,12 @@ def test_positions_of_the_table_become_distances(tmp_path: Path, capsys: pytest.
     assert row["sdm3"] is None
     assert merged["geo_queries"] == 0
     assert pq.read_table(tmp_path / "o" / "metrics.parquet").to_pylist() == [row, merged]
+    asked = pq.read_table(tmp_path / "o" / "queries.parquet").to_pylist()
+    assert [each["distance_m"] for each in asked[:2]] == pytest.approx([55.6, 55.6], abs=0.05)
+    assert [asked[1][name] for name in ("lat", "lon", "answer_lat", "answer_lon")] == [31.0, 120.0, 31.0005, 120.0]
+    assert asked[2]["distance_m"] is None
+    assert (tmp_path / "o" / "figures" / "map-drone-satellite.pdf").exists()
+    assert 'id="map"' in (tmp_path / "o" / "report.html").read_text()
     said = capsys.readouterr().out
     assert "55.6 m" in said
     assert "published" in said

@@ -13,7 +13,8 @@ from pipeline.records import InputError
 galleries = st.builds(
     Gallery,
     rows=st.integers(1, 10**9), dimension=st.sampled_from([16, 100, 512, 768, 2048]), budget=st.floats(1e8, 1e12),
-    target_recall=st.floats(0.5, 1), effective_dimension=st.sampled_from([None, 16, 96, 256]), rows_readable=st.booleans(),
+    target_recall=st.floats(0.5, 1), workers=st.integers(0, 16),
+    effective_dimension=st.sampled_from([None, 16, 96, 256]), rows_readable=st.booleans(),
 )  # fmt: skip
 
 

@@ -47,6 +47,9 @@ WRONG: list[tuple[str, list[str], str]] = [
     ("import_weights", ["--lpn", __file__, "--out", "{}/o"], "is no state dict"),
     ("import_weights", ["--out", "{}/o"], "neither of --torchvision and --lpn"),
     ("build_index", ["--table", "{}", "--out", "{}/o"], "no feature table at"),
+    ("build_index", ["--extend", "--table", "{}", "--out", "{}/o"], "no index at"),
+    ("build_index", ["--remove", "0839", "--out", "{}/o"], "no index at"),
+    ("build_index", ["--verify", "--out", "{}/o"], "no index at"),
     ("evaluate", ["--table", "{}", "--out", "{}/o"], "no feature table at"),
     ("locate", ["--checkpoint", "{}/c.pt", "--index", "{}", "--out", "{}/o", "{}/gone.jpg"], "no photo or folder at"),
     ("calibrate", ["--checkpoint", "{}/c.pt", "--shards", "{}", "--index", "{}"], "no index at"),
@@ -96,7 +99,7 @@ def test_the_road_by_command_lines_and_again(
         ("drone->satellite", False), ("satellite->drone", False), ("drone->satellite", True),
     ]  # fmt: skip
     assert (metrics[0]["queries"], metrics[0]["gallery"]) == (9, 5)
-    assert "data:image/jpeg" in (out / "report.html").read_text()
+    assert "data:image/webp" in (out / "report.html").read_text()
     photos = tiny_world / "test" / "query_drone"
     done = call("locate", "--checkpoint", run / "last.pt", "--index", index, "--out", tmp_path / "o.geojson", photos)
     assert done.returncode == 0, done.stderr

@@ -31,7 +31,7 @@ def confidence(**changes: Any) -> Confidence:
     """Sure by the margin alone: 0.5 where it is 0.1."""
     model = Logistic(mean_F=(0, 0.1, 0, 0), scale_F=(1, 0.05, 1, 1), coefficient_F=(0, 2.0, 0, 0), intercept=0.0)
     plain = Confidence(
-        fingerprint="f" * 64, gallery=3, spacing_m=300.0, within_m=150.0, tolerance_m=25.0, outside=0.5, model=model,
+        fingerprint="f" * 64, gallery=3, asked="", spacing_m=300.0, within_m=150.0, tolerance_m=25.0, outside=0.5, model=model,
         threshold=0.4, sharpness=20.0, elsewhere=1.0, photos=100, locations=20, right=0.7, right_kept=0.8,
         outside_unknown=0.9, calibration_error=0.02, bins=(Bin(said=0.1, seen=0.2, share=1.0),),
     )  # fmt: skip

@@ -14,6 +14,7 @@ from jobs.locate import Settings, locate_photos, main
 from jobs.photo_encoder import PhotoEncoder
 from model.checkpoint import Checkpoint, dumps, fingerprint, loads
 from model.pvda import FeatureEncoder, PVDAConfig
+from pipeline import storage
 from pipeline.confidence import Confidence, write_confidence
 from pipeline.features import PartFooter, PartRows, write_part
 from pipeline.index_build import IndexSettings, build_index
@@ -66,8 +67,8 @@ def settings(world: dict[str, str], **changes: Any) -> Settings:
 def calibrated(world: dict[str, str]) -> None:
     sure = Logistic(mean_F=(0,) * 4, scale_F=(1,) * 4, coefficient_F=(0,) * 4, intercept=2.0)
     confidence = Confidence(
-        fingerprint=world["mark"], gallery=PLACES, spacing_m=111.0, within_m=50.0, tolerance_m=25.0, outside=0.5, model=sure,
-        threshold=0.4, sharpness=5000.0, elsewhere=0.0, photos=100, locations=20, right=0.7, right_kept=0.8,
+        fingerprint=world["mark"], gallery=PLACES, asked="", spacing_m=111.0, within_m=50.0, tolerance_m=25.0, outside=0.5,
+        model=sure, threshold=0.4, sharpness=5000.0, elsewhere=0.0, photos=100, locations=20, right=0.7, right_kept=0.8,
         outside_unknown=0.9, calibration_error=0.02, bins=(),
     )  # fmt: skip
     write_confidence(f"{world['index']}/calibration.json", confidence)
@@ -109,6 +110,21 @@ def test_a_damaged_photo_is_told_the_others_are_answered_and_the_exit_code_is_1(
     said = json.loads(Path(world["out"]).read_text())["features"]
     assert [len(feature["properties"]["rejected"]) for feature in said] == [0, 1, 0, 0, 0]
     assert [feature["geometry"] is None for feature in said] == [False, True, False, False, False]
+
+
+def test_a_photo_that_cannot_be_read_is_told_like_a_damaged_one(world: dict[str, str], monkeypatch: Any) -> None:
+    plain = storage.read_bytes
+
+    def failing(path: str) -> bytes:
+        if path.endswith("1.jpg"):
+            raise PermissionError("not yours")
+        return plain(path)
+
+    monkeypatch.setattr(storage, "read_bytes", failing)
+    located = locate_photos(settings(world))
+    assert [[(one.reason, one.found) for one in photo.rejected] for photo in located] == [
+        [], [("unreadable file", "not yours")], [], [],
+    ]  # fmt: skip
 
 
 def test_a_flight_is_placed_as_one_in_the_order_of_its_times(world: dict[str, str]) -> None:

@@ -16,8 +16,8 @@ from pipeline import report
 from pipeline.records import InputError
 from pipeline.report_charts import nice_ticks, recall_chart, training_charts
 from pipeline.report_evidence import scores_chart, views_chart
-from pipeline.report_inputs import Extras, Findings, read_training
-from pipeline.report_panels import distance, keys_shown, make_panel, spread, sureness, thumbnail
+from pipeline.report_inputs import Extras, Findings, no_pictures, read_training
+from pipeline.report_panels import Album, distance, keys_shown, make_panel, spread, sureness, thumbnail
 from pipeline.retrieval import RESULTS_SCHEMA
 
 
@@ -78,10 +78,10 @@ def test_panels_frame_right_and_wrong_and_say_so_in_words() -> None:
 
 
 def test_the_best_true_match_is_shown_where_it_is_not_among_the_five() -> None:
-    panel = make_panel(TOWN[2], {})
+    panel = make_panel(TOWN[2], Album({}))
     assert panel.truth
     assert (panel.truth.rank, panel.truth.key, panel.truth.right) == (40, "gallery-0003", True)
-    assert make_panel(TOWN[1], {}).truth is None
+    assert make_panel(TOWN[1], Album({})).truth is None
 
 
 def test_hostile_names_stay_names() -> None:
@@ -102,7 +102,7 @@ def test_the_page_needs_nothing_but_itself() -> None:
 
 
 def test_without_pictures_the_page_says_how_to_get_them() -> None:
-    text = report.render(findings(TOWN), Extras(title="Town"), report.no_pictures)
+    text = report.render(findings(TOWN), Extras(title="Town"), no_pictures)
     assert "evaluate again with <code>--shards</code>" in text
     assert "<img" not in text
 
@@ -137,7 +137,7 @@ def test_panels_are_spread_over_the_range_and_over_locations() -> None:
 def test_thumbnails_are_small_and_damaged_pictures_are_left_out() -> None:
     source = thumbnail(jpeg("teal", (900, 450)), 180)
     assert source
-    assert source.startswith("data:image/jpeg;base64,")
+    assert source.startswith("data:image/webp;base64,")
     assert len(source) < 4000
     assert thumbnail(b"damaged", 180) is None
     assert thumbnail(None, 180) is None

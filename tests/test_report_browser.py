@@ -6,9 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pytest
 from PIL import Image
+from test_report_sections import GAP, GROUPS, PARTS
 
 from pipeline import report
 from pipeline.report_inputs import Extras, Findings
@@ -27,12 +29,13 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this ma
 LONG = "a-location-with-a-name-that-does-not-end-" * 4
 
 
-def result(location: str, first: int | None) -> dict[str, Any]:
-    """A query whose true match stands at this rank."""
+def result(location: str, first: int | None, multi: bool = False) -> dict[str, Any]:
+    """A query whose true match stands at this rank; of all of a place's images, with `multi`."""
     tops = [location if rank == first else f"other{rank}" for rank in range(1, 6)]
     return {
-        "query": f"query-{location}", "location": location, "task": "drone->satellite", "protocol": "full",
-        "multi_query": False,
+        "query": location if multi else f"query-{location}", "location": location, "task": "drone->satellite",
+        "protocol": "full", "multi_query": multi, "lat": 30.0, "lon": 120.0, "answer_lat": 30.1, "answer_lon": 120.1,
+        "distance_m": 14_700.0,
         "matches": int(first is not None), "first_match_rank": first, "first_match_key": first and "gallery-true",
         "first_match_score": first and 0.1, "ap": 0.0, "top_keys": tops, "top_scores": [0.9, 0.8, 0.7, 0.6, 0.5],
         "top_locations": tops,
@@ -54,7 +57,13 @@ def findings(rows: list[dict[str, Any]], name: str) -> Findings:
         {"task": "drone->satellite", "views": n, "queries": 54 // n, "r1": 0.5, "r1_low": 0.25, "r1_high": 0.75}
         for n in (1, 2, 3, 6, 9, 18, 27, 54)
     )
-    return Findings(name=name, metrics=[metrics], views=views, results=pa.Table.from_pylist(rows, RESULTS_SCHEMA))
+    groups = tuple(GROUPS[0] | {"value": value} for value in (LONG, "50 to 100"))
+    merged = [result(row["location"], 1, multi=True) for row in rows]
+    of_merged = metrics | {"multi_query": True, "queries": len(merged), "geo_queries": 0}
+    return Findings(
+        name=name, metrics=[metrics, of_merged], views=views, groups=groups, parts=PARTS, gaps=(GAP,),
+        results=pa.Table.from_pylist([*rows, *merged], RESULTS_SCHEMA),
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -71,10 +80,15 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> str:
     stream = io.BytesIO()
     Image.new("RGB", (300, 300), "olive").save(stream, "JPEG")
     rows = [result("0001", 1), result(LONG, 1), result("0002", 3), result(LONG, 12_345), result("0004", None)]
+    rows += [result(f"1{number:03d}", 1) for number in range(9)]
     training = tuple({"epoch": e, "location_loss": 9 / e, "view_loss": 0.7, "alpha": 0.9 + e // 5} for e in range(1, 9))
     extras = Extras(title="A town", beside=findings(rows, LONG), training=training)
     path: Path = tmp_path_factory.mktemp("page") / "report.html"
-    path.write_text(report.render(findings(rows, "out"), extras, lambda keys: dict.fromkeys(keys, stream.getvalue())))
+    vector = np.full(4, 0.5, np.float32)
+    path.write_text(report.render(
+        findings(rows, "out"), extras, lambda keys: dict.fromkeys(keys, stream.getvalue()),
+        lambda keys: dict.fromkeys(keys, vector), panels=12,
+    ))  # fmt: skip
     return path.as_uri()
 
 
@@ -87,6 +101,7 @@ def test_the_page_opens_in_silence_and_fits(browser: Any, address: str, width: i
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("request", lambda request: asked.append(request.url))
     page.goto(address)
+    page.evaluate("document.querySelectorAll('details').forEach(each => each.open = true)")
     page.evaluate("document.querySelectorAll('img').forEach(image => image.loading = 'eager')")
     page.wait_for_function("[...document.images].every(image => image.complete && image.naturalWidth > 0)")
     assert said == []
@@ -110,17 +125,42 @@ def test_true_matches_are_framed_green_and_wrong_ones_red(browser: Any, address:
         for kind in ("right", "wrong")
     }
     assert colours == {"right": {"rgb(22, 128, 60)"}, "wrong": {"rgb(200, 50, 43)"}}
-    assert set(page.locator(".answer.right .badge").all_inner_texts()) == {"✓"}
-    assert set(page.locator(".answer.wrong .badge").all_inner_texts()) == {"✗"}
+    assert set(page.locator(".answer.right .badge").all_text_contents()) == {"✓"}
+    assert set(page.locator(".answer.wrong .badge").all_text_contents()) == {"✗"}
     assert page.locator("img:not([alt])").count() == 0
     page.close()
 
 
-def test_the_sections_are_reached_by_keyboard(browser: Any, address: str) -> None:
-    page = browser.new_page()
+def test_sections_and_panels_are_reached_by_keyboard(browser: Any, address: str) -> None:
+    page = browser.new_page(reduced_motion="reduce")  # a page that scrolls smoothly arrives later
     page.goto(address)
+    focused = "document.activeElement.getAttribute('href') || document.activeElement.tagName"
     page.keyboard.press("Tab")
-    assert page.evaluate("document.activeElement.getAttribute('href')") == "#measures"
+    assert page.evaluate(focused) == "#main"  # past the list of sections
+    page.keyboard.press("Tab")
+    assert page.evaluate(focused) == "#measures"
     page.keyboard.press("Enter")
     assert page.url.endswith("#measures")
+    for number in range(1, 7):  # of the hits six are open, the others unfold
+        page.locator(f"a[href='#drone-satellite-hit-{number}']").focus()
+        page.keyboard.press("Tab")
+    assert page.evaluate(focused) == "SUMMARY"
+    page.keyboard.press("Enter")
+    page.keyboard.press("Tab")
+    assert page.evaluate(focused) == "#drone-satellite-hit-7"
+    at = page.evaluate("document.activeElement.getBoundingClientRect().toJSON()")
+    assert 0 <= at["top"] < at["bottom"] <= page.evaluate("innerHeight")
+    page.close()
+
+
+def test_in_print_what_is_open_is_all_there(browser: Any, address: str) -> None:
+    page = browser.new_page()
+    page.goto(address)
+    page.emulate_media(media="print")
+    assert not page.locator("nav").is_visible()
+    assert not page.locator("summary").first.is_visible()
+    assert (
+        page.locator("#drone-satellite-hit-6").evaluate("each => getComputedStyle(each).contentVisibility") == "visible"
+    )
+    assert page.pdf(format="A4").startswith(b"%PDF")
     page.close()

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline import metrics
+from pipeline import metrics, scoring
 from pipeline.features import FeatureTable, Floats, PartFooter, PartRows, open_table, write_part
 from pipeline.ranking import Blocks, Ranking, Side, rank, side_of_array
 from pipeline.ranking_workers import rank_spread
@@ -56,12 +56,17 @@ def brute(queries: Side, gallery: Side, top: int) -> list[tuple[list[int], list[
     return found
 
 
-@given(sides(), cuts, st.integers(1, 12))
+FEW = (-1, math.inf)  # never and always the way that picks the few entries that matter
+
+
+@given(sides(), cuts, st.integers(1, 12), st.sampled_from(FEW))
 @settings(max_examples=150, deadline=None)
 def test_ranking_equals_the_brute_force_twin_however_the_work_is_cut(
-    pair: tuple[Side, Side], cut: Blocks, top: int
+    pair: tuple[Side, Side], cut: Blocks, top: int, few: float
 ) -> None:
-    found = rank(*pair, top, cut)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scoring, "FEW", few)
+        found = rank(*pair, top, cut)
     for q, (ranks, rows, scores) in enumerate(brute(*pair, top)):
         assert found.matches_Q[q] == len(ranks)
         assert found.first_rank_Q[q] == (ranks[0] if ranks else 0)
@@ -105,8 +110,12 @@ def test_every_bit_is_the_same_for_any_number_of_workers(ray_cluster: None) -> N
 
 @pytest.mark.parametrize("spread", [0.0, 1e-7, 1e-5, 1e-3, 0.1])
 @pytest.mark.parametrize("each", [1, 3, 30])
-def test_near_ties_are_settled_exactly_however_near(spread: float, each: int) -> None:
+@pytest.mark.parametrize("few", FEW)
+def test_near_ties_are_settled_exactly_however_near(
+    spread: float, each: int, few: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Vectors that differ by less than float32 products can tell: every score is in doubt."""
+    monkeypatch.setattr(scoring, "FEW", few)
     rng = np.random.default_rng(4)
     centre = rng.standard_normal(300)
     queries = side((centre + spread * rng.standard_normal((9, 300))).astype(np.float32), [f"{i % 4}" for i in range(9)])

@@ -92,16 +92,17 @@ def chains(flight: list[Photo], motion: Motion, start: Start | None) -> dict[tup
     weights = {}
     for chain in product(*([None, *range(len(one.log_chance_K))] for one in flight)):
         weight, last = 1.0, None if start is None else (flight[0].time_s, start.lat, start.lon, start.radius_m)
-        for one, at in zip(flight, chain, strict=True):
+        seen = None
+        for number, (one, at) in enumerate(zip(flight, chain, strict=True)):
             weight *= float(np.exp(one.log_elsewhere if at is None else one.log_chance_K[at]))
             if at is None:
                 continue
             here: Doubles = one.places_K2[at]
-            if last is not None:
+            if last is not None and (seen is None or number - seen <= motion.remembered):
                 away = float(haversine_m(np.array(last[1:3]), here))
                 way = motion.max_speed * (one.time_s - last[0]) + motion.slack_m + last[3]
                 weight *= float(np.exp(motion.gain(np.array(way)))) if away <= way else 0.0
-            last = (one.time_s, float(here[0]), float(here[1]), 0.0)
+            last, seen = (one.time_s, float(here[0]), float(here[1]), 0.0), number
         weights[chain] = weight
     return weights
 
@@ -114,7 +115,7 @@ def test_track_and_probabilities_are_those_of_all_chains(seed: int) -> None:
         count = int(rng.integers(0, 4))
         share = rng.dirichlet(np.ones(count + 1))
         flight.append(photo(float(time), rng.uniform(0, 600, count).tolist(), share[:count].tolist()))
-    motion = Motion(max_speed=12, slack_m=20, places=40 if seed % 3 else 1, spacing_m=50)
+    motion = Motion(max_speed=12, slack_m=20, places=40 if seed % 3 else 1, spacing_m=50, remembered=1 + seed % 4)
     start = Start(lat=300 * METRE, lon=8.0, radius_m=200) if seed % 2 else None
     weights = chains(flight, motion, start)
     total = sum(weights.values())
