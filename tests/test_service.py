@@ -9,7 +9,8 @@ from typing import Any
 
 import aiohttp
 import pytest
-from aiohttp.test_utils import TestClient, TestServer
+from aiohttp import web
+from aiohttp.test_utils import BaseTestServer, TestClient
 from PIL import Image
 from test_service_question import bomb, photo
 
@@ -77,6 +78,17 @@ class Engine:
         return Status(fingerprint="f" * 64, rows=3, factory="Flat", calibrated=True, refused=None)
 
 
+class Server(BaseTestServer):
+    """The service on a socket, listening as the job lets it listen."""
+
+    def __init__(self, service: Service) -> None:
+        super().__init__()
+        self.service = service
+
+    async def _make_runner(self, **_: Any) -> web.AppRunner:
+        return self.service.runner()
+
+
 def served(
     test: Callable[[Client, Engine], Coroutine[Any, Any, None]], token: str | None = None, **settings: Any
 ) -> None:
@@ -85,7 +97,8 @@ def served(
     async def main() -> None:
         engine = Engine()
         service = Service(ServiceSettings(**settings), engine, token)
-        async with TestClient(TestServer(service.app)) as client:
+        client: Client = TestClient(Server(service))
+        async with client:
             await test(client, engine)
 
     asyncio.run(asyncio.wait_for(main(), 30))
@@ -214,12 +227,12 @@ MALFORMED = {
 
 @pytest.mark.parametrize("data", MALFORMED.values(), ids=MALFORMED)
 def test_what_is_no_http_is_refused_without_a_word_on_the_terminal(
-    data: bytes, capsys: pytest.CaptureFixture[str]
+    data: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def test(client: Client, engine: Engine) -> None:
         assert b" 400 " in await raw(client, data)
         assert (await post(client, photo())).status == 200
-        assert capsys.readouterr().err == ""
+        assert caplog.records == []
 
     served(test)
 
@@ -386,7 +399,7 @@ def test_the_description_names_every_path_and_nothing_else_and_the_page_says_the
     async def test(client: Client, engine: Engine) -> None:
         document = await (await client.get("/openapi.json")).json()
         assert document["openapi"].startswith("3.1")
-        routes = {(route.method.lower(), route.resource.canonical) for route in client.server.app.router.routes()}  # type: ignore[attr-defined]
+        routes = {(one.method.lower(), one.resource.canonical) for one in client.server.service.app.router.routes()}  # type: ignore[attr-defined]
         pages = {"/", "/page.js", "/style.css", "/api", "/openapi.json"}
         described = {(verb, path) for path, calls in document["paths"].items() for verb in calls}
         assert described == {(verb, path) for verb, path in routes if path not in pages and verb != "head"}

@@ -10,8 +10,6 @@ import logging
 import time
 import traceback
 from collections.abc import Awaitable, Callable
-from pathlib import Path
-from typing import Any
 
 from aiohttp import web
 
@@ -21,22 +19,12 @@ from pipeline.service.answerer import Outcome
 from pipeline.service.batcher import Alone, Batcher, Gone
 from pipeline.service.engine import Engine, NotReady
 from pipeline.service.metrics import CONTENT_TYPE, Metrics
-from pipeline.service.openapi import describe, reference
+from pipeline.service.pages import HEADERS, PATHS, pages
 from pipeline.service.question import Question, Refusal, question_of, refusal_of
 from pipeline.service.settings import LOOPBACK, ServiceSettings
 from pipeline.service.uploads import read_upload, refuse_by_head
 
-WEB = Path(__file__).parent / "web"
-HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Cache-Control": "no-store",
-    "Server": "pvda",  # and no versions
-}
-OPEN = {"/", "/page.js", "/style.css", "/api", "/openapi.json", "/health"}
+OPEN = {*PATHS, "/health"}
 "Paths that need no token: the pages, which say nothing of the index, and what a load balancer asks."
 KEPT_S = 30
 "Seconds that a connection may be idle between two requests."
@@ -62,9 +50,7 @@ class Service:
         self._taken = 0
         self.app = web.Application(middlewares=[self._outermost])
         self.app.add_routes([
-            web.get("/", _file("index.html")), web.get("/page.js", _file("page.js")), web.get("/style.css", _file("style.css")),
-            web.get("/api", _text(reference(settings), "text/html")), web.get("/openapi.json", _json(describe(settings))),
-            web.get("/health", self._health), web.get("/metrics", self._metrics),
+            *pages(settings), web.get("/health", self._health), web.get("/metrics", self._metrics)
         ])  # fmt: skip
         self.app.router.add_post("/locate", self._locate, expect_handler=self._expect)
 
@@ -198,22 +184,3 @@ def _refused(refusal: Refusal) -> web.Response:
     if refusal.retry_after_s is not None:
         response.headers["Retry-After"] = str(refusal.retry_after_s)
     return response
-
-
-def _file(name: str) -> Handler:
-    kind = {"html": "text/html", "js": "text/javascript", "css": "text/css"}[name.rsplit(".", 1)[-1]]
-    return _text((WEB / name).read_text(), kind)
-
-
-def _text(text: str, kind: str) -> Handler:
-    async def answer(request: web.Request) -> web.Response:
-        return web.Response(text=text, content_type=kind)
-
-    return answer
-
-
-def _json(value: Any) -> Handler:
-    async def answer(request: web.Request) -> web.Response:
-        return web.json_response(value)
-
-    return answer

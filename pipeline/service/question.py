@@ -12,7 +12,8 @@ from pipeline.records import InputError
 from pipeline.transforms import DecodeError
 from pipeline.where import Near
 
-SIGNATURES = ((b"\xff\xd8\xff", b""), (b"\x89PNG\r\n\x1a\n", b""), (b"RIFF", b"WEBP"))
+JPEG = b"\xff\xd8\xff"
+SIGNATURES = ((JPEG, b""), (b"\x89PNG\r\n\x1a\n", b""), (b"RIFF", b"WEBP"))
 """How a file begins, and what stands in bytes 8 to 12. Formats whose size is known without decoding; Pillow knows some 40 more,
 and the decoder of each would be a stranger's to try."""
 SCAN, MOST_SCANS = b"\xff\xda", 100
@@ -89,11 +90,11 @@ def _top(fields: Mapping[str, str]) -> int:
 def _judge(photo: bytes, most_pixels: int) -> None:
     if not photo:
         raise Refusal(400, "the photo is empty, expected the bytes of a JPEG, PNG or WebP file")
-    if not any(photo.startswith(begin) and photo[8:].startswith(then) for begin, then in SIGNATURES):
+    if not any(photo.startswith(begin) and photo.startswith(then, 8) for begin, then in SIGNATURES):
         raise Refusal(
             415, f"the photo begins with {photo[:8]!r}, expected a JPEG, PNG or WebP file; save it as one of these"
         )
-    if (scans := photo.count(SCAN)) > MOST_SCANS and photo.startswith(SIGNATURES[0][0]):
+    if photo.startswith(JPEG) and (scans := photo.count(SCAN)) > MOST_SCANS:
         raise Refusal(422, f"the photo has {scans} scans, expected at most {MOST_SCANS}; save it as a plain JPEG")
     try:
         inspect(photo, most_pixels)
