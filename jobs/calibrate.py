@@ -63,12 +63,11 @@ def calibrate_index(settings: Settings) -> Confidence:
     out = settings.out or storage.join(settings.index, FILE)
     index = Index(settings.index)
     asked = f"{settings.split} {settings.view} -> {settings.gallery_view}, at most {settings.photos} photos"
-    if storage.exists(out):
-        confidence = read_confidence(out, index.facts)
-        there = (confidence.asked, confidence.gallery, confidence.tolerance_m, confidence.outside)
-        if there == (asked, len(index), settings.tolerance, settings.outside):
-            console.print(f"{out} is complete; nothing to do")
-            return confidence
+    wanted = (asked, len(index), settings.tolerance, settings.outside)
+    there = finished(out, index)
+    if there and (there.asked, there.gallery, there.tolerance_m, there.outside) == wanted:
+        console.print(f"{out} is complete; nothing to do")
+        return there
     if not storage.exists(settings.checkpoint):
         raise InputError(
             f"no checkpoint at {settings.checkpoint}; expected a last.pt of jobs/train.py; check --checkpoint"
@@ -88,6 +87,14 @@ def calibrate_index(settings: Settings) -> Confidence:
     console.print(told(confidence))
     print(f"calibration: {out}, diagram: {picture}")
     return confidence
+
+
+def finished(out: str, index: Index) -> Confidence | None:
+    """The calibration that is there; none where it is another network's or damaged, as it is to be replaced."""
+    try:
+        return read_confidence(out, index.facts) if storage.exists(out) else None
+    except InputError:
+        return None
 
 
 def embedded(

@@ -7,6 +7,7 @@ page with a map. Photos that cannot be decoded are listed with the reason, the o
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -35,6 +36,17 @@ from pipeline.stream import fetch
 from pipeline.track import TRACKED, Motion, Start
 from pipeline.where import Near, Where
 
+THREE_NUMBERS: Any = tyro.constructors.PrimitiveConstructorSpec(
+    nargs=3,  # tyro's own reading of an optional tuple takes the photos behind it as well
+    metavar="LAT LON METRES",
+    instance_from_str=lambda said: Near(lat=float(said[0]), lon=float(said[1]), radius_m=float(said[2])),
+    is_instance=lambda value: value is None or isinstance(value, Near),
+    str_from_instance=lambda value: (
+        [str(value)] if value is None else [str(value.lat), str(value.lon), str(value.radius_m)]
+    ),
+)
+"How a circle is told on the command line."
+
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
@@ -52,9 +64,8 @@ class Settings:
     "Candidates that are listed of each photo."
     together: bool = False
     "All photos of a folder show one place: they are asked as one, by the mean of their embeddings."
-    near: tuple[float, float, float] | None = None
-    """Latitude, longitude and radius in metres: only gallery images in this circle may answer. With --track it is where the
-    flight began, at the time of its first photo."""
+    near: Annotated[Near | None, THREE_NUMBERS] = None
+    "Only gallery images in this circle may answer. With --track it is where the flight began, when its first photo was taken."
     track: bool = False
     "The photos are of one flight: each is placed in the light of all, and GeoJSON begins with the flight's line."
     max_speed: float = 25.0
@@ -91,7 +102,6 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
 
     `truths`: where photos were really taken, by name, for the page. Raises InputError and CheckpointError on unusable input.
     """
-    near = Near(lat=settings.near[0], lon=settings.near[1], radius_m=settings.near[2]) if settings.near else None
     photos = find_photos(settings.photos)
     if not storage.exists(settings.checkpoint):
         raise InputError(
@@ -107,7 +117,7 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
     asked = [query for query in queries if query.embedding_D is not None]
     if settings.track:
         asked = timed(asked, settings)
-    answers = ask(asked, index, gallery, confidence, near, settings)
+    answers = ask(asked, index, gallery, confidence, settings)
     answered = dict(zip((query.name for query in asked), zip(asked, answers, strict=True), strict=True))
     located = [
         _located(*answered[query.name], settings.top) if query.name in answered else _located(query, None, settings.top)
@@ -132,11 +142,11 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
 
 
 def ask(
-    queries: Sequence[Query], index: Index, gallery: GalleryMap, confidence: Confidence | None, near: Near | None,
-    settings: Settings,
+    queries: Sequence[Query], index: Index, gallery: GalleryMap, confidence: Confidence | None, settings: Settings
 ) -> list[Answer]:  # fmt: skip
     """An answer per query, in the light of the whole flight with --track."""
     embeddings_QD = np.array([query.embedding_D for query in queries], np.float32).reshape(-1, index.dimension)
+    near = settings.near
     if not settings.track or confidence is None:
         where = Where(near=near) if near else None
         return locate(index, embeddings_QD, settings.top, where, confidence, gallery.spacing_m)

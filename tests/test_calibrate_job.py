@@ -80,6 +80,8 @@ def test_photos_of_places_not_trained_on_calibrate_an_index(
     assert "nothing to do" in capsys.readouterr().err
     assert calibrate_index(Settings(**world, outside=0.2)).outside == 0.2
     assert calibrate_index(Settings(**world, outside=0.2, photos=30)).photos == 30
+    (tmp_path / "index" / "calibration.json").write_text("{}")
+    assert calibrate_index(Settings(**world)) == made
 
 
 def test_few_photos_are_enough_to_ask_for_but_not_few_places(world: dict[str, Any], tmp_path: Path) -> None:

@@ -52,6 +52,7 @@ WRONG: list[tuple[str, list[str], str]] = [
     ("build_index", ["--verify", "--out", "{}/o"], "no index at"),
     ("evaluate", ["--table", "{}", "--out", "{}/o"], "no feature table at"),
     ("locate", ["--checkpoint", "{}/c.pt", "--index", "{}", "--out", "{}/o", "{}/gone.jpg"], "no photo or folder at"),
+    ("locate", ["--checkpoint", "{}/c.pt", "--index", "{}", "--out", "{}/o", "--near", "95", "0", "9", "{}"], "latitude 95"),
     ("calibrate", ["--checkpoint", "{}/c.pt", "--shards", "{}", "--index", "{}"], "no index at"),
     ("simulate", ["--out", "{}/o", "--train-locations", "1", "--test-locations", "1", "--distractors", "0",
                   "--textures", "{}/nowhere"], "nowhere"),
@@ -101,7 +102,9 @@ def test_the_road_by_command_lines_and_again(
     assert (metrics[0]["queries"], metrics[0]["gallery"]) == (9, 5)
     assert "data:image/webp" in (out / "report.html").read_text()
     photos = tiny_world / "test" / "query_drone"
-    done = call("locate", "--checkpoint", run / "last.pt", "--index", index, "--out", tmp_path / "o.geojson", photos)
+    near = ("--near", -46.5, 8, 1e8)  # half-way round the earth, and a photo behind it
+    given = ("--checkpoint", run / "last.pt", "--index", index, "--out", tmp_path / "o.geojson")
+    done = call("locate", *given, *near, photos)
     assert done.returncode == 0, done.stderr
     assert len(json.loads((tmp_path / "o.geojson").read_text())["features"]) == 9
     pair = ("--queries", table, "--gallery", table, "--query-view", "drone", "--gallery-view", "satellite")

@@ -21,6 +21,7 @@ from pipeline.index_build import IndexSettings, build_index
 from pipeline.logistic import Logistic
 from pipeline.records import InputError, Unfinished
 from pipeline.transforms import preprocessing, resize
+from pipeline.where import Near
 
 PLACES = 12
 STEP = 1e-3  # degrees between places, about 111 m
@@ -98,7 +99,7 @@ def test_photos_of_one_folder_are_one_query_together(world: dict[str, str]) -> N
 
 
 def test_near_a_place_only_what_lies_there_answers(world: dict[str, str]) -> None:
-    located = locate_photos(settings(world, near=(46 + STEP * 2, 8.0, 150.0)))
+    located = locate_photos(settings(world, near=Near(lat=46 + STEP * 2, lon=8.0, radius_m=150.0)))
     found = {hit.location for one in located if one.answer for hit in one.answer.candidates}
     assert found == {"0001", "0002", "0003"}
 
@@ -156,7 +157,6 @@ def test_a_flight_without_times_or_without_a_calibration_is_refused(world: dict[
         ({"together": True, "track": True}, "both --together and --track"),
         ({"interval": -1.0}, "--interval is -1"),
         ({"max_speed": 0.0}, "--max-speed is 0"),
-        ({"near": (95.0, 0.0, 10.0)}, "latitude 95"),
         ({"checkpoint": "nowhere.pt"}, "no checkpoint at nowhere.pt"),
     ],
 )
