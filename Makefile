@@ -4,7 +4,7 @@ BIN := .venv/bin
 
 .PHONY: demo test check bench
 
-demo: .venv/installed  ## simulate, pack, train, embed, index, evaluate, report: at most six minutes on two cores
+demo: .venv/installed  ## simulate, pack, train, embed, index, evaluate, report, locate: at most six minutes on two cores
 	$(BIN)/python jobs/demo.py --out runs/demo
 
 test: .venv/installed
@@ -17,7 +17,8 @@ check: .venv/installed
 
 bench: .venv/installed
 	for name in simulate shards streaming evaluate train_step; do $(BIN)/python benchmarks/$$name.py || exit 1; done
-# benchmarks/ablation.py takes hours and a folder of imagery: it is called by hand
+# benchmarks/ablation.py (hours) and benchmarks/locate.py (minutes) take a folder of imagery, benchmarks/serve.py a trained
+# network and its index: they are called by hand
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and f"found Python {sys.version}; expected 3.11 or later; say make PYTHON=python3.11")'

@@ -1,4 +1,4 @@
-"""The whole road on one machine: `demo.py [--out DIR]`. Simulate, pack, train, embed, index, evaluate, report.
+"""The whole road on one machine: `demo.py [--out DIR]`. Simulate, pack, train, embed, index, evaluate, report, locate.
 
 Every stage is the one that the other jobs run, on a data set small enough for minutes on two cores. Run again, it goes on
 where it was.
@@ -7,12 +7,13 @@ where it was.
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from rich.text import Text
 
 from jobs.cli import run
+from jobs.demo_photos import Demo, locate_some
 from jobs.encoders import network_of
 from jobs.evaluate import print_table
 from jobs.recipes import smoke
@@ -39,8 +40,10 @@ class Settings:
 
     out: str = "runs/demo"
     "Folder for everything that it makes."
-    train_locations: int = 200
-    "Places to learn from."
+    train_locations: int = 230
+    "Places to learn from, with those held out."
+    hold_out: float = 0.13
+    "Share of these that is not learnt from: how sure answers are is calibrated by them."
     test_locations: int = 100
     "Places to find; none of them is seen in training."
     distractors: int = 50
@@ -73,7 +76,7 @@ def demo(settings: Settings) -> list[dict[str, Any]]:
     with step(seconds, "2 pack", "images into webdataset shards"):
         pack(University1652(), PackingSettings(root=flights, out=shards))
     with step(seconds, "3 train", "PVDA from scratch by recipe smoke: small, quick, the same two-step method"):
-        recipe = smoke(epochs=settings.epochs)
+        recipe = replace(smoke(epochs=settings.epochs), hold_out=settings.hold_out)
         checkpoint = train(TrainSettings(recipe=recipe, shards=shards, out=trained))
         start = storage.join(out, "untrained.pt")
         if not storage.exists(start):
@@ -103,6 +106,10 @@ def demo(settings: Settings) -> list[dict[str, Any]]:
         index = storage.join(out, "index")
         build_index(IndexSettings(table=table, out=index, split=Split.GALLERY, view=View.SATELLITE))
         console.print(ask(index, table))
+    with step(seconds, "9 locate", "a few unseen photos: where were they taken?"):
+        page = locate_some(
+            Demo(flights=flights, shards=shards, checkpoint=checkpoint, index=index, out=storage.join(out, "located"))
+        )
     console.rule("done")
     console.print("seconds: " + ", ".join(f"{name} {spent:.0f}" for name, spent in seconds.items()))
     chance = 1 / rows["trained"][0]["gallery"]
@@ -111,7 +118,7 @@ def demo(settings: Settings) -> list[dict[str, Any]]:
         f"{rows['untrained'][0]['r1']:.2%}, trained {rows['trained'][0]['r1']:.2%}"
     )
     print_table(rows["trained"])
-    print(f"report: {storage.join(out, 'evaluation-trained', 'report.html')}")
+    print(f"report: {storage.join(out, 'evaluation-trained', 'report.html')}\nphotos on the map: {page}")
     return rows["trained"]
 
 

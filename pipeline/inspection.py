@@ -23,33 +23,34 @@ PNG_ORIENTED = (b"Raw profile type exif\0", b"XML:com.adobe.xmp\0")
 "Keywords of the text chunks that may hold an orientation."
 
 
-def inspect(data: bytes) -> tuple[int, int]:
+def inspect(data: bytes, most_pixels: int = MAX_PIXELS) -> tuple[int, int]:
     """Encoded image -> (width, height), upright as its EXIF orientation says; JPEG, PNG and WebP without decoding.
 
     It refuses for decode's reasons (`empty file`, `not an image`, `damaged image`, `too many pixels`), and besides for
     `truncated image`, where the end is missing, and `absurd dimensions`. What it accepts may still not decode: flipped or
     overwritten bytes within the compressed pixels, and a hole that was filled so that the end is where it belongs, are not
-    seen. CMYK JPEG, TIFF, BMP, GIF and all others are decoded, so of them all is seen.
+    seen. CMYK JPEG, TIFF, BMP, GIF and all others are decoded, so of them all is seen; JPEG, PNG and WebP of more than
+    `most_pixels` never are.
 
     Raises DecodeError.
     """
     with refusing(data):
         if data.startswith(b"\xff\xd8\xff"):
-            size = _jpeg(data)
+            size = _jpeg(data, most_pixels)
         elif data.startswith(b"\x89PNG\r\n\x1a\n"):
-            size = _png(data)
+            size = _png(data, most_pixels)
         elif data.startswith(b"RIFF") and data[8:12] == b"WEBP":
             size = _webp(data)
         else:
             size = _decoded(data)
-    _refuse_absurd(*size)
+    _refuse_absurd(*size, most_pixels)
     return size
 
 
-def _refuse_absurd(width: int, height: int) -> None:
+def _refuse_absurd(width: int, height: int, most_pixels: int) -> None:
     short, long = sorted((width, height))
-    if width * height > MAX_PIXELS:
-        raise DecodeError("too many pixels", f"{width} x {height}, expected at most {MAX_PIXELS} pixels")
+    if width * height > most_pixels:
+        raise DecodeError("too many pixels", f"{width} x {height}, expected at most {most_pixels} pixels")
     if short < MIN_SIDE or long > MAX_SIDE or long > MAX_RATIO * short:
         raise DecodeError(
             "absurd dimensions",
@@ -80,9 +81,9 @@ class _JpegHeader:
     "Where the first scan begins."
 
 
-def _jpeg(data: bytes) -> tuple[int, int]:
+def _jpeg(data: bytes, most_pixels: int) -> tuple[int, int]:
     header = _jpeg_header(data)
-    _refuse_absurd(header.width, header.height)
+    _refuse_absurd(header.width, header.height, most_pixels)
     if header.colours not in (1, 3):  # decode leaves these to Pillow, which is milder than libjpeg about the end
         return _decoded(data)
     # The end marker cannot occur within compressed pixels. It may stand far from the file's end: cameras append previews,
@@ -125,7 +126,7 @@ def _jpeg_header(data: bytes) -> _JpegHeader:
     raise DecodeError("truncated image", f"{end} bytes of JPEG that end within the header")
 
 
-def _png(data: bytes) -> tuple[int, int]:
+def _png(data: bytes, most_pixels: int) -> tuple[int, int]:
     at, described, pixels, end = 8, False, False, len(data)
     size: tuple[int, int] | None = None
     while at + 12 <= end:
@@ -134,7 +135,7 @@ def _png(data: bytes) -> tuple[int, int]:
             break
         if kind == b"IHDR":
             size = int.from_bytes(data[at + 8 : at + 12]), int.from_bytes(data[at + 12 : at + 16])
-            _refuse_absurd(*size)
+            _refuse_absurd(*size, most_pixels)
         elif kind == b"eXIf" or (kind in (b"iTXt", b"zTXt", b"tEXt") and data.startswith(PNG_ORIENTED, at + 8)):
             described = True
         pixels |= kind == b"IDAT"

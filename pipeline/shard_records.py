@@ -5,11 +5,12 @@ and one table for other programs, as Parquet or GeoJSON.
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from pipeline import storage
@@ -80,6 +81,18 @@ def read_part(out: str, name: str, columns: list[str] | None = None) -> pa.Table
             f"{path} cannot be read ({error}); expected the record table that packing wrote beside the tars; run "
             "jobs/make_shards.py again as it was run first, which makes what is missing"
         ) from None
+
+
+def footprints(shards: str, manifest: Manifest, keys: Iterable[str]) -> dict[str, list[list[float]]]:
+    """Corners (lat, lon) of the ground that some images show, from the upper left clockwise; those unknown are absent."""
+    wanted = set(keys)
+    found: dict[str, list[list[float]]] = {}
+    for shard in manifest.shards:
+        if any(key.startswith(f"{shard.split}-{shard.view}-") for key in wanted):
+            table = read_part(shards, shard.name, ["key", "footprint"])
+            known = table.filter(pc.and_(pc.is_in(table["key"], pa.array(wanted)), pc.is_valid(table["footprint"])))
+            found |= dict(zip(known["key"].to_pylist(), known["footprint"].to_pylist(), strict=True))
+    return found
 
 
 def export(shards: str, manifest: Manifest, file: str) -> tuple[int, int]:

@@ -9,7 +9,10 @@ import faiss
 import pytest
 
 ROOT = Path(__file__).parent.parent
-JOBS = ["simulate", "make_shards", "train", "embed_gallery", "build_index", "evaluate", "import_weights", "demo"]
+JOBS = [
+    "simulate", "make_shards", "train", "embed_gallery", "build_index", "evaluate", "import_weights", "calibrate", "locate",
+    "demo",
+]  # fmt: skip
 
 
 def call(job: str, *arguments: object) -> subprocess.CompletedProcess[str]:
@@ -48,6 +51,9 @@ WRONG: list[tuple[str, list[str], str]] = [
     ("build_index", ["--remove", "0839", "--out", "{}/o"], "no index at"),
     ("build_index", ["--verify", "--out", "{}/o"], "no index at"),
     ("evaluate", ["--table", "{}", "--out", "{}/o"], "no feature table at"),
+    ("locate", ["--checkpoint", "{}/c.pt", "--index", "{}", "--out", "{}/o", "{}/gone.jpg"], "no photo or folder at"),
+    ("locate", ["--checkpoint", "{}/c.pt", "--index", "{}", "--out", "{}/o", "--near", "95", "0", "9", "{}"], "latitude 95"),
+    ("calibrate", ["--checkpoint", "{}/c.pt", "--shards", "{}", "--index", "{}"], "no index at"),
     ("simulate", ["--out", "{}/o", "--train-locations", "1", "--test-locations", "1", "--distractors", "0",
                   "--textures", "{}/nowhere"], "nowhere"),
     ("make_shards", ["--root", "{}", "--out", "{}/o", "--source", "university1652", "--no-such-flag"], "--no-such-flag"),
@@ -95,6 +101,12 @@ def test_the_road_by_command_lines_and_again(
     ]  # fmt: skip
     assert (metrics[0]["queries"], metrics[0]["gallery"]) == (9, 5)
     assert "data:image/webp" in (out / "report.html").read_text()
+    photos = tiny_world / "test" / "query_drone"
+    near = ("--near", -46.5, 8, 1e8)  # half-way round the earth, and a photo behind it
+    given = ("--checkpoint", run / "last.pt", "--index", index, "--out", tmp_path / "o.geojson")
+    done = call("locate", *given, *near, photos)
+    assert done.returncode == 0, done.stderr
+    assert len(json.loads((tmp_path / "o.geojson").read_text())["features"]) == 9
     pair = ("--queries", table, "--gallery", table, "--query-view", "drone", "--gallery-view", "satellite")
     done = call("evaluate", *pair, "--out", tmp_path / "pair", "--multi-query", "--protocol", "queried-only")
     assert done.returncode == 0, done.stderr

@@ -1,0 +1,259 @@
+"""Where were these photos taken? `locate.py --checkpoint FILE --index INDEX --out FILE.geojson PHOTO...`
+
+Photos, or folders of them, are embedded as the index's images were, and the index is asked. Writes GeoJSON, on demand CSV and a
+page with a map. Photos that cannot be decoded are listed with the reason, the others are answered, and the exit code is 1.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from jobs.cli import run
+from jobs.photo_encoder import PhotoEncoder
+from jobs.photos import Query, read_photos, together
+from pipeline import answer_files, rejects, storage
+from pipeline.answer_files import Located
+from pipeline.answer_page import Place, Surroundings, render
+from pipeline.confidence import Confidence, find_confidence, read_confidence
+from pipeline.flight import LIKELIER, motion_over, settle
+from pipeline.gallery_map import GalleryMap, gallery_map
+from pipeline.index import Index
+from pipeline.locate import Answer, locate
+from pipeline.photo_files import find_photos, read_times, seconds
+from pipeline.progress import console
+from pipeline.records import InputError, Unfinished
+from pipeline.report_inputs import no_pictures
+from pipeline.shard_records import footprints
+from pipeline.shards import read_manifest
+from pipeline.stream import fetch
+from pipeline.track import TRACKED, Motion, Start
+from pipeline.where import Near, Where
+
+THREE_NUMBERS: Any = tyro.constructors.PrimitiveConstructorSpec(
+    nargs=3,  # tyro's own reading of an optional tuple takes the photos behind it as well
+    metavar="LAT LON METRES",
+    instance_from_str=lambda said: Near(lat=float(said[0]), lon=float(said[1]), radius_m=float(said[2])),
+    is_instance=lambda value: value is None or isinstance(value, Near),
+    str_from_instance=lambda value: (
+        [str(value)] if value is None else [str(value.lat), str(value.lon), str(value.radius_m)]
+    ),
+)
+"How a circle is told on the command line."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Which photos are looked for in which index, and what is written."""
+
+    photos: tyro.conf.Positional[tuple[str, ...]]
+    "Photos, or folders with photos below them; paths or URIs."
+    checkpoint: str
+    "The network that the index was made with."
+    index: str
+    "Folder or URI of the index."
+    out: str
+    "The GeoJSON file with a point per photo."
+    top: int = 5
+    "Candidates that are listed of each photo."
+    together: bool = False
+    "All photos of a folder show one place: they are asked as one, by the mean of their embeddings."
+    near: Annotated[Near | None, THREE_NUMBERS] = None
+    "Only gallery images in this circle may answer. With --track it is where the flight began, when its first photo was taken."
+    track: bool = False
+    "The photos are of one flight: each is placed in the light of all, and GeoJSON begins with the flight's line."
+    max_speed: float = 25.0
+    "Of the flight, metres per second over the ground; 25 is beyond most multicopters."
+    elsewhere: float = 0.1
+    "Of the flight, the share of photos expected to show no place of the gallery."
+    times: str | None = None
+    "CSV table with the columns photo and time (seconds or ISO 8601); by default the camera's own times."
+    interval: float | None = None
+    "Seconds between photos in the order of their names, where neither tables nor cameras say when."
+    calibration: str | None = None
+    "What jobs/calibrate.py wrote; by default INDEX/calibration.json where it is there."
+    csv: str | None = None
+    "A CSV file with a row per photo."
+    page: str | None = None
+    "An HTML page with photos, candidates and a map, in one file that needs no network."
+    shards: str | None = None
+    "Those that the index was made of: the pictures of the page; needed besides where the index's embeddings are int8."
+
+    def __post_init__(self) -> None:
+        if self.top < 1:
+            raise InputError(f"--top is {self.top}, expected at least 1")
+        if self.together and self.track:
+            raise InputError(
+                "both --together and --track were given, expected one: a track is of single photos; leave one out"
+            )
+        if self.interval is not None and not self.interval > 0:
+            raise InputError(f"--interval is {self.interval}, expected seconds above 0")
+        Motion(max_speed=self.max_speed, elsewhere=self.elsewhere)  # which checks them
+
+
+def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None) -> list[Located]:
+    """Answer, write what was asked for, and return the answers in the order of the photos (of their folders, together).
+
+    `truths`: where photos were really taken, by name, for the page. Raises InputError and CheckpointError on unusable input.
+    """
+    photos = find_photos(settings.photos)
+    if not storage.exists(settings.checkpoint):
+        raise InputError(
+            f"no checkpoint at {settings.checkpoint}; expected a last.pt of jobs/train.py; check --checkpoint"
+        )
+    index = Index(settings.index)
+    confidence = confidence_of(settings, index)
+    encoder = PhotoEncoder(storage.read_bytes(settings.checkpoint), settings.checkpoint, index.facts, settings.shards)
+    gallery = gallery_map(index)
+    queries = read_photos(photos, encoder)
+    if settings.together:
+        queries = together(queries)
+    asked = [query for query in queries if query.embedding_D is not None]
+    if settings.track:
+        asked = timed(asked, settings)
+    answers = ask(asked, index, gallery, confidence, settings)
+    answered = dict(zip((query.name for query in asked), zip(asked, answers, strict=True), strict=True))
+    located = [
+        _located(*answered[query.name], settings.top) if query.name in answered else _located(query, None, settings.top)
+        for query in queries
+    ]
+    if settings.track:
+        located.sort(key=lambda one: (one.taken_at is None, seconds(one.taken_at or "0")))
+    about = {
+        "index": settings.index, "fingerprint": encoder.fingerprint, "together": settings.together,
+        "threshold": LIKELIER if settings.track else confidence.threshold if confidence else None,
+    }  # fmt: skip
+    storage.write_bytes(settings.out, answer_files.geojson(located, about, settings.track))
+    if settings.csv:
+        storage.write_bytes(settings.csv, answer_files.table(located))
+    if settings.page:
+        around = Surroundings(
+            title="Where these photos were taken", gallery=gallery, confidence=confidence, fingerprint=encoder.fingerprint,
+            track=settings.track, truths=truths or {},
+        )  # fmt: skip
+        storage.write_bytes(settings.page, page(located, around, settings.shards).encode("utf-8", "replace"))
+    return located
+
+
+def ask(
+    queries: Sequence[Query], index: Index, gallery: GalleryMap, confidence: Confidence | None, settings: Settings
+) -> list[Answer]:  # fmt: skip
+    """An answer per query, in the light of the whole flight with --track."""
+    embeddings_QD = np.array([query.embedding_D for query in queries], np.float32).reshape(-1, index.dimension)
+    near = settings.near
+    if not settings.track or confidence is None:
+        where = Where(near=near) if near else None
+        return locate(index, embeddings_QD, settings.top, where, confidence, gallery.spacing_m)
+    single = locate(index, embeddings_QD, max(settings.top, TRACKED), None, confidence)
+    start = Start(lat=near.lat, lon=near.lon, radius_m=near.radius_m) if near else None
+    motion = motion_over(gallery, settings.max_speed, settings.elsewhere)
+    return settle(single, [seconds(query.taken_at or "0") for query in queries], confidence, motion, start)
+
+
+def confidence_of(settings: Settings, index: Index) -> Confidence | None:
+    """The calibration that was named, or the one beside the index, or none, which is said.
+
+    Raises InputError where it is another network's, or where there is none and a track needs one.
+    """
+    if settings.calibration:
+        return read_confidence(settings.calibration, index.facts)
+    confidence = find_confidence(settings.index, index.facts)
+    if confidence is None and settings.track:
+        raise InputError(
+            f"no calibration beside {settings.index}, and --track weighs candidates by one; expected calibration.json; make it "
+            "with jobs/calibrate.py"
+        )
+    if confidence is None:
+        console.print("not calibrated: answers come without a probability, and none is unknown; see jobs/calibrate.py")
+    elif confidence.gallery != len(index):
+        console.print(
+            f"calibrated over {confidence.gallery} gallery images, the index has {len(index)}: probabilities are "
+            "rough until jobs/calibrate.py is run again",
+            style="yellow",
+        )
+    return confidence
+
+
+def timed(queries: Sequence[Query], settings: Settings) -> list[Query]:
+    """The photos with when each was taken: by the table, else by the interval, else as the cameras say.
+
+    Raises InputError where that is not known of all.
+    """
+    names = [query.name for query in queries]
+    if settings.times:
+        said = read_times(settings.times, names)
+    elif settings.interval:
+        said = {name: str(number * settings.interval) for number, name in enumerate(sorted(names))}
+    else:
+        said = {query.name: query.taken_at for query in queries if query.taken_at is not None}
+    unknown = [name for name in names if name not in said]
+    if unknown:
+        raise InputError(
+            f"{len(unknown)} of {len(names)} photos do not say when they were taken, {unknown[0]} among them; expected times "
+            "for --track; give --times TABLE or --interval SECONDS"
+        )
+    return [replace(query, taken_at=said[query.name]) for query in queries]
+
+
+def _located(query: Query, answer: Answer | None, top: int) -> Located:
+    shown = replace(answer, candidates=answer.candidates[:top]) if answer else None
+    return Located(name=query.name, photos=query.photos, answer=shown, rejected=query.rejected, taken_at=query.taken_at)
+
+
+def page(located: Sequence[Located], around: Surroundings, shards: str | None) -> str:
+    """The HTML page; with pictures and corners of the gallery's images where shards are at hand."""
+
+    def photos(names: Iterable[str]) -> dict[str, bytes]:
+        return {name: storage.read_bytes(name) for name in names}
+
+    if shards is None:
+        return render(located, around, photos, no_pictures)
+    around = replace(around, footprints=partial(footprints, shards, read_manifest(shards)))
+    return render(located, around, photos, partial(fetch, shards))
+
+
+def print_answers(located: Sequence[Located]) -> None:
+    """The answers on standard output, a line each."""
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for heading in ("photo", "position", "within", "sure", "location", "score"):
+        table.add_column(heading, justify="left" if heading in ("photo", "location") else "right", overflow="fold")
+    for one in located:
+        table.add_row(one.name, *_cells(one))
+    Console().print(table)
+
+
+def _cells(one: Located) -> list[str]:
+    answer = one.answer
+    if answer is None:
+        return [one.rejected[0].reason, "", "", "", ""]
+    position = f"{answer.position.lat:.6f}, {answer.position.lon:.6f}" if answer.position else "no position"
+    return [
+        position if answer.known else "unknown",
+        f"{answer.position.radius_m:.0f} m" if answer.position and answer.known else "",
+        "" if answer.probability is None else f"{answer.probability:.0%}",
+        (answer.location or "") if answer.known else "",
+        f"{answer.candidates[0].score:.3f}" if answer.candidates else "",
+    ]
+
+
+def main(settings: Settings) -> None:
+    """Answer where photos were taken: a position, how sure it is, and the candidates behind it."""
+    located = locate_photos(settings)
+    print_answers(located)
+    print(f"answers: {settings.out}" + (f", page: {settings.page}" if settings.page else ""))
+    damaged = [refused for one in located for refused in one.rejected]
+    if damaged:
+        raise Unfinished(
+            f"{len(damaged)} of {sum(len(one.photos) for one in located)} photos could not be decoded: "
+            f"{rejects.commonest(damaged)}; they are listed in {settings.out}"
+        )
+
+
+if __name__ == "__main__":
+    run(main)

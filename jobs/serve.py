@@ -1,0 +1,129 @@
+"""A checkpoint and its index -> answers over HTTP: `serve.py --checkpoint FILE --index INDEX [--host H] [--port P]`."""
+
+import asyncio
+import os
+import signal
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from aiohttp import web
+
+from jobs.cli import run
+from jobs.photo_encoder import PhotoEncoder
+from model.checkpoint import CheckpointError
+from pipeline import cluster, storage
+from pipeline.index_facts import FACTS
+from pipeline.placement import place
+from pipeline.progress import console
+from pipeline.records import InputError
+from pipeline.service.answerer import Answerer
+from pipeline.service.app import Service
+from pipeline.service.batcher import Gone
+from pipeline.service.engine import NotReady
+from pipeline.service.live_index import LOOK_EVERY_S
+from pipeline.service.replicas import Replicas
+from pipeline.service.settings import ServiceSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(ServiceSettings):
+    """Which index answers, by which network, to whom."""
+
+    checkpoint: str
+    "The checkpoint that the index's gallery was embedded with."
+    index: str
+    "Folder or URI of the index; one that is built there later is taken over."
+    shards: str | None = None
+    "What the index was made of: needed only where it was embedded in int8."
+    replicas: int = 1
+    "Processes that each load network and index."
+    threads: int | None = None
+    "CPU cores of each; by default as many as let all of them fit on the nodes that are up."
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("replicas", "threads"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise InputError(f"--{name} is {value}, expected at least 1")
+
+
+def load(checkpoint: str, index: str, shards: str | None, threads: int) -> Answerer:
+    """What each replica calls. Raises InputError."""
+    import torch
+
+    torch.set_num_threads(threads)  # FAISS takes OMP_NUM_THREADS, which Ray sets to the replica's cores
+
+    def encoder_for(facts: dict[str, Any]) -> PhotoEncoder:
+        try:
+            return PhotoEncoder(storage.read_bytes(checkpoint), checkpoint, facts, shards)
+        except CheckpointError as error:
+            raise InputError(str(error)) from None
+
+    return Answerer(index, encoder_for)
+
+
+def main(settings: Settings) -> None:
+    """Answer over HTTP where photos were taken, until Ctrl-C or SIGTERM."""
+    for name, path, hint in (
+        ("checkpoint", settings.checkpoint, "a last.pt of jobs/train.py"),
+        ("index", storage.join(settings.index, FACTS), "an index of jobs/build_index.py"),
+    ):
+        if not storage.exists(path):
+            raise InputError(f"no {name} at {path}; expected {hint}; check --{name}")
+    token = settings.token()
+    cluster.connect()
+    asyncio.run(serve(settings, token))
+
+
+async def serve(settings: Settings, token: str | None) -> None:
+    """Listen at once, so that whoever asks for its health hears that it is loading; answer once it has loaded."""
+    placement = place(cluster.nodes(), settings.replicas, settings.replicas, settings.threads)
+    shards = None if settings.shards is None else storage.absolute(settings.shards)
+    checkpoint, index = storage.absolute(settings.checkpoint), storage.absolute(settings.index)
+    make = partial(load, checkpoint, index, shards, placement.cpus)
+    replicas = Replicas(f"pvda-{os.getpid()}", placement, make)
+    runner = Service(settings, replicas, token, abreast=placement.workers).runner()
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    await runner.setup()
+    try:
+        site = web.TCPSite(runner, settings.host, settings.port)
+        try:
+            await site.start()
+        except OSError as error:
+            raise InputError(
+                f"cannot listen on {settings.host} port {settings.port}: {error.strerror}; choose another --port"
+            ) from None
+        console.print(f"http://{settings.host}:{site.port} listens; loading")
+        working = asyncio.create_task(work(replicas))
+        stopping = asyncio.create_task(stop.wait())
+        await asyncio.wait([working, stopping], return_when=asyncio.FIRST_COMPLETED)
+        if working.done():
+            working.result()  # it ends by an exception only
+        console.print("stopping")
+        working.cancel()
+    finally:
+        await runner.cleanup()
+        await asyncio.to_thread(replicas.stop)
+
+
+async def work(replicas: Replicas) -> None:
+    """Load, then tell whenever another index answers or one was refused; replicas themselves are silent."""
+    known = await asyncio.to_thread(replicas.start)
+    console.print(f"ready: {known.rows} rows, {known.factory}, network {known.fingerprint[:12]}; Ctrl-C ends it")
+    while True:
+        await asyncio.sleep(LOOK_EVERY_S)
+        try:
+            status = await replicas.status()
+        except (NotReady, Gone):  # another replica is on its way
+            continue
+        if status != known:
+            said = f"another index answers: {status.rows} rows, {status.factory}"
+            console.print(status.refused or said, style="yellow" if status.refused else None)
+            known = status
+
+
+if __name__ == "__main__":
+    run(main)

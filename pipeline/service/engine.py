@@ -1,0 +1,21 @@
+"""Whoever computes, as the HTTP side sees it."""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from pipeline.service.answerer import Outcome, Status
+from pipeline.service.question import Question
+
+
+class NotReady(Exception):
+    """Nobody has loaded the network and the index yet. One sentence."""
+
+
+class Engine(Protocol):
+    """Whoever computes."""
+
+    async def answer(self, questions: Sequence[Question]) -> Sequence[Outcome]:
+        """One outcome per question, in order. Raises NotReady, and Gone where the batch is lost."""
+
+    async def status(self) -> Status:
+        """Raises NotReady or Gone."""

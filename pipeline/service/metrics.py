@@ -1,0 +1,40 @@
+"""What the service counts of itself, in Prometheus' text format."""
+
+from collections.abc import Callable
+
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+
+SECONDS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
+SIZES = (1, 2, 4, 8, 16, 32, 64)
+CONTENT_TYPE = CONTENT_TYPE_LATEST
+
+
+class Metrics:
+    """Counters of one service; another in the same process has its own."""
+
+    def __init__(self, waiting: Callable[[], int]) -> None:
+        """`waiting` says how many photos wait for a batch, when it is asked."""
+        self._registry = CollectorRegistry()
+        self._requests = Counter(
+            "pvda_requests", "Requests by path and HTTP status.", ["path", "status"], registry=self._registry
+        )
+        self._seconds = Histogram(
+            "pvda_request_seconds", "From a request's head to its answer.", ["path"], buckets=SECONDS, registry=self._registry
+        )  # fmt: skip
+        self._batches = Histogram(
+            "pvda_batch_photos", "Photos computed at once.", buckets=SIZES, registry=self._registry
+        )
+        queue = Gauge("pvda_waiting_photos", "Photos that wait for a batch.", registry=self._registry)
+        queue.set_function(waiting)
+
+    def request(self, path: str, status: int, seconds: float) -> None:
+        """One request was answered. `path` is one of the service's, or `other`."""
+        self._requests.labels(path, str(status)).inc()
+        self._seconds.labels(path).observe(seconds)
+
+    def batch(self, photos: int) -> None:
+        """A batch of so many begins."""
+        self._batches.observe(photos)
+
+    def text(self) -> bytes:
+        return generate_latest(self._registry)

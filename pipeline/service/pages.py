@@ -1,0 +1,41 @@
+"""What the service shows: the page for people, the one for programs, and the headers that keep both to themselves."""
+
+import json
+from pathlib import Path
+
+from aiohttp import web
+
+from pipeline.service.openapi import describe, reference
+from pipeline.service.settings import ServiceSettings
+
+WEB = Path(__file__).parent / "web"
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+    "Server": "pvda",  # and no versions
+}
+"Of every answer."
+PATHS = ("/", "/page.js", "/style.css", "/api", "/openapi.json")
+
+
+def pages(settings: ServiceSettings) -> list[web.RouteDef]:
+    """The routes of PATHS, in their order."""
+    shown = (
+        ((WEB / "index.html").read_text(), "text/html"),
+        ((WEB / "page.js").read_text(), "text/javascript"),
+        ((WEB / "style.css").read_text(), "text/css"),
+        (reference(settings), "text/html"),
+        (json.dumps(describe(settings)), "application/json"),
+    )
+    return [_page(path, text, kind) for path, (text, kind) in zip(PATHS, shown, strict=True)]
+
+
+def _page(path: str, text: str, kind: str) -> web.RouteDef:
+    async def answer(request: web.Request) -> web.Response:
+        return web.Response(text=text, content_type=kind)
+
+    return web.get(path, answer)
