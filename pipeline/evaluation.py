@@ -61,7 +61,7 @@ class EvaluationSettings:
     title: str = "Retrieval evaluation"
     "Headline of the report."
     panels: int = PANELS
-    "Hits, and as many misses, that the report shows of each task; the first few are open, the others unfold."
+    "Hits, and as many misses, that the report shows of each task; a few are open, the others unfold."
     workers: int = 0
     "Ray tasks that rank, of one core each, each for some of the queries; 0: this process ranks, on all cores."
     views: bool = True

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipeline import report_map
+from pipeline import map_sheet
 from pipeline.metrics import recall_at
 from pipeline.report_charts import CURVE_POINTS
 from pipeline.report_evidence import BINS, best_scores
@@ -103,7 +103,7 @@ def gap_figure(gap: Row) -> Figure:
 
 def map_figure(drawn: ErrorMap) -> Figure:
     """The page's map of errors."""
-    figure, [axes] = _sheet(1, COLUMN * report_map.HEIGHT / report_map.WIDTH)
+    figure, [axes] = _sheet(1, COLUMN * map_sheet.HEIGHT / map_sheet.WIDTH)
     for x1, y1, x2, y2, _ in drawn.lines:
         axes.plot([x1, x2], [y1, y2], color=RED, linewidth=0.4, alpha=drawn.opacity, zorder=1)
         axes.plot(x2, y2, "o", color=RED, markersize=1.2, zorder=1)
@@ -114,14 +114,14 @@ def map_figure(drawn: ErrorMap) -> Figure:
         places = [place for place in drawn.places if place.found == found]
         axes.plot([p.x for p in places], [p.y for p in places], "o", markersize=3, label=name, **look)
     length, text = drawn.bar
-    left, bottom = report_map.MARGIN, report_map.HEIGHT - 6
+    left, bottom = map_sheet.MARGIN, map_sheet.HEIGHT - 6
     axes.plot([left, left + length], [bottom, bottom], color="black", linewidth=1)
     axes.text(left + length + 6, bottom, text, va="center")
     axes.annotate(
-        "N", (report_map.WIDTH - 16, report_map.HEIGHT - 30), (report_map.WIDTH - 16, report_map.HEIGHT - 4),
+        "N", (map_sheet.WIDTH - 16, map_sheet.HEIGHT - 30), (map_sheet.WIDTH - 16, map_sheet.HEIGHT - 4),
         ha="center", va="center", arrowprops={"arrowstyle": "->", "linewidth": 0.8},
     )  # fmt: skip
-    axes.set(xlim=(0, report_map.WIDTH), ylim=(report_map.HEIGHT, 0), aspect="equal", title=drawn.title)
+    axes.set(xlim=(0, map_sheet.WIDTH), ylim=(map_sheet.HEIGHT, 0), aspect="equal", title=drawn.title)
     axes.set_axis_off()
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0), ncols=2)
     return figure

@@ -1,6 +1,6 @@
 """Which FAISS index suits a gallery: rows, dimension, memory and wanted recall in, a factory string and its reasons out. Pure.
 
-The families stand from the fastest to the slowest as `benchmarks/index.py` measures them (docs/results.md). The first that
+The families stand from the fastest to the slowest, as `benchmarks/index.py` measures them (docs/results.md). The first that
 fits the memory and is known to reach the recall is taken; where none reaches it, the one that comes nearest.
 """
 
@@ -14,8 +14,6 @@ from pipeline.records import InputError
 
 EXACT_ROWS = 100_000
 "Rows up to which exact search is fast enough to need no planning."
-GRAPH_ROWS = 1_000_000
-"Rows beyond which a graph takes hours to build."
 PROCESS_BYTES = 300e6
 "Python, FAISS, Arrow and Ray before the first vector."
 BLOCK_BYTES = 4 * 64e6
@@ -33,6 +31,7 @@ UNIT_SHARE = 1 / 16
 LEAST_UNIT_ROWS = 20_000
 PART_SHARE = 1 / 3
 "Of the memory, for merging a part of an index whose lists then stay on the disk."
+PIECE = 8  # dimensions of a 4-bit subquantiser: 256 of them at 2,048 dimensions
 REFINING = 10
 "Candidates per wanted row whose vectors are read from the table."
 Refine = Literal["none", "table"]
@@ -91,33 +90,32 @@ class _Family:
 
     name: str
     form: str
-    "Factory string with {lists}, {quarter} (of the dimension: subquantisers) and, before it, the reduction."
+    "Factory string with {lists} and {pieces}, the subquantisers."
     ceiling: float
     "Recall@10 that is reached with enough breadth: what quantisation leaves."
     refine: Refine = "none"
     on_disk: bool = False
-    inverted: bool = True
     reduces: bool = False
     "Whether it is used behind a projection onto the leading directions, or without one."
 
     def code_bytes(self, dimension: int) -> float:
         """Of one row's code with its id or its links."""
         return {
-            "Flat": 4.0 * dimension, "HNSW32,SQ8": dimension + 32 * 2 * 4 + 24, "SQ8": dimension + 8.0,
-            "PQfs": dimension / 16 + 8, "RaBitQ": dimension / 8 + 16, "RaBitQ4": dimension / 2 + 24,
+            "Flat": 4.0 * dimension, "SQfp16": 2 * dimension + 8.0, "SQ8": dimension + 8.0,
+            "PQfs": dimension / (2 * PIECE) + 8, "RaBitQ": dimension / 8 + 16, "RaBitQ4": dimension / 2 + 24,
         }[self.name]  # fmt: skip
 
 
 FAMILIES = (
-    _Family(name="PQfs", form="IVF{lists},PQ{eighth}x4fs", ceiling=0.99, refine="table", reduces=True),
-    _Family(name="PQfs", form="IVF{lists},PQ{eighth}x4fs", ceiling=0.985, refine="table"),
-    _Family(name="HNSW32,SQ8", form="HNSW32,SQ8", ceiling=0.99, inverted=False),
-    _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.99),
-    _Family(name="RaBitQ", form="IVF{lists},RaBitQ", ceiling=0.985, refine="table", on_disk=True),
+    _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985, refine="table", reduces=True),
+    _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985),
+    _Family(name="PQfs", form="IVF{lists},PQ{pieces}x4fs", ceiling=0.98, refine="table"),
+    _Family(name="SQfp16", form="IVF{lists},SQfp16", ceiling=0.999),
+    _Family(name="RaBitQ", form="IVF{lists},RaBitQ", ceiling=0.97, refine="table", on_disk=True),
     _Family(name="RaBitQ4", form="IVF{lists},RaBitQ4", ceiling=0.9),
-    _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.99, on_disk=True),
+    _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985, on_disk=True),
 )
-EXACT = _Family(name="Flat", form="Flat", ceiling=1.0, inverted=False)
+EXACT = _Family(name="Flat", form="Flat", ceiling=1.0)
 
 
 def plan_index(gallery: Gallery) -> Plan:
@@ -156,29 +154,26 @@ def _plans(gallery: Gallery) -> Iterator[Plan]:
     if gallery.rows <= EXACT_ROWS:
         yield _plan(EXACT, gallery)
     for family in FAMILIES:
-        suits = gallery.rows <= GRAPH_ROWS or family.inverted
         pays = gallery.effective_dimension is not None and gallery.effective_dimension <= gallery.dimension // 2
-        if suits and (gallery.rows_readable or family.refine == "none") and (pays or not family.reduces):
+        if (gallery.rows_readable or family.refine == "none") and (pays or not family.reduces):
             yield _plan(family, gallery)
 
 
 def _plan(family: _Family, gallery: Gallery) -> Plan:
     reduced = gallery.effective_dimension if family.reduces and gallery.effective_dimension else gallery.dimension
-    lists = _lists(gallery) if family.inverted else 0
+    lists = 0 if family is EXACT else _lists(gallery)
     trained = 0 if family is EXACT else _training_rows(gallery, lists)
     code = family.code_bytes(reduced)
     fixed = PROCESS_BYTES + lists * (4.0 * reduced + 64) + 4.0 * gallery.dimension * (reduced if family.reduces else 0)
     codes, masks = gallery.rows * code, MASK_BYTES * gallery.rows
     unit = min(gallery.rows, max(LEAST_UNIT_ROWS, int(gallery.budget * UNIT_SHARE / code / max(1, gallery.workers))))
-    if not family.inverted:
-        unit = gallery.rows  # a graph is built in one piece
     part = max(unit, int(gallery.budget * PART_SHARE / code)) if family.on_disk else gallery.rows
-    merging = part * code if family.on_disk else 2 * codes if family.name in ("PQfs", "HNSW32,SQ8", "Flat") else codes
+    merging = part * code if family.on_disk else 2 * codes if family.name in ("PQfs", "Flat") else codes
     growing = max(1, gallery.workers) * (fixed + BLOCK_BYTES + 2 * unit * code) + (
         PROCESS_BYTES if gallery.workers else 0
     )
     return Plan(
-        factory=(f"PCA{reduced}," if family.reduces else "") + form_of(family.form, lists, reduced),
+        factory=(f"PCA{reduced}," if family.reduces else "") + form_of(family, lists, reduced),
         refine=family.refine, on_disk=family.on_disk, training_rows=trained, unit_rows=unit,
         part_rows=part,
         search_bytes=fixed + masks + (0 if family.on_disk else codes),
@@ -188,10 +183,11 @@ def _plan(family: _Family, gallery: Gallery) -> Plan:
     )  # fmt: skip
 
 
-def form_of(form: str, lists: int, dimension: int) -> str:
-    """A family's factory string. Subquantisers of eight dimensions; FAISS wants a divisor of the dimension."""
-    eighth = next(count for count in range(max(1, dimension // 8), 0, -1) if dimension % count == 0)
-    return form.format(lists=lists, eighth=eighth)
+def form_of(family: _Family, lists: int, dimension: int) -> str:
+    """A family's factory string. FAISS wants as many subquantisers as divide the dimension."""
+    most = max(1, dimension // PIECE)
+    pieces = next(count for count in range(most, 0, -1) if dimension % count == 0)
+    return family.form.format(lists=lists, pieces=pieces)
 
 
 def _lists(gallery: Gallery) -> int:
@@ -213,12 +209,12 @@ def _training_rows(gallery: Gallery, lists: int) -> int:
 def _reason(family: _Family, gallery: Gallery, reduced: int, code: float) -> str:
     what = {
         "Flat": f"exact search: {gallery.rows:,} rows are few enough to look at each",
-        "HNSW32,SQ8": "a graph over 8-bit codes",
-        "SQ8": "lists of 8-bit codes",
-        "PQfs": "lists of 4-bit product codes, the best candidates scored again by the table's vectors",
-        "RaBitQ": "lists of one-bit codes, the best candidates scored again by the table's vectors",
-        "RaBitQ4": "lists of four-bit codes",
-    }[family.name]
-    where = ", lists on the disk," if family.on_disk else ""
-    less = f", vectors reduced from {gallery.dimension} to {reduced} directions" if family.reduces else ""
-    return f"{what}{less}:{where} {code:,.0f} bytes a row" if family is not EXACT else what
+        "SQfp16": "lists of 16-bit numbers", "SQ8": "lists of 8-bit codes", "PQfs": "lists of 4-bit product codes",
+        "RaBitQ": "lists of one-bit codes", "RaBitQ4": "lists of four-bit codes",
+    }[family.name]  # fmt: skip
+    if family is EXACT:
+        return what
+    less = f" of vectors reduced from {gallery.dimension} to {reduced} directions" if family.reduces else ""
+    where = ", on the disk" if family.on_disk else ""
+    again = ", the best candidates scored again by the table's vectors" if family.refine == "table" else ""
+    return f"{what}{less}{where}{again}: {code:,.0f} bytes a row"

@@ -18,7 +18,7 @@ FAISS: Any = faiss  # whose types know nothing of its keyword arguments
 SPECTRUM_ROWS = 16_384
 "Rows by which the table's directions are weighed."
 SAMPLED_AT_ONCE = 4_096
-ENERGY = 0.99
+ENERGY = 0.999
 "Of the vectors' squared length, what a projection has to keep."
 STEP = 32
 "Projections have a multiple of so many directions."

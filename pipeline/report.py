@@ -11,7 +11,8 @@ from typing import Any
 
 import jinja2
 
-from pipeline import report_charts, report_map, report_scatter
+from pipeline import map_sheet, report_charts, report_scatter
+from pipeline.chosen_rows import evenly
 from pipeline.features import Floats
 from pipeline.report_choice import Choice, choose
 from pipeline.report_evidence import scores_chart, views_chart
@@ -27,7 +28,7 @@ PROTOCOLS = {
     "queried-only": "the reduced protocol: gallery images of places that are not queried are left out, so its figures do "
     "not compare with those of the official one",
 }
-AT_ONCE = 6  # panels of a kind that are open from the start; the others unfold
+OPENED = 6  # panels of a kind that are open from the start, spread over all of them; the others unfold
 
 
 def render(
@@ -44,7 +45,9 @@ def render(
     environment.filters |= {
         "percent": lambda value: f"{100 * value:.2f}",
         "points": lambda value: f"{100 * value:+.2f}",
-        "metres": report_map.metres,
+        "metres": map_sheet.metres,
+        "opened": lambda items: [(i + 1, items[i]) for i in evenly(len(items), OPENED)],
+        "folded": lambda items: [(i + 1, items[i]) for i in range(len(items)) if i not in evenly(len(items), OPENED)],
     }
     tasks = [task_view(row, findings.results_of(row), extras) for row in findings.metrics]
     single = [task for task in tasks if not task.row["multi_query"]]
@@ -71,12 +74,11 @@ def render(
         evidence=[chart for chart in evidence if chart],
         groups=group_tables(findings.groups, names, r1),
         parts=part_tables(findings.parts, names, r1),
-        gaps=[scatter(gap) for gap in findings.gaps],
+        gaps=[scatter(gap, extras.beside) for gap in findings.gaps],
         maps=[each for each in maps if each],
         training=report_charts.training_charts(extras.training),
         sections=[_section(choice, album, known, parts.get(choice.task.row["task"], 1)) for choice in choices],
-        at_once=AT_ONCE,
-        charts=report_charts, scatters=report_scatter, map_size=report_map,
+        charts=report_charts, scatters=report_scatter, map_size=map_sheet,
     )  # fmt: skip
 
 

@@ -116,7 +116,8 @@ class Extras:
     @property
     def sha256(self) -> str:
         """Hash of all of it: the same extras give the same page."""
-        beside = [self.beside.name, self.beside.metrics, self.beside.results.to_pydict()] if self.beside else None
+        other = self.beside
+        beside = [other.name, other.metrics, other.results.to_pydict(), other.gaps] if other else None
         return hashlib.sha256(json.dumps([self.title, beside, self.training]).encode()).hexdigest()
 
 

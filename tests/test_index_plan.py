@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.index_plan import EXACT_ROWS, FAMILIES, GRAPH_ROWS, Gallery, Plan, plan_factory, plan_index
+from pipeline.index_plan import EXACT_ROWS, FAMILIES, Gallery, Plan, plan_factory, plan_index
 from pipeline.records import InputError
 
 galleries = st.builds(
@@ -76,19 +76,21 @@ def test_few_rows_are_searched_exactly_and_the_sentence_says_so() -> None:
 
 def test_memory_is_what_it_comes_to() -> None:
     """Lists of 8-bit codes of 1,000,000 x 2048 with their ids: 2.056 GB, beside the process and the centroids."""
-    gallery = Gallery(rows=10**6, dimension=2048, budget=8e9, target_recall=0.95, rows_readable=False)
-    plan = plan_index(replace(gallery, rows=GRAPH_ROWS + 1))
+    plan = plan_index(Gallery(rows=10**6, dimension=2048, budget=8e9, target_recall=0.95))
     assert plan.factory == "IVF2048,SQ8"
     assert plan.search_bytes == pytest.approx(2.056e9 + 2048 * 2048 * 4 + 300e6, rel=0.01)
-    assert "2,056 bytes a row" in plan.why
+    assert plan.why == "lists of 8-bit codes: 2,056 bytes a row"
 
 
 def test_a_tight_budget_leaves_the_lists_on_the_disk_or_takes_smaller_codes() -> None:
-    gallery = Gallery(rows=10**7, dimension=2048, budget=2e9, target_recall=0.95)
-    readable, elsewhere = plan_index(gallery), plan_index(replace(gallery, rows_readable=False))
-    assert readable.refine == "table"
-    assert elsewhere.on_disk
-    assert elsewhere.part_rows < gallery.rows, "an index that does not fit the memory cannot be merged in it"
+    gallery = Gallery(rows=10**7, dimension=2048, budget=4e9, target_recall=0.95)
+    assert (plan_index(gallery).factory, plan_index(gallery).refine) == ("IVF2048,PQ256x4fs", "table")
+    tight = plan_index(replace(gallery, budget=2e9))
+    elsewhere = plan_index(replace(gallery, budget=2e9, rows_readable=False))
+    assert (tight.factory, elsewhere.factory) == ("IVF1024,RaBitQ", "IVF1024,SQ8")
+    for plan in (tight, elsewhere):
+        assert plan.on_disk
+        assert plan.part_rows < gallery.rows, "what does not fit the memory cannot be merged in it"
 
 
 def test_few_strong_directions_are_made_use_of() -> None:
@@ -99,8 +101,9 @@ def test_few_strong_directions_are_made_use_of() -> None:
 
 def test_recall_beyond_every_family_is_approached_as_far_as_it_goes() -> None:
     best = max(family.ceiling for family in FAMILIES)
-    plan = plan_index(Gallery(rows=10**6, dimension=2048, budget=64e9, target_recall=1.0))
-    assert plan.expected_recall == best
+    gallery = Gallery(rows=10**6, dimension=2048, budget=64e9, target_recall=1.0)
+    assert plan_index(gallery).expected_recall == best
+    assert plan_index(replace(gallery, target_recall=0.99)).factory == "IVF2048,SQfp16"
 
 
 def test_a_factory_of_the_users_is_taken_as_it_is() -> None:

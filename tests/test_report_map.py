@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline import report_map
+from pipeline.map_sheet import HEIGHT, WIDTH, Sheet, metres
 from pipeline.positions import haversine_m
-from pipeline.report_map import Sheet, distance_chart, error_map, metres
+from pipeline.report_map import distance_chart, error_map
 
 Position = tuple[float, float]
 
@@ -59,10 +59,10 @@ def test_places_on_both_sides_of_the_180th_meridian_are_neighbours() -> None:
 def test_every_place_lies_on_the_sheet_wherever_on_earth(at: list[Position]) -> None:
     sheet = Sheet.around(np.array(at))
     for x, y in sheet.xy(np.array(at)):
-        assert -0.2 <= x <= report_map.WIDTH + 0.2
-        assert -0.2 <= y <= report_map.HEIGHT + 0.2
+        assert -0.2 <= x <= WIDTH + 0.2
+        assert -0.2 <= y <= HEIGHT + 0.2
     assert all(math.isfinite(tick.at) for tick in (*sheet.meridians(), *sheet.parallels()))
-    assert 0 < sheet.bar()[0] <= report_map.WIDTH / 3 + 0.1
+    assert 0 < sheet.bar()[0] <= WIDTH / 3 + 0.1
 
 
 def test_a_world_map_has_meridians_and_parallels() -> None:

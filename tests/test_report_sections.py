@@ -77,11 +77,15 @@ def test_one_image_stands_beside_all_from_the_place_left_farthest_to_those_found
     assert (pairs.places, pairs.mended, pairs.lost) == (3, 2, 1)
 
 
-def test_panels_beyond_the_first_few_unfold() -> None:
+def test_a_few_panels_spread_over_all_are_open_and_the_others_unfold() -> None:
     rows = [result(f"{i:04d}", 1, 0.5 + 0.01 * i) for i in range(20)]
     text = report.render(findings(rows), Extras(title="Town"), lambda keys: {}, panels=15)
     assert text.count('<article class="panel"') == 15
     assert "<summary>9 more hits</summary>" in text
+    opened, folded = (
+        set(map(int, re.findall(r'id="drone-satellite-hit-(\d+)"', half))) for half in text.split("<summary>")
+    )
+    assert (opened, opened | folded) == ({1, 4, 7, 9, 12, 15}, set(range(1, 16)))
     assert report.render(findings(rows), Extras(title="Town"), lambda keys: {}, panels=0).count("<article") == 0
 
 
@@ -102,3 +106,7 @@ def test_the_scatter_keeps_distances_and_lies_within_its_frame() -> None:
     assert drawn.joins.startswith(f"M{first[0]} {first[1]}L")
     assert drawn.triangles.count("z") == 1
     assert drawn.figures[0][:2] == ("Cosine of true pairs", "0.750 (0.50 to 1.00)")
+    untrained = replace(findings(TOWN, name="untrained"), gaps=(GAP | {"distance": 0.5},))
+    assert scatter(GAP, untrained).figures[2][1:] == (
+        "0.125", "in units of a view's spread; 0 where there is no gap; untrained: 0.500",
+    )  # fmt: skip
