@@ -1,6 +1,6 @@
 """The images of an index on the map: where they lie, and how far apart.
 
-In: an opened index. Out: keys, locations and positions of its rows, and the gallery's spacing.
+In: an opened index. Out: keys and positions of its rows, and the gallery's spacing.
 Shapes: N rows, P distinct positions, 2 = latitude and longitude in degrees (NaN where unknown).
 """
 
@@ -24,7 +24,6 @@ class GalleryMap:
     """Rows of an index."""
 
     keys: Words
-    locations: Words
     places_N2: Doubles
     rows: int
     "Of the whole index, of which these may be a sample."
@@ -70,6 +69,5 @@ def gallery_map(index: Index) -> GalleryMap:
         kept_N &= ~(here_N & np.isin(location_N, np.array(part.removed, dtype=np.str_)))
     places_N2 = np.stack([names[name].to_numpy().astype(np.float64) for name in ("lat", "lon")], axis=1)
     return GalleryMap(
-        keys=np.asarray(names["key"].to_pylist(), dtype=np.str_)[kept_N], locations=location_N[kept_N],
-        places_N2=places_N2[kept_N], rows=len(index),
+        keys=np.asarray(names["key"].to_pylist(), dtype=np.str_)[kept_N], places_N2=places_N2[kept_N], rows=len(index)
     )  # fmt: skip
