@@ -14,6 +14,8 @@ from pipeline.records import InputError
 
 EXACT_ROWS = 100_000
 "Rows up to which exact search is fast enough to need no planning."
+GRAPH_ROWS = 500_000
+"Rows up to which a graph is built: it takes several times as long as lists, in one piece."
 PROCESS_BYTES = 300e6
 "Python, FAISS, Arrow and Ray before the first vector."
 BLOCK_BYTES = 4 * 64e6
@@ -95,19 +97,23 @@ class _Family:
     "Recall@10 that is reached with enough breadth: what quantisation leaves."
     refine: Refine = "none"
     on_disk: bool = False
+    graph: bool = False
+    "Built in one piece, for FAISS cannot merge graphs."
     reduces: bool = False
     "Whether it is used behind a projection onto the leading directions, or without one."
 
     def code_bytes(self, dimension: int) -> float:
         """Of one row's code with its id or its links."""
         return {
-            "Flat": 4.0 * dimension, "SQfp16": 2 * dimension + 8.0, "SQ8": dimension + 8.0,
+            "Flat": 4.0 * dimension, "HNSW32,SQ8": dimension + 4.0 * 2 * 32 + 24, "SQ8": dimension + 8.0,
+            "SQfp16": 2 * dimension + 8.0,
             "PQfs": dimension / (2 * PIECE) + 8, "RaBitQ": dimension / 8 + 16, "RaBitQ4": dimension / 2 + 24,
         }[self.name]  # fmt: skip
 
 
 FAMILIES = (
     _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985, refine="table", reduces=True),
+    _Family(name="HNSW32,SQ8", form="HNSW32,SQ8", ceiling=0.985, graph=True),
     _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985),
     _Family(name="PQfs", form="IVF{lists},PQ{pieces}x4fs", ceiling=0.98, refine="table"),
     _Family(name="SQfp16", form="IVF{lists},SQfp16", ceiling=0.999),
@@ -155,20 +161,24 @@ def _plans(gallery: Gallery) -> Iterator[Plan]:
         yield _plan(EXACT, gallery)
     for family in FAMILIES:
         pays = gallery.effective_dimension is not None and gallery.effective_dimension <= gallery.dimension // 2
+        if family.graph and gallery.rows > GRAPH_ROWS:
+            continue
         if (gallery.rows_readable or family.refine == "none") and (pays or not family.reduces):
             yield _plan(family, gallery)
 
 
 def _plan(family: _Family, gallery: Gallery) -> Plan:
     reduced = gallery.effective_dimension if family.reduces and gallery.effective_dimension else gallery.dimension
-    lists = 0 if family is EXACT else _lists(gallery)
+    lists = 0 if family is EXACT or family.graph else _lists(gallery)
     trained = 0 if family is EXACT else _training_rows(gallery, lists)
     code = family.code_bytes(reduced)
     fixed = PROCESS_BYTES + lists * (4.0 * reduced + 64) + 4.0 * gallery.dimension * (reduced if family.reduces else 0)
     codes, masks = gallery.rows * code, MASK_BYTES * gallery.rows
     unit = min(gallery.rows, max(LEAST_UNIT_ROWS, int(gallery.budget * UNIT_SHARE / code / max(1, gallery.workers))))
+    if family.graph:
+        unit = gallery.rows
     part = max(unit, int(gallery.budget * PART_SHARE / code)) if family.on_disk else gallery.rows
-    merging = part * code if family.on_disk else 2 * codes if family.name in ("PQfs", "Flat") else codes
+    merging = part * code if family.on_disk else 2 * codes if family.graph or family.name in ("PQfs", "Flat") else codes
     growing = max(1, gallery.workers) * (fixed + BLOCK_BYTES + 2 * unit * code) + (
         PROCESS_BYTES if gallery.workers else 0
     )
@@ -209,6 +219,7 @@ def _training_rows(gallery: Gallery, lists: int) -> int:
 def _reason(family: _Family, gallery: Gallery, reduced: int, code: float) -> str:
     what = {
         "Flat": f"exact search: {gallery.rows:,} rows are few enough to look at each",
+        "HNSW32,SQ8": "a graph over 8-bit codes",
         "SQfp16": "lists of 16-bit numbers", "SQ8": "lists of 8-bit codes", "PQfs": "lists of 4-bit product codes",
         "RaBitQ": "lists of one-bit codes", "RaBitQ4": "lists of four-bit codes",
     }[family.name]  # fmt: skip
