@@ -114,8 +114,8 @@ class _Family:
 FAMILIES = (
     _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985, refine="table", reduces=True),
     _Family(name="HNSW32,SQ8", form="HNSW32,SQ8", ceiling=0.985, graph=True),
-    _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985),
     _Family(name="PQfs", form="IVF{lists},PQ{pieces}x4fs", ceiling=0.98, refine="table"),
+    _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985),
     _Family(name="SQfp16", form="IVF{lists},SQfp16", ceiling=0.999),
     _Family(name="RaBitQ", form="IVF{lists},RaBitQ", ceiling=0.97, refine="table", on_disk=True),
     _Family(name="RaBitQ4", form="IVF{lists},RaBitQ4", ceiling=0.9),

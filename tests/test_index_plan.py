@@ -76,7 +76,7 @@ def test_few_rows_are_searched_exactly_and_the_sentence_says_so() -> None:
 
 def test_memory_is_what_it_comes_to() -> None:
     """Lists of 8-bit codes of 1,000,000 x 2048 with their ids: 2.056 GB, beside the process and the centroids."""
-    plan = plan_index(Gallery(rows=10**6, dimension=2048, budget=8e9, target_recall=0.95))
+    plan = plan_index(Gallery(rows=10**6, dimension=2048, budget=8e9, target_recall=0.95, rows_readable=False))
     assert plan.factory == "IVF2048,SQ8"
     assert plan.search_bytes == pytest.approx(2.056e9 + 2048 * 2048 * 4 + 300e6, rel=0.01)
     assert plan.why == "lists of 8-bit codes: 2,056 bytes a row"
