@@ -7,7 +7,7 @@ Shapes: Q queries, K rows wanted, D dimensions.
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import faiss
@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from pipeline.feature_rows import RowReader, readable
 from pipeline.features import Floats
-from pipeline.index_facts import Effort, IndexFacts, read_facts
+from pipeline.index_facts import Effort, IndexFacts, as_said, read_facts
 from pipeline.index_part import NOBODY, IndexPart
 from pipeline.metrics import Whole
 from pipeline.records import InputError, View
@@ -61,7 +61,7 @@ class Index:
         Raises InputError when there is no index at `path`, or it is damaged.
         """
         self.path, self.told = path, told or read_facts(path)
-        self.facts: dict[str, Any] = asdict(self.told) | self.told.measured
+        self.facts = as_said(self.told)
         self.dimension = self.told.dimension
         # Ray sets OMP_NUM_THREADS to a task's cores before FAISS is loaded, and in its jobs that is one.
         faiss.omp_set_num_threads(threads or os.cpu_count() or 1)

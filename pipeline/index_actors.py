@@ -4,7 +4,6 @@ The same questions and answers as pipeline/index.py's Index, which it is made of
 Shapes: Q queries, K rows wanted, D dimensions.
 """
 
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ import ray
 from pipeline import cluster, storage
 from pipeline.features import Floats
 from pipeline.index import Hit, Index, hits_of, merged
-from pipeline.index_facts import Effort, read_facts
+from pipeline.index_facts import Effort, as_said, read_facts
 from pipeline.index_part import NOBODY
 from pipeline.metrics import Whole
 from pipeline.records import InputError
@@ -32,7 +31,7 @@ class SpreadIndex:
         Raises InputError when there is no index at `path`, or it is damaged.
         """
         told = read_facts(path)
-        self.facts: dict[str, Any] = asdict(told) | told.measured
+        self.facts = as_said(told)
         self.dimension = told.dimension
         cluster.connect()
         kind: Any = ray.remote(num_cpus=cores)(_Holder)

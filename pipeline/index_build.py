@@ -18,7 +18,7 @@ from pipeline.exclusive import one_at_a_time
 from pipeline.feature_rows import readable
 from pipeline.features import FeatureTable, open_table
 from pipeline.index import Index
-from pipeline.index_facts import FACTS, Effort, IndexFacts, read_facts, write_facts
+from pipeline.index_facts import FACTS, Effort, IndexFacts, as_said, read_facts, write_facts
 from pipeline.index_measure import Held, efforts, hold_queries, speed, tuned
 from pipeline.index_plan import Gallery, Plan, plan_factory, plan_index
 from pipeline.index_training import SPECTRUM_ROWS, effective_dimension, new_index, sample, train
@@ -167,7 +167,7 @@ def finish(out: str, facts: IndexFacts, held: Held, workshop: Workshop, start: f
         f"{out}: {facts.rows} rows, {facts.factory}, recall@10 {at_10:.3f} of exact, "
         f"{measured['queries_per_second']:.0f} queries/s"
     )
-    return Index(out).facts
+    return as_said(facts)
 
 
 def facts_of_all(facts: IndexFacts) -> IndexFacts:
@@ -187,7 +187,7 @@ def _finished(out: str, table: FeatureTable, asked: dict[str, Any]) -> dict[str,
     if told.asked == asked and told.fingerprint == table.fingerprint and held.items() <= now.items():
         if not missing:
             console.print(f"{out} is complete: {told.rows} rows, {told.factory}; nothing to do")
-            return Index(out).facts
+            return as_said(told)
         raise InputError(
             f"{out} holds an index of {len(held)} parts of the table, which has {len(missing)} more by now; say --extend to "
             "add them, or choose another --out"

@@ -88,10 +88,15 @@ class IndexFacts:
     schema_version: int = field(default=SCHEMA_VERSION)
 
 
-def write_facts(folder: str, facts: IndexFacts) -> None:
+def as_said(facts: IndexFacts) -> dict[str, Any]:
+    """The facts as `index.json` has them: what was measured beside the rest."""
     said = asdict(facts)
-    measured = said.pop("measured")
-    storage.write_json(storage.join(folder, FACTS), said | measured)
+    measured: dict[str, Any] = said.pop("measured")
+    return said | measured
+
+
+def write_facts(folder: str, facts: IndexFacts) -> None:
+    storage.write_json(storage.join(folder, FACTS), as_said(facts))
 
 
 def read_facts(folder: str) -> IndexFacts:

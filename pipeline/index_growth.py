@@ -18,7 +18,7 @@ from pipeline.exclusive import one_at_a_time
 from pipeline.features import FeatureTable, open_table
 from pipeline.index import Index
 from pipeline.index_build import finish
-from pipeline.index_facts import IndexFacts, PartFacts, check_files, read_facts, write_facts
+from pipeline.index_facts import IndexFacts, PartFacts, as_said, check_files, read_facts, write_facts
 from pipeline.index_ids import Ids, local_copy
 from pipeline.index_measure import hold_queries
 from pipeline.index_work import Workshop, rows_by_part
@@ -43,7 +43,7 @@ def extend_index(table: str, out: str, workers: int = 0) -> dict[str, Any]:
     added = rows_by_part(chosen.only(missing))
     if not added:
         console.print(f"{out} holds all of {table}: {told.rows} rows; nothing to do")
-        return Index(out).facts
+        return as_said(told)
     faiss.omp_set_num_threads(os.cpu_count() or 1)  # Ray sets OMP_NUM_THREADS in its jobs; this one uses all cores
     check_files(out, told.trained)
     identity = {"extends": [asdict(part) for part in told.parts], "by": chosen.only(missing).digest}
@@ -66,7 +66,8 @@ def remove_locations(out: str, locations: Iterable[str]) -> dict[str, Any]:
     """
     told, wanted = read_facts(out), frozenset(locations)
     with tempfile.TemporaryDirectory() as scratch:
-        parts = [_without(out, part, wanted, scratch) for part in told.parts]
+        thinned = [_without(out, part, wanted, scratch) for part in told.parts]
+    parts = tuple(part for part, _ in thinned)
     gone = {
         name for part, before in zip(parts, told.parts, strict=True) for name in set(part.removed) - {*before.removed}
     }
@@ -76,9 +77,11 @@ def remove_locations(out: str, locations: Iterable[str]) -> dict[str, Any]:
             f"{out} has no rows of {len(unknown)} of the locations to remove, such as {unknown[0]}; nothing was removed; check "
             "their names in its ids.parquet"
         )
-    write_facts(out, replace(told, parts=tuple(parts)))
-    console.print(f"{out}: {len(gone)} locations removed, {len(Index(out)):,} of {told.rows:,} rows answer")
-    return Index(out).facts
+    facts = replace(told, parts=parts)
+    write_facts(out, facts)
+    left = sum(answering for _, answering in thinned)
+    console.print(f"{out}: {len(gone)} locations removed, {left:,} of {told.rows:,} rows answer")
+    return as_said(facts)
 
 
 def verify_index(out: str) -> IndexFacts:
@@ -94,13 +97,14 @@ def verify_index(out: str) -> IndexFacts:
     return told
 
 
-def _without(out: str, part: PartFacts, locations: frozenset[str], scratch: str) -> PartFacts:
-    """The part with those of the locations that it holds among the removed ones."""
+def _without(out: str, part: PartFacts, locations: frozenset[str], scratch: str) -> tuple[PartFacts, int]:
+    """The part with those of the locations that it holds among the removed ones, and how many of its rows answer then."""
     check_files(out, part.files)
     ids = Ids(local_copy(storage.join(out, part.ids), scratch))
     rows = np.flatnonzero(ids.mask(Where(locations=locations)))
     found = set(ids.take(rows, ["location"])["location"].to_pylist())
-    return replace(part, removed=tuple(sorted({*part.removed, *found})))
+    thinned = replace(part, removed=tuple(sorted({*part.removed, *found})))
+    return thinned, part.rows - int(np.count_nonzero(ids.mask(Where(locations=frozenset(thinned.removed)))))
 
 
 def _refuse_another(out: str, told: IndexFacts, table: FeatureTable, held: dict[str, str]) -> None:
