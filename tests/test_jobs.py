@@ -3,6 +3,8 @@
 import json
 import subprocess
 import sys
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import faiss
@@ -20,9 +22,22 @@ def call(job: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
+@pytest.fixture(scope="module")
+def both_cores() -> Iterator[ThreadPoolExecutor]:
+    """Calls that have nothing to do with each other are made by twos: most of each is Python's start."""
+    with ThreadPoolExecutor(2) as pool:
+        yield pool
+
+
+@pytest.fixture(scope="module")
+def helped(both_cores: ThreadPoolExecutor) -> Mapping[str, "Future[subprocess.CompletedProcess[str]]"]:
+    """Every job's answer to --help."""
+    return {job: both_cores.submit(call, job, "--help") for job in JOBS}
+
+
 @pytest.mark.parametrize("job", JOBS)
-def test_every_job_has_help(job: str) -> None:
-    done = call(job, "--help")
+def test_every_job_has_help(helped: Mapping[str, "Future[subprocess.CompletedProcess[str]]"], job: str) -> None:
+    done = helped[job].result()
     assert done.returncode == 0
     assert "--out" in done.stdout
 
@@ -60,15 +75,28 @@ WRONG: list[tuple[str, list[str], str]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("job", "arguments", "sentence"), WRONG, ids=[f"{job}: {said}" for job, _, said in WRONG])
+@pytest.fixture(scope="module")
+def refused(
+    both_cores: ThreadPoolExecutor, tmp_path_factory: pytest.TempPathFactory
+) -> Sequence[tuple[Path, "Future[subprocess.CompletedProcess[str]]"]]:
+    """The answers to the wrong calls, each with the folder that it was made in."""
+    folders = [tmp_path_factory.mktemp("wrong") for _ in WRONG]
+    return [
+        (folder, both_cores.submit(call, job, *(argument.format(folder) for argument in arguments)))
+        for folder, (job, arguments, _) in zip(folders, WRONG, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("number", range(len(WRONG)), ids=[f"{job}: {said}" for job, _, said in WRONG])
 def test_a_wrong_call_gets_a_sentence_and_exit_code_2(
-    tmp_path: Path, job: str, arguments: list[str], sentence: str
+    refused: Sequence[tuple[Path, "Future[subprocess.CompletedProcess[str]]"]], number: int
 ) -> None:
-    done = call(job, *(argument.format(tmp_path) for argument in arguments))
+    folder, answer = refused[number]
+    done = answer.result()
     assert done.returncode == 2
-    assert sentence in done.stderr
+    assert WRONG[number][2] in done.stderr
     assert "Traceback" not in done.stderr
-    assert not (tmp_path / "o").exists()
+    assert not (folder / "o").exists()
 
 
 def test_the_road_by_command_lines_and_again(
