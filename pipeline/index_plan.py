@@ -26,6 +26,8 @@ TRAINING_SHARE = 0.25
 "Of the memory, for the rows that an index is trained on."
 COPIED = 1.75
 "FAISS's residuals and reduced copies of them, the rows themselves included."
+MERGED = 1.3
+"Of the codes, what merging them and reading them back took, as measured with lists of 8-bit codes."
 MOST_TRAINING_ROWS = 2_000_000
 ROWS_PER_LIST = 50  # that train a centroid: FAISS warns below 39 and uses no more than 256
 UNIT_SHARE = 1 / 16
@@ -178,7 +180,13 @@ def _plan(family: _Family, gallery: Gallery) -> Plan:
     if family.graph:
         unit = gallery.rows
     part = max(unit, int(gallery.budget * PART_SHARE / code)) if family.on_disk else gallery.rows
-    merging = part * code if family.on_disk else 2 * codes if family.graph or family.name in ("PQfs", "Flat") else codes
+    merging = (
+        part * code
+        if family.on_disk
+        else 2 * codes
+        if family.graph or family.name in ("PQfs", "Flat")
+        else MERGED * codes
+    )
     growing = max(1, gallery.workers) * (fixed + BLOCK_BYTES + 2 * unit * code) + (
         PROCESS_BYTES if gallery.workers else 0
     )
