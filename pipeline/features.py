@@ -105,6 +105,11 @@ class FeatureTable:
         return hashlib.sha256(json.dumps([self.dimension, list(self.parts), said]).encode()).hexdigest()
 
     @property
+    def shards(self) -> dict[str, str]:
+        """Of each part the hash of the shard that was embedded, in the table's order."""
+        return {name: footer.shard_sha256 for name, footer in zip(self.parts, self.footers, strict=True)}
+
+    @property
     def views(self) -> list[View]:
         """The views that rows of the selected splits and views have."""
         return sorted({view for view, _ in self._kinds()})

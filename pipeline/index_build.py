@@ -143,7 +143,8 @@ def finish(out: str, facts: IndexFacts, held: Held, workshop: Workshop, start: f
     """Find the effort that reaches the recall, write what the index is, and clear the workshop. Returns its facts."""
     size = sum(each["bytes"] for part in facts.parts for name, each in part.files.items() if name.endswith(".faiss"))
     built = round(time.perf_counter() - start, 3)
-    index = Index(out, told=facts_of_all(facts))
+    whole = replace(facts, parts=tuple(replace(part, removed=()) for part in facts.parts))
+    index = Index(out, told=whole)  # measured as if nothing had been removed: exact search knows of no removals
     effort, at_1, at_10 = tuned(
         index, held, efforts(new_index(facts.factory, facts.dimension), facts.refine), facts.target_recall
     )
@@ -170,21 +171,15 @@ def finish(out: str, facts: IndexFacts, held: Held, workshop: Workshop, start: f
     return as_said(facts)
 
 
-def facts_of_all(facts: IndexFacts) -> IndexFacts:
-    """The index as if nothing had been removed: what it is measured by."""
-    return replace(facts, parts=tuple(replace(part, removed=()) for part in facts.parts))
-
-
 def _finished(out: str, table: FeatureTable, asked: dict[str, Any]) -> dict[str, Any]:
     """A finished index of the same rows and settings.
 
     Raises InputError where it is another's.
     """
     told = read_facts(out)
-    held = {name: shard for part in told.parts for name, shard in part.table_parts.items()}
-    now = {name: footer.shard_sha256 for name, footer in zip(table.parts, table.footers, strict=True)}
+    held = told.table_parts
     missing = rows_by_part(table.only([name for name in table.parts if name not in held]))
-    if told.asked == asked and told.fingerprint == table.fingerprint and held.items() <= now.items():
+    if told.asked == asked and told.fingerprint == table.fingerprint and held.items() <= table.shards.items():
         if not missing:
             console.print(f"{out} is complete: {told.rows} rows, {told.factory}; nothing to do")
             return as_said(told)

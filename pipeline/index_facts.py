@@ -87,6 +87,11 @@ class IndexFacts:
     "The trained index without rows, which growing copies: name, and its `bytes` and `sha256`."
     schema_version: int = field(default=SCHEMA_VERSION)
 
+    @property
+    def table_parts(self) -> dict[str, str]:
+        """All parts of the table that it holds, in the order of its rows, each with its shard's hash."""
+        return {name: shard for part in self.parts for name, shard in part.table_parts.items()}
+
 
 def as_said(facts: IndexFacts) -> dict[str, Any]:
     """The facts as `index.json` has them: what was measured beside the rest."""

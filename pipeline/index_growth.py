@@ -37,8 +37,8 @@ def extend_index(table: str, out: str, workers: int = 0) -> dict[str, Any]:
     told, whole = read_facts(out), open_table(table)
     split, view = told.asked["split"], told.asked["view"]
     chosen = whole.select(Split(split) if split else None, View(view) if view else None)
-    held = {name: shard for part in told.parts for name, shard in part.table_parts.items()}
-    _refuse_another(out, told, chosen, held)
+    _refuse_another(out, told, chosen)
+    held = told.table_parts
     missing = [name for name in chosen.parts if name not in held]
     added = rows_by_part(chosen.only(missing))
     if not added:
@@ -107,14 +107,14 @@ def _without(out: str, part: PartFacts, locations: frozenset[str], scratch: str)
     return thinned, part.rows - int(np.count_nonzero(ids.mask(Where(locations=frozenset(thinned.removed)))))
 
 
-def _refuse_another(out: str, told: IndexFacts, table: FeatureTable, held: dict[str, str]) -> None:
+def _refuse_another(out: str, told: IndexFacts, table: FeatureTable) -> None:
     """Raise InputError where a table is not the one that the index was built from, with more."""
     if told.fingerprint != table.fingerprint:
         raise InputError(
             f"{out} is of network {told.fingerprint[:12]} and {table.path} of {table.fingerprint[:12]}; expected one; embed "
             "with the index's network (jobs/embed_gallery.py --checkpoint), or build another index"
         )
-    now = {name: footer.shard_sha256 for name, footer in zip(table.parts, table.footers, strict=True)}
+    held, now = told.table_parts, table.shards
     changed = sorted(name for name, shard in held.items() if now.get(name) != shard)
     if changed:
         raise InputError(

@@ -51,7 +51,6 @@ class Gallery:
     "Bytes that building or searching may take, the process included."
     target_recall: float
     "Recall@10 against exact search."
-    cores: int = 1
     effective_dimension: int | None = None
     "Leading directions that hold nearly all of the vectors' length; None where not known."
     workers: int = 0
@@ -101,6 +100,8 @@ class _Family:
     on_disk: bool = False
     graph: bool = False
     "Built in one piece, for FAISS cannot merge graphs."
+    merging: float = MERGED
+    "Its codes' room, while units become one, as a multiple of the codes: appended ones double."
     reduces: bool = False
     "Whether it is used behind a projection onto the leading directions, or without one."
 
@@ -115,15 +116,15 @@ class _Family:
 
 FAMILIES = (
     _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985, refine="table", reduces=True),
-    _Family(name="HNSW32,SQ8", form="HNSW32,SQ8", ceiling=0.985, graph=True),
-    _Family(name="PQfs", form="IVF{lists},PQ{pieces}x4fs", ceiling=0.98, refine="table"),
+    _Family(name="HNSW32,SQ8", form="HNSW32,SQ8", ceiling=0.985, graph=True, merging=2),
+    _Family(name="PQfs", form="IVF{lists},PQ{pieces}x4fs", ceiling=0.98, refine="table", merging=2),
     _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985),
     _Family(name="SQfp16", form="IVF{lists},SQfp16", ceiling=0.999),
     _Family(name="RaBitQ", form="IVF{lists},RaBitQ", ceiling=0.97, refine="table", on_disk=True),
     _Family(name="RaBitQ4", form="IVF{lists},RaBitQ4", ceiling=0.9),
     _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985, on_disk=True),
 )
-EXACT = _Family(name="Flat", form="Flat", ceiling=1.0)
+EXACT = _Family(name="Flat", form="Flat", ceiling=1.0, merging=2)
 
 
 def plan_index(gallery: Gallery) -> Plan:
@@ -161,11 +162,11 @@ def _plans(gallery: Gallery) -> Iterator[Plan]:
     """Every family that suits the gallery, the fastest first, whatever it takes."""
     if gallery.rows <= EXACT_ROWS:
         yield _plan(EXACT, gallery)
+    pays = gallery.effective_dimension is not None and gallery.effective_dimension <= gallery.dimension // 2
     for family in FAMILIES:
-        pays = gallery.effective_dimension is not None and gallery.effective_dimension <= gallery.dimension // 2
-        if family.graph and gallery.rows > GRAPH_ROWS:
-            continue
-        if (gallery.rows_readable or family.refine == "none") and (pays or not family.reduces):
+        readable = gallery.rows_readable or family.refine == "none"
+        buildable = gallery.rows <= GRAPH_ROWS or not family.graph
+        if readable and buildable and (pays or not family.reduces):
             yield _plan(family, gallery)
 
 
@@ -180,20 +181,13 @@ def _plan(family: _Family, gallery: Gallery) -> Plan:
     if family.graph:
         unit = gallery.rows
     part = max(unit, int(gallery.budget * PART_SHARE / code)) if family.on_disk else gallery.rows
-    merging = (
-        part * code
-        if family.on_disk
-        else 2 * codes
-        if family.graph or family.name in ("PQfs", "Flat")
-        else MERGED * codes
-    )
+    merging = part * code if family.on_disk else family.merging * codes
     growing = max(1, gallery.workers) * (fixed + BLOCK_BYTES + 2 * unit * code) + (
         PROCESS_BYTES if gallery.workers else 0
     )
     return Plan(
         factory=(f"PCA{reduced}," if family.reduces else "") + form_of(family, lists, reduced),
-        refine=family.refine, on_disk=family.on_disk, training_rows=trained, unit_rows=unit,
-        part_rows=part,
+        refine=family.refine, on_disk=family.on_disk, training_rows=trained, unit_rows=unit, part_rows=part,
         search_bytes=fixed + masks + (0 if family.on_disk else codes),
         build_bytes=max(growing, fixed + BLOCK_BYTES + max(merging, COPIED * 4.0 * trained * gallery.dimension)),
         expected_recall=family.ceiling,

@@ -127,7 +127,7 @@ class Workshop:
         names = (f"index{ending}.faiss", *ids.values())
         return PartFacts(
             faiss=names[0], ids=ids["arrow"], first_row=first_row, rows=sum(unit.rows for unit in units),
-            table_parts={name: footer.shard_sha256 for name, footer in zip(table.parts, table.footers, strict=True)},
+            table_parts=table.shards,
             files={name: measure_file(self._out, name) for name in names},
         )  # fmt: skip
 
