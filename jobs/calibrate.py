@@ -10,6 +10,7 @@ from itertools import islice
 import numpy as np
 
 from jobs.cli import run
+from jobs.encoders import read_checkpoint
 from jobs.photo_encoder import PhotoEncoder
 from model.checkpoint import loads
 from pipeline import storage
@@ -68,11 +69,7 @@ def calibrate_index(settings: Settings) -> Confidence:
     if there and (there.asked, there.gallery, there.tolerance_m, there.outside) == wanted:
         console.print(f"{out} is complete; nothing to do")
         return there
-    if not storage.exists(settings.checkpoint):
-        raise InputError(
-            f"no checkpoint at {settings.checkpoint}; expected a last.pt of jobs/train.py; check --checkpoint"
-        )
-    data = storage.read_bytes(settings.checkpoint)
+    data = read_checkpoint(settings.checkpoint)
     encoder = PhotoEncoder(data, settings.checkpoint, index.facts, settings.shards)
     trained_on = frozenset(loads(data, settings.checkpoint).locations)
     photos = embedded(settings, encoder, settings.view, trained_on, settings.photos)

@@ -3,10 +3,9 @@
 from dataclasses import dataclass, fields
 
 from jobs.cli import run
-from jobs.encoders import EncoderSettings, network_of
+from jobs.encoders import EncoderSettings, network_of, read_checkpoint
 from pipeline import storage
 from pipeline.embed import EmbeddingSettings, embed_gallery
-from pipeline.records import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,15 +18,12 @@ class Settings(EmbeddingSettings, EncoderSettings):
 
 def main(settings: Settings) -> None:
     """Embed shards into a feature table, one part per shard; finished parts are skipped."""
-    if not storage.exists(settings.checkpoint):
-        raise InputError(
-            f"no checkpoint at {settings.checkpoint}; expected a last.pt of jobs/train.py; check --checkpoint"
-        )
+    checkpoint = read_checkpoint(settings.checkpoint)
     given = {field.name: getattr(settings, field.name) for field in fields(EmbeddingSettings)}
     given |= {"shards": storage.absolute(settings.shards), "out": storage.absolute(settings.out)}
     embedding = EmbeddingSettings(**given)
     encoder = EncoderSettings(**{field.name: getattr(settings, field.name) for field in fields(EncoderSettings)})
-    network = network_of(storage.read_bytes(settings.checkpoint), settings.checkpoint, embedding, encoder)
+    network = network_of(checkpoint, settings.checkpoint, embedding, encoder)
     embed_gallery(embedding, network)
 
 

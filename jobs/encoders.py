@@ -17,6 +17,7 @@ from model.checkpoint import build_encoder, fingerprint, loads
 from model.fast import make_fast
 from model.inference import InEffect, Precision, effective_precision, with_precision
 from model.int8 import PrecisionError, calibration_digest, require_int8
+from pipeline import storage
 from pipeline.embed import EmbeddingSettings, Network
 from pipeline.features import Floats
 from pipeline.foreign import open_manifest
@@ -59,6 +60,16 @@ class Blueprint:
     "That each worker will embed, about."
     probe_B3HW: Bytes
     calibration_B3HW: Bytes | None
+
+
+def read_checkpoint(path: str) -> bytes:
+    """The bytes of a checkpoint.
+
+    Raises InputError when there is none.
+    """
+    if not storage.exists(path):
+        raise InputError(f"no checkpoint at {path}; expected a last.pt of jobs/train.py; check --checkpoint")
+    return storage.read_bytes(path)
 
 
 class Embedder:

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jobs.cli import run
+from jobs.encoders import read_checkpoint
 from jobs.photo_encoder import PhotoEncoder
 from jobs.photos import Query, read_photos, together
 from pipeline import answer_files, rejects, storage
@@ -103,13 +104,10 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
     `truths`: where photos were really taken, by name, for the page. Raises InputError and CheckpointError on unusable input.
     """
     photos = find_photos(settings.photos)
-    if not storage.exists(settings.checkpoint):
-        raise InputError(
-            f"no checkpoint at {settings.checkpoint}; expected a last.pt of jobs/train.py; check --checkpoint"
-        )
+    checkpoint = read_checkpoint(settings.checkpoint)
     index = Index(settings.index)
     confidence = confidence_of(settings, index)
-    encoder = PhotoEncoder(storage.read_bytes(settings.checkpoint), settings.checkpoint, index.facts, settings.shards)
+    encoder = PhotoEncoder(checkpoint, settings.checkpoint, index.facts, settings.shards)
     gallery = gallery_map(index)
     queries = read_photos(photos, encoder)
     if settings.together:
