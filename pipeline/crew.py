@@ -14,6 +14,8 @@ from typing import Any
 import ray
 from ray.exceptions import RayError, RayTaskError
 
+from pipeline import cluster
+
 STRIKES = 3
 "Deaths over one item after which it is not tried again."
 FIRST_LOST = 5
@@ -65,6 +67,8 @@ class CannotWork(RuntimeError):
 @dataclass(eq=False)
 class _Worker:
     actor: Any
+    created: Any
+    "Reference to its first call, which ends as soon as it lives."
     starting: Any
     "Reference to the end of `start`; None once it is there."
     since: float = 0.0
@@ -113,13 +117,15 @@ class Crew:
 
     def _hire(self) -> None:
         actor = self.terms.hire()
-        self._workers.append(_Worker(actor, actor.start.remote()))
+        self._workers.append(_Worker(actor, actor.__ray_ready__.remote(), actor.start.remote()))
 
     def _dismiss(self, worker: _Worker) -> None:
         self._workers.remove(worker)
         if worker.starting is None:
             self.seconds += time.monotonic() - worker.since
-        ray.kill(worker.actor)
+            cluster.end_actor(worker.actor, worker.created)
+        else:
+            cluster.end_actor(worker.actor, worker.created, worker.starting)
 
     def _hand_out(self) -> None:
         while self._fresh or self._suspects:

@@ -37,8 +37,9 @@ class SpreadIndex:
         kind: Any = ray.remote(num_cpus=cores)(_Holder)
         shares = np.array_split(np.arange(len(told.parts)), min(actors, len(told.parts)))
         self._actors = [kind.remote(storage.absolute(path), share.tolist(), cores) for share in shares]
+        self._counts = [actor.rows.remote() for actor in self._actors]
         try:
-            self._rows: int = sum(_got([actor.rows.remote() for actor in self._actors]))
+            self._rows: int = sum(_got(self._counts))
         except InputError:
             self.close()
             raise
@@ -54,9 +55,9 @@ class SpreadIndex:
         return self._rows
 
     def close(self) -> None:
-        for actor in self._actors:
-            ray.kill(actor)
-        self._actors = []
+        for actor, count in zip(self._actors, self._counts, strict=True):
+            cluster.end_actor(actor, count)
+        self._actors, self._counts = [], []
 
     def search(
         self, queries_QD: Floats, k: int = 10, where: Where | None = None, effort: Effort | None = None

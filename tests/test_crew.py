@@ -1,11 +1,13 @@
 """A crew of actors: every item once, whoever dies, and nobody waits for those who have not come."""
 
 import os
+import time
 from typing import Any
 
 import pytest
 import ray
 
+from pipeline import cluster
 from pipeline.crew import CannotWork, Crew, NobodyCame, SetAside, Terms
 
 
@@ -63,3 +65,19 @@ def test_those_that_have_not_come_keep_nobody_from_working(ray_cluster: None) ->
     assert len(list(crew.work(range(10)))) == 10
     with pytest.raises(NobodyCame, match="no worker has started for 1 s; each asks for a little"):
         list(Crew(terms(cpus=1000, patience=1.0)).work(range(3)))
+
+
+def test_actors_that_are_still_starting_at_the_end_give_their_places_back(ray_cluster: None) -> None:
+    for patience in (0.2, 1.0):
+        slow = terms(start=lambda: time.sleep(60), cpus=1, patience=patience)
+        with pytest.raises(NobodyCame):
+            list(Crew(slow).work([1, 2]))
+    until = time.monotonic() + 30
+    while free_cpus() < cluster.cpus() and time.monotonic() < until:
+        time.sleep(0.1)
+    assert free_cpus() == cluster.cpus()
+
+
+def free_cpus() -> float:
+    free: dict[str, float] = ray.available_resources()  # type: ignore[no-untyped-call]
+    return free.get("CPU", 0.0)
