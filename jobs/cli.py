@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import tyro
+from ray.exceptions import RayError, RayTaskError
 
 from model.checkpoint import CheckpointError
 from pipeline.progress import console
@@ -29,6 +30,14 @@ def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lamb
         sys.exit(2)
     except Unfinished as error:
         _say(str(error))
+        sys.exit(1)
+    except OSError as error:  # no place on the disk, a file that cannot be read, a cluster that does not answer
+        _say(f"{error}; mend that and run the same command again to go on")
+        sys.exit(1)
+    except RayError as error:
+        if isinstance(error, RayTaskError):
+            raise
+        _say(f"lost Ray's cluster or a worker ({type(error).__name__}); run the same command again to go on")
         sys.exit(1)
     except KeyboardInterrupt:
         console.print("stopped; run the same command again to go on")

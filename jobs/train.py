@@ -5,12 +5,14 @@ RUN/tensorboard. Killed, it goes on from the last checkpoint when run again; whe
 """
 
 import threading
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import torch
 import tyro
+from ray.exceptions import RayActorError
 from ray.train import RunConfig, ScalingConfig, WorkerGroupError, get_context
 from ray.train.torch import TorchTrainer, get_device
 from ray.util.queue import Queue
@@ -128,10 +130,11 @@ def train_on_ray(this: Run, settings: Settings, meter: Meter) -> None:
         try:
             train_group(this, scaling, cpus, meter)
             break
-        except WorkerGroupError as error:
+        except (WorkerGroupError, RayActorError) as error:
             if failures > settings.max_failures:
                 raise
-            lost = ", ".join(sorted({type(failure).__name__ for failure in error.worker_failures.values()}))
+            failed = error.worker_failures.values() if isinstance(error, WorkerGroupError) else [error]
+            lost = ", ".join(sorted({type(failure).__name__ for failure in failed}))
             meter.note(
                 f"lost a worker ({lost}); going on from the last checkpoint, {failures} of {settings.max_failures}"
             )
@@ -154,16 +157,22 @@ def train_group(this: Run, scaling: ScalingConfig, cpus: int, meter: Meter) -> N
     )
     try:
         trainer.fit()
-    except WorkerGroupError:
-        told.put(None)
-        listener.join()  # all has been heard
+    except (WorkerGroupError, RayActorError):
+        hang_up(told, listener)  # all has been heard
         if refused:
             raise refused[0] from None
         raise
     finally:
+        hang_up(told, listener)
+        with suppress(RayActorError):
+            told.shutdown()
+
+
+def hang_up(told: Queue, listener: threading.Thread) -> None:
+    """Let the listener hear what is still in the queue, and end. Where the queue's actor was lost, it has ended already."""
+    with suppress(RayActorError):
         told.put(None)
-        listener.join()
-        told.shutdown()
+    listener.join()
 
 
 def ray_worker(config: dict[str, Any]) -> None:
@@ -204,12 +213,13 @@ def gather(damage: Damage) -> list[Damage]:
 
 
 def listen(told: Queue, meter: Meter, refused: list[Exception]) -> None:
-    """Show what the workers tell until None comes; keep why they cannot go on."""
-    while (facts := told.get()) is not None:
-        if "refused" in facts:
-            refused.append(facts["refused"])
-        else:
-            show(meter, facts)
+    """Show what the workers tell until None comes, or the queue's actor is lost; keep why they cannot go on."""
+    with suppress(RayActorError):
+        while (facts := told.get()) is not None:
+            if "refused" in facts:
+                refused.append(facts["refused"])
+            else:
+                show(meter, facts)
 
 
 def show(meter: Meter, told: dict[str, Any]) -> None:

@@ -7,8 +7,10 @@ from itertools import islice
 from typing import Any, TypeVar
 
 import ray
+from ray.exceptions import RayTaskError
 
 from pipeline.placement import Node
+from pipeline.records import Unfinished
 
 Item = TypeVar("Item")
 
@@ -17,7 +19,8 @@ def connect() -> None:
     """Join the cluster that RAY_ADDRESS names (`ray job submit` sets it) or that `ray start` began on this machine, else
     start one for this process. Idempotent.
 
-    Workers' output stays in Ray's session folder: what a worker has to say comes back as a result or an exception.
+    Workers' output stays in Ray's session folder: what a worker has to say comes back as a result or an exception. Raises
+    Unfinished where no cluster answers and none can be started.
     """
     if ray.is_initialized():
         return
@@ -25,7 +28,14 @@ def connect() -> None:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's coming default; unset, each init warns
     # A token for a local cluster is what we want, and no news.
     logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
-    ray.init(log_to_driver=False, logging_level=logging.WARNING)
+    try:
+        ray.init(log_to_driver=False, logging_level=logging.WARNING)
+    except Exception as error:  # Ray raises ConnectionError, RuntimeError, ValueError and plain Exception here
+        asked = f"at {address}" if (address := os.environ.get("RAY_ADDRESS")) else "on this machine"
+        raise Unfinished(
+            f"found no Ray cluster {asked}, and none could be started ({str(error).strip().splitlines()[0]}); expected one "
+            "that answers; see to it, or unset RAY_ADDRESS so that one is started here, and run the same command again"
+        ) from error
 
 
 def cpus() -> int:
@@ -70,14 +80,17 @@ def bounded(
 ) -> Iterator[tuple[Item, Any]]:
     """Call `submit` on every item with at most `window` calls in flight; yield (item, result) as they finish.
 
-    An exception in a call is raised here, after nothing new has been submitted.
+    An exception in a call is raised here as it is, after nothing new has been submitted.
     """
     waiting = iter(items)
     running: dict[Any, Item] = {submit(item): item for item in islice(waiting, window)}
     while running:
         [done], _ = ray.wait(list(running), num_returns=1)
         item = running.pop(done)
-        result = ray.get(done)
+        try:
+            result = ray.get(done)
+        except RayTaskError as error:
+            raise error.cause or error from error
         for following in islice(waiting, 1):
             running[submit(following)] = following
         yield item, result

@@ -99,15 +99,13 @@ def write_shard(
 def read_member(record: ImageRecord, source: Source, check: Check) -> Member:
     """An image's bytes, never encoded again, and what the tar says of them.
 
-    Raises DecodeError when they are no image, or cannot be read.
+    Raises DecodeError when they are no image, or cannot be read, and are neither when they are read once more: a storage
+    that fails for a moment costs no image.
     """
     try:
-        data = source.read(record)
-    except OSError as error:
-        raise DecodeError(UNREADABLE, str(error)) from None
-    width, height = inspect(data)
-    if check == "full":
-        decode(data)
+        data, (width, height) = _judged(record, source, check)
+    except DecodeError:
+        data, (width, height) = _judged(record, source, check)
     facts = {
         "key": record.key, "location": record.location, "view": record.view, "split": record.split,
         "variant": record.variant,
@@ -115,6 +113,18 @@ def read_member(record: ImageRecord, source: Source, check: Check) -> Member:
         "source": name_of(source), "sha256": hashlib.sha256(data).hexdigest(), "width": width, "height": height,
     }  # fmt: skip
     return Member(name=f"{record.key}.{source.ending(record)}", data=data, facts=facts)
+
+
+def _judged(record: ImageRecord, source: Source, check: Check) -> tuple[bytes, tuple[int, int]]:
+    """An image's bytes, with its width and height."""
+    try:
+        data = source.read(record)
+    except OSError as error:
+        raise DecodeError(UNREADABLE, str(error)) from None
+    size = inspect(data)
+    if check == "full":
+        decode(data)
+    return data, size
 
 
 def header(name: str, size: int) -> bytes:

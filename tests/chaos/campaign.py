@@ -1,0 +1,316 @@
+"""The campaign: a stage runs, meets faults, is run again by the same command, and its content is compared.
+
+A trial's verdict is by content: what the stage has written in the end equals what an undisturbed run wrote. Where a run
+refuses, what its sentence asks for is done: a damaged input is put back (the stage before it makes it again), a damaged
+output that it names is deleted.
+"""
+
+import json
+import os
+import random
+import re
+import shutil
+import signal
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from faults import DAMAGE, KILLS, PLACES, STORAGE, Damaged, damage
+from launcher import PATH, Ended, Job, Launcher
+from processes import cluster, daemons, strike, working
+from stages import Content, Stage
+
+PATIENCE = 180.0
+"Seconds after which a run counts as hung."
+TRIES = 6
+"Runs after the faults in which the stage has to come to its end."
+PASSED_OVER = ("tensorboard", "ray", "job.log", ".parts")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """One trial: which fault the stage meets."""
+
+    stage: Stage
+    kind: str
+    "Of KILLS, STORAGE or DAMAGE."
+    place: str = ""
+    "Of PLACES, for damage."
+    seed: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.place} {self.kind}".strip()
+
+
+@dataclass
+class Verdict:
+    """What came of a trial."""
+
+    case: Case
+    faults: int = 0
+    "That were injected: a kill that came too late counts as none."
+    runs: int = 0
+    found: str = ""
+    "How damage was noticed: by default, by --verify, or it made no difference."
+    lost: list[str] = field(default_factory=list)
+    "Content that is missing in the end, or another than it should be."
+    doubled: list[str] = field(default_factory=list)
+    "Content that should not be there."
+    hangs: int = 0
+    unclear: list[str] = field(default_factory=list)
+    "Last lines of runs that ended in a traceback instead of a sentence."
+    restart_seconds: float = 0.0
+    "Of the run that came to the end, over an undisturbed run's."
+
+    @property
+    def bad(self) -> bool:
+        return bool(self.lost or self.doubled or self.hangs or self.unclear)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Undisturbed:
+    """A stage's run without faults."""
+
+    content: Content
+    seconds: Mapping[bool, float]
+    "By whether Ray's workers did it."
+    operations: Mapping[str, int]
+    "On files, by kind."
+
+
+class Ground:
+    """Where the stages run: the folders as they should be, and the one that is spoilt."""
+
+    def __init__(self, scratch: Path, environment: Mapping[str, str], head: int, address: str) -> None:
+        self.here, self._pristine = scratch / "here", scratch / "pristine"
+        self._spec, self._counter = scratch / "fault.json", scratch / "operations"
+        self._launcher = Launcher(scratch, {**environment, "CHAOS": str(self._spec)})
+        self._head, self._address = head, address
+        self._known: dict[str, Undisturbed] = {}
+
+    def close(self) -> None:
+        self._launcher.close()
+
+    def prepare(self, stage: Stage, without: bool = True) -> None:
+        """Lay out what a stage reads, and nothing else."""
+        shutil.rmtree(self.here, ignore_errors=True)
+        self.here.mkdir(parents=True)
+        self._spec.unlink(missing_ok=True)
+        for name in (*stage.reads, *([] if without else [stage.writes])):
+            shutil.copytree(self._pristine / name, self.here / name)
+
+    def start(self, stage: Stage, spread: bool, own_cluster: bool = False, guarded: bool = False) -> Job:
+        address = "local" if own_cluster else self._address
+        return self._launcher.start(stage.job, stage.command(self.here, spread, guarded), RAY_ADDRESS=address)
+
+    def run(self, stage: Stage, spread: bool, guarded: bool = False) -> Ended:
+        return self.start(stage, spread, guarded=guarded).end(PATIENCE)
+
+    def check(self, stage: Stage) -> Ended:
+        """The stage's own check of every byte that it wrote."""
+        assert stage.verify
+        words = stage.verify.format(here=self.here).split()
+        return self._launcher.start(stage.job, words, RAY_ADDRESS=self._address).end(PATIENCE)
+
+    def victims(self, job: Job, kind: str) -> list[int]:
+        """Who may be killed."""
+        if kind.startswith("driver"):
+            return [job.pid]
+        return daemons(job.pid) if kind.startswith("cluster") else working(self._head) + working(job.pid)
+
+    def arm(self, kind: str, at: int) -> None:
+        """The operation on files with this number meets a fault."""
+        self._counter.unlink(missing_ok=True)
+        said = {
+            "kind": kind,
+            "at": at,
+            "under": str(self.here),
+            "counter": str(self._counter),
+            "counts": [STORAGE[kind]],
+        }
+        self._spec.write_text(json.dumps(said))
+
+    def disarm(self) -> int:
+        """No more faults; how many operations there were."""
+        self._spec.unlink(missing_ok=True)
+        return self._counter.stat().st_size if self._counter.exists() else 0
+
+    def undisturbed(self, stage: Stage) -> Undisturbed:
+        """How the stage runs without faults, and its content, which the stages after it read."""
+        if stage.name not in self._known:
+            seconds, operations = dict[bool, float](), dict[str, int]()
+            for spread, kind in ((True, "disk full"), (False, "read fails")):
+                self.prepare(stage)
+                self.arm(kind, -1)
+                ended = self.run(stage, spread)
+                if ended.code != 0:
+                    raise RuntimeError(f"{stage.name} does not run undisturbed: {ended.said[-2000:]}")
+                seconds[spread], operations[STORAGE[kind]] = ended.seconds, self.disarm()
+            content = stage.held(self.here)
+            shutil.copytree(self.here / stage.writes, self._pristine / stage.writes)
+            self._known[stage.name] = Undisturbed(content=content, seconds=seconds, operations=operations)
+        return self._known[stage.name]
+
+
+ENVIRONMENT = {"RAY_AUTH_MODE": "disabled", "RAY_USAGE_STATS_ENABLED": "0", "OMP_WAIT_POLICY": "PASSIVE"}
+
+
+@contextmanager
+def ground(scratch: Path) -> Iterator[Ground]:
+    """A ground in a folder, with a Ray cluster of its own."""
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    scratch = scratch.resolve()
+    hook = {"CHAOS": str(scratch / "fault.json"), "PYTHONPATH": os.pathsep.join(PATH)}
+    with cluster(2, ENVIRONMENT | hook) as (head, address):
+        made = Ground(scratch, ENVIRONMENT, head, address)
+        try:
+            yield made
+        finally:
+            made.close()
+
+
+def cases(stage: Stage, seed: int) -> list[Case]:
+    """One trial of every fault that the stage can meet."""
+    kills = [Case(stage=stage, kind=kind, seed=seed) for kind in KILLS]
+    storage = [Case(stage=stage, kind=kind, seed=seed) for kind in STORAGE if stage.reads or STORAGE[kind] == "write"]
+    damages = [
+        Case(stage=stage, kind=kind, place=place, seed=seed)
+        for place in PLACES
+        if stage.reads or place != "input"
+        for kind in DAMAGE
+    ]
+    return [case for case in kills + storage + damages if not any(word in case.name for word in stage.blind)]
+
+
+def trial(ground: Ground, case: Case) -> Verdict:
+    """Let a stage meet a fault, bring it to its end, and judge."""
+    stage, rng, verdict = case.stage, random.Random(repr((case.stage.name, case.name, case.seed))), Verdict(case)
+    usual = ground.undisturbed(stage)
+    damaged: list[Damaged] = []
+    if case.kind in KILLS:
+        ground.prepare(stage)
+        _kill(ground, case, rng, usual, verdict)
+    elif case.kind in STORAGE:
+        ground.prepare(stage)
+        _spoil_operation(ground, case, rng, usual, verdict)
+    else:
+        damaged = _damage(ground, case, rng, usual, verdict)
+    _bring_to_its_end(ground, case, usual, verdict, damaged)
+    return verdict
+
+
+def _kill(ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, verdict: Verdict) -> None:
+    """Up to three kills at random moments, of workers; one of the driver or of the cluster."""
+    spread = not case.kind.startswith("driver") or rng.random() < 0.5 or not case.stage.alone
+    own = case.kind.startswith("cluster")
+    job = ground.start(case.stage, spread, own_cluster=own)
+    extent = usual.seconds[spread] + (6.0 if own else 0.0)
+    for moment in sorted(rng.uniform(0, extent) for _ in range(3 if case.kind.startswith("worker") else 1)):
+        if job.wait(moment):
+            break
+        while not (victims := ground.victims(job, case.kind)) and not job.wait(job.seconds + 0.02):
+            pass
+        verdict.faults += bool(victims) and strike(rng.choice(victims), KILLS[case.kind])
+    _judge_run(verdict, job.end(PATIENCE))
+
+
+def _spoil_operation(ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, verdict: Verdict) -> None:
+    count = max(1, usual.operations[STORAGE[case.kind]])
+    at = rng.randrange(count)
+    ground.arm(case.kind, at)
+    ended = ground.run(case.stage, spread=rng.random() < 0.5 or not case.stage.alone)
+    verdict.faults += ground.disarm() > at
+    _judge_run(verdict, ended)
+
+
+def _damage(ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, verdict: Verdict) -> list[Damaged]:
+    """Spoil a file: of the input, before a run or during it; of the finished output; of what a killed run left."""
+    stage = case.stage
+    ground.prepare(stage, without=case.place != "output")
+    if case.place == "input":
+        during = rng.random() < 0.5
+        folder = ground.here / rng.choice(stage.reads)
+        job = ground.start(stage, spread=False) if during else None
+        if job is not None:
+            job.wait(rng.uniform(0, usual.seconds[False]))
+        spoilt = damage(folder, case.kind, rng, PASSED_OVER)
+        ended = job.end(PATIENCE) if job is not None else ground.run(stage, spread=False)
+        _judge_run(verdict, ended)
+        verdict.found = "by default" if ended.code else ""
+    else:
+        if case.place == "unfinished output":
+            job = ground.start(stage, spread=False)
+            job.wait(rng.uniform(0.2, 1.0) * usual.seconds[False])
+            strike(job.pid, signal.SIGKILL)
+            _judge_run(verdict, job.end(PATIENCE))
+        spoilt = damage(ground.here / stage.writes, case.kind, rng, PASSED_OVER)
+    verdict.faults += spoilt is not None
+    return [spoilt] if spoilt is not None else []
+
+
+def _bring_to_its_end(ground: Ground, case: Case, usual: Undisturbed, verdict: Verdict, damaged: list[Damaged]) -> None:
+    """Run the same command until it succeeds, doing what its sentences ask for, and compare."""
+    stage = case.stage
+    for _ in range(TRIES):
+        ended = ground.run(stage, spread=False)
+        _judge_run(verdict, ended)
+        if ended.code != 0:
+            verdict.found = verdict.found or "by default"
+            _mend(ground, case, ended, damaged)
+            continue
+        verdict.restart_seconds = max(0.0, ended.seconds - usual.seconds[False])
+        wrong = _differences(ground, stage, usual)
+        if not any(wrong):
+            verdict.found = verdict.found or ("no difference" if damaged else "")
+            return
+        checked = _look_closely(ground, case, damaged)
+        if checked is None or checked.code == 0:
+            verdict.lost, verdict.doubled = wrong
+            return
+        verdict.found = "by --verify"
+        _mend(ground, case, checked, damaged)
+    verdict.lost = [f"no end after {TRIES} runs: {ended.said.strip().splitlines()[-1:]}"]
+
+
+def _look_closely(ground: Ground, case: Case, damaged: list[Damaged]) -> Ended | None:
+    """What the check of every byte says of damage that made a difference and went unseen; None where there is no such check.
+
+    Of an input, the stage is begun anew on the same damage and told to look first.
+    """
+    if case.place == "input" and case.stage.guard:
+        ground.prepare(case.stage)
+        for one in damaged:
+            one.repeat()
+        return ground.run(case.stage, spread=False, guarded=True)
+    return ground.check(case.stage) if damaged and case.place != "input" and case.stage.verify else None
+
+
+def _mend(ground: Ground, case: Case, ended: Ended, damaged: list[Damaged]) -> None:
+    """What a sentence asks for: inputs are put back, outputs that it names are deleted."""
+    if case.place == "input":
+        for one in damaged:
+            one.restore()
+    said = re.sub(r"\s*\n\s*", "", ended.said) + " " + ended.said.replace("\n", " ")
+    for path in sorted((ground.here / case.stage.writes).rglob("*"), reverse=True):
+        if path.is_file() and str(path) in said and case.place != "input":
+            path.unlink()
+
+
+def _differences(ground: Ground, stage: Stage, usual: Undisturbed) -> tuple[list[str], list[str]]:
+    """What is lost and what is doubled."""
+    try:
+        got = stage.held(ground.here)
+    except Exception as error:  # what cannot be read is lost, whatever it raises
+        return [f"{type(error).__name__}: {error}"], []
+    lost = [name for name, value in usual.content.items() if name not in got or got[name] != value]
+    return lost, [name for name in got if name not in usual.content]
+
+
+def _judge_run(verdict: Verdict, ended: Ended) -> None:
+    verdict.runs += 1
+    verdict.hangs += ended.code is None
+    if "Traceback (most recent call last)" in ended.said and ended.code not in (0, None):
+        verdict.unclear.append(ended.said.strip().splitlines()[-1])

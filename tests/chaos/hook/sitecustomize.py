@@ -1,0 +1,128 @@
+"""Faults of the storage, in every Python process that has this folder on its path and CHAOS in its environment.
+
+CHAOS names a file, as JSON `kind, at, under, counter`: of the operations on files below the folder `under`, counted over all
+processes in the file `counter`, the one with number `at` meets the fault `kind`. Where no such file is, nothing happens.
+"""
+
+import errno
+import fcntl
+import importlib.abc
+import importlib.util
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+
+def met(operation: str, path: str) -> str | None:
+    """The fault that this operation meets, or None."""
+    try:
+        with open(os.environ["CHAOS"]) as stream:
+            said = json.load(stream)
+    except (OSError, ValueError):
+        return None
+    if operation not in said["counts"] or not os.path.abspath(path).startswith(said["under"]):
+        return None
+    with open(said["counter"], "a+") as counter:
+        fcntl.flock(counter, fcntl.LOCK_EX)
+        counter.write(".")
+        counter.flush()
+        number = counter.tell() - 1
+    return str(said["kind"]) if number == said["at"] else None
+
+
+class Stream:
+    """A stream that fails, or ends in the middle of the file."""
+
+    def __init__(self, stream: Any, kind: str, size: int) -> None:
+        self._stream, self._kind, self._end = stream, kind, size // 2
+
+    def _check(self) -> None:
+        if self._kind == "read fails":
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    def read(self, size: int | None = -1) -> bytes:
+        self._check()
+        room = max(0, self._end - self._stream.tell())
+        data: bytes = self._stream.read(room if size is None or size < 0 else min(size, room))
+        return data
+
+    read1 = read
+
+    def readinto(self, buffer: Any) -> int:
+        data = self.read(len(buffer))
+        buffer[: len(data)] = data
+        return len(data)
+
+    def readline(self, size: int = -1) -> bytes:
+        self._check()
+        line: bytes = self._stream.readline(size)
+        return line
+
+    def __iter__(self) -> Iterator[bytes]:
+        return iter(self.readline, b"")
+
+    def __enter__(self) -> "Stream":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stream.close()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def spoil(storage: Any) -> None:
+    """Put the faults into the project's module of that name."""
+    open_read, read_bytes, read_head, atomic_file = (
+        getattr(storage, name) for name in ("open_read", "read_bytes", "read_head", "atomic_file")
+    )
+
+    def bad_bytes(path: str, whole: Callable[[], bytes]) -> bytes:
+        kind = met("read", path)
+        if kind == "read fails":
+            raise OSError(errno.EIO, os.strerror(errno.EIO), path)
+        data = whole()
+        return data[: len(data) // 2] if kind == "read ends early" else data
+
+    def bad_open(path: str) -> Any:
+        kind = met("read", path)
+        stream = open_read(path)
+        return stream if kind is None else Stream(stream, kind, storage.size(path))
+
+    @contextmanager
+    def bad_atomic_file(path: str) -> Iterator[str]:
+        kind = met("write", path)
+        with atomic_file(path) as local:
+            yield local
+            if kind == "disk full":
+                os.truncate(local, os.path.getsize(local) // 2)
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
+
+    storage.open_read, storage.atomic_file = bad_open, bad_atomic_file
+    storage.read_bytes = lambda path: bad_bytes(path, lambda: read_bytes(path))
+    storage.read_head = lambda path, size: bad_bytes(path, lambda: read_head(path, size))
+
+
+class Finder(importlib.abc.MetaPathFinder):
+    """Finds pipeline.storage as it is, and spoils it when it has been loaded."""
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> Any:
+        if name != "pipeline.storage":
+            return None
+        sys.meta_path.remove(self)
+        spec: Any = importlib.util.find_spec(name)
+        load = spec.loader.exec_module
+
+        def exec_module(module: Any) -> None:
+            load(module)
+            spoil(module)
+
+        spec.loader.exec_module = exec_module
+        return spec
+
+
+if "CHAOS" in os.environ:
+    sys.meta_path.insert(0, Finder())
