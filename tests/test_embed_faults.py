@@ -1,19 +1,15 @@
 """Whatever goes wrong while embedding, the table ends up with the bytes of an undisturbed run's, and nothing beside them.
 
-PVDA_KILL_SEEDS: how many seeds the campaigns of random kills go through; a few by default.
+Random kills, of workers and of the stage, are in tests/chaos.
 """
 
 import errno
 import os
-import random
 import shutil
 import signal
-import subprocess
-import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,16 +23,6 @@ from pipeline.features import open_table, verify
 from pipeline.placement import Node
 from pipeline.records import InputError
 from pipeline.shards import Shard, read_manifest
-
-SEEDS = int(os.environ.get("PVDA_KILL_SEEDS", "2"))
-DRIVER = """
-import sys
-sys.path.insert(0, sys.argv[1])
-from test_embed_faults import network_of_colours
-from pipeline.embed import EmbeddingSettings, embed_gallery
-embed_gallery(EmbeddingSettings(shards=sys.argv[2], out=sys.argv[3], batch_size=2, workers=2),
-              network_of_colours(seconds=0.03, pids=sys.argv[4]))
-"""
 
 
 def network_of_colours(
@@ -112,71 +98,6 @@ def blacken(shards: Path, shard: Shard) -> None:
     assert len(buffer.getvalue()) <= len(room)
     data[member.offset_data : member.offset_data + member.size] = buffer.getvalue().ljust(len(room), b"\0")
     path.write_bytes(data)
-
-
-@contextmanager
-def killing(pids: Path, seed: int, kills: int) -> Iterator[list[int]]:
-    """Kill so many workers at random moments."""
-    rng, killed, over = random.Random(seed), list[int](), threading.Event()
-
-    def kill() -> None:
-        while len(killed) < kills and not over.is_set():
-            time.sleep(rng.uniform(0.0, 0.6))
-            alive = sorted(int(path.name) for path in pids.iterdir() if int(path.name) not in killed)
-            if alive:
-                victim = rng.choice(alive)
-                killed.append(victim)
-                if Path(f"/proc/{victim}").exists():
-                    os.kill(victim, signal.SIGKILL)
-
-    thread = threading.Thread(target=kill)
-    thread.start()
-    try:
-        yield killed
-    finally:
-        over.set()
-        thread.join()
-
-
-@pytest.mark.parametrize("seed", range(SEEDS))
-def test_workers_killed_at_random_moments_leave_no_trace(
-    seed: int, tmp_path: Path, tiny_shards: str, undisturbed: dict[str, bytes]
-) -> None:
-    out, pids = tmp_path / "table", tmp_path / "pids"
-    pids.mkdir()
-    with killing(pids, seed, kills=3) as killed, suppress(Incomplete):  # where all three kills were over one shard
-        embed_gallery(settings_of(tiny_shards, out), network_of_colours(seconds=0.03, pids=str(pids)))
-    assert killed
-    embed_gallery(settings_of(tiny_shards, out), network_of_colours())
-    assert held(out) == undisturbed
-
-
-@pytest.mark.parametrize("seed", range(SEEDS))
-def test_a_stage_that_is_killed_goes_on_where_it_was(
-    seed: int, tmp_path: Path, tiny_shards: str, undisturbed: dict[str, bytes], ray_address: str
-) -> None:
-    out, pids = tmp_path / "table", tmp_path / "pids"
-    pids.mkdir()
-    here = Path(__file__).parent
-    environment = os.environ | {"PYTHONPATH": f"{here.parent}:{os.environ.get('PYTHONPATH', '')}"}
-    driver = subprocess.Popen(
-        [sys.executable, "-c", DRIVER, str(here), tiny_shards, str(out), str(pids)],
-        env=environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    while driver.poll() is None and len(part_names(str(out))) < 2:
-        time.sleep(0.02)
-    time.sleep(random.Random(seed).uniform(0, 0.2))
-    driver.kill()
-    driver.wait()
-    done = {name: (out / name).stat().st_mtime_ns for name in part_names(str(out))}
-    assert len(done) >= 2
-    embed_gallery(settings_of(tiny_shards, out), network_of_colours())
-    assert held(out) == undisturbed
-    # A worker whose stage is gone may still finish the part in its hands; what was whole is not made again.
-    again = [name for name, at in done.items() if (out / name).stat().st_mtime_ns != at]
-    assert len(again) <= 2
 
 
 def test_a_shard_that_kills_its_worker_is_set_aside_and_the_rest_is_done(

@@ -2,11 +2,7 @@
 
 import json
 import os
-import signal
-import subprocess
-import sys
 import tarfile
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -93,30 +89,6 @@ def test_what_was_packed_before_a_stop_is_not_packed_again(tmp_path: Path, monke
     assert pack(SOURCE, said(root, out)) == whole
     assert {name: (out / f"{name}.tar").stat().st_mtime_ns for name in written} == before
     assert content(out) == content(tmp_path / "whole")
-
-
-def test_killed_at_any_moment_and_begun_again_it_gives_the_same_bytes(tmp_path: Path) -> None:
-    root = imagery(tmp_path / "root", range(40))
-    pack(SOURCE, said(root, tmp_path / "whole", samples_per_shard=2))
-    code = (
-        "import sys; from pipeline.packing import *; from pipeline.sources.university1652 import University1652; "
-        "print('ready', flush=True); "
-        "pack(University1652(), PackingSettings(root=sys.argv[1], out=sys.argv[2], samples_per_shard=2, workers=0))"
-    )
-    out = tmp_path / "out"
-    kills = 0
-    for wait in (0.02, 0.05, 0.1, 0.2):
-        command = [sys.executable, "-c", code, str(root), str(out)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=Path.cwd()) as job:
-            assert job.stdout is not None
-            job.stdout.readline()
-            time.sleep(wait)
-            job.send_signal(signal.SIGKILL)
-        kills += not (out / "manifest.json").exists()
-    assert kills
-    pack(SOURCE, said(root, out, samples_per_shard=2))
-    left = {name: data for name, data in content(out).items() if not Path(name).name.startswith(".")}
-    assert left == content(tmp_path / "whole")
 
 
 def test_an_image_that_was_mended_is_packed_when_the_job_runs_again(tmp_path: Path) -> None:

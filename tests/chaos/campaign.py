@@ -243,7 +243,7 @@ def _damage(ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, 
     else:
         if case.place == "unfinished output":
             job = ground.start(stage, spread=False)
-            job.wait(rng.uniform(0.2, 1.0) * usual.seconds[False])
+            job.wait(rng.uniform(0.5, 1.0) * usual.seconds[False])
             strike(job.pid, signal.SIGKILL)
             _judge_run(verdict, job.end(PATIENCE))
         spoilt = damage(ground.here / stage.writes, case.kind, rng, PASSED_OVER)
