@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from pipeline import storage, stream
+from pipeline import parquet_files, storage, stream
 from pipeline.chosen_rows import vectors_by_key
 from pipeline.evaluation_files import Besides, Export, write_besides
 from pipeline.exclusive import one_at_a_time
@@ -182,8 +181,7 @@ def _evaluate(
         spent[str(task)] = time.monotonic() - started
     rows, results = [each.metrics for each in found], pa.concat_tables([each.queries for each in found])
     for name, table in ((RESULTS, results), ("metrics.parquet", pa.Table.from_pylist(rows, METRICS_SCHEMA))):
-        with storage.atomic(storage.join(settings.out, name)) as stream_out:
-            pq.write_table(table, stream_out)
+        parquet_files.write_table(storage.join(settings.out, name), table)
     started = time.monotonic()
     _write_besides(settings, queries, gallery, tasks, results)
     spent["views, groups and exports"] = time.monotonic() - started

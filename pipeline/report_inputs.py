@@ -8,9 +8,8 @@ from typing import Any, Literal
 
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
-from pipeline import storage
+from pipeline import parquet_files, storage
 from pipeline.evaluation_files import GAP, GROUPS, PARTS, VIEWS
 from pipeline.features import Floats
 from pipeline.records import InputError
@@ -88,8 +87,14 @@ def read_findings(folder: str) -> Findings:
     """
     if not storage.exists(storage.join(folder, "metrics.json")):
         raise InputError(f"no finished evaluation at {folder}: found no metrics.json; make one with jobs/evaluate.py")
-    with storage.open_read(storage.join(folder, "queries.parquet")) as stream:
-        results = pq.read_table(stream)
+    path = storage.join(folder, "queries.parquet")
+    try:
+        results = parquet_files.read_table(path)
+    except parquet_files.DAMAGE as error:
+        raise InputError(
+            f"{path} cannot be read ({error}), expected the rows of a finished evaluation; delete {folder} and evaluate again "
+            "with jobs/evaluate.py"
+        ) from None
     return Findings(
         name=folder.rstrip("/").rsplit("/", 1)[-1],
         metrics=storage.read_json(storage.join(folder, "metrics.json")),
