@@ -5,6 +5,7 @@ Seeded: flipped bits, blocks of zeros, files cut off, files gone. Never a traceb
 
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline import rejects, shard_records
+from pipeline import rejects, sealed, shard_records, storage
+from pipeline.confidence import Confidence, read_confidence, write_confidence
+from pipeline.evaluation_folder import INPUTS, METRICS, VIEWS, read_inputs, read_rows, write_inputs
 from pipeline.feature_parts import (
     PartFooter,
     PartRows,
@@ -24,9 +27,12 @@ from pipeline.feature_parts import (
 )
 from pipeline.feature_rows import RowReader
 from pipeline.features import Box, open_table
+from pipeline.index_facts import FACTS, Effort, IndexFacts, PartFacts, read_facts, write_facts
+from pipeline.logistic import Logistic
 from pipeline.records import InputError, Rejection, Split, View
+from pipeline.reliability import Bin
 from pipeline.shard_records import Packed
-from pipeline.shards import Shard
+from pipeline.shards import MANIFEST, Manifest, Shard, read_manifest
 
 ROWS, DIMENSION = 40, 16
 MENDS = re.compile(r"jobs/\w+\.py|embed its shard again|run the same command again|calibrate again|taking checkpoint")
@@ -77,6 +83,17 @@ def found_or_equal(path: Path, look: Callable[[], Any], count: int, errors: type
     path.write_bytes(good)
     assert look() == expected
     return refused
+
+
+def look_or_say_gone(path: Path, look: Callable[[], Any]) -> Callable[[], Any]:
+    """`look`, of a file whose absence means that nothing was done yet."""
+
+    def looked() -> Any:
+        if not path.exists():
+            raise InputError(f"{path} is gone; jobs/again.py")
+        return look()
+
+    return looked
 
 
 @pytest.fixture
@@ -136,12 +153,7 @@ def test_each_byte_of_a_footer_is_held_against_the_seal_before_arrow_sees_it(par
 
 
 def test_every_byte_of_a_part_is_looked_at_when_asked(part: Path) -> None:
-    def look() -> None:
-        if not part.exists():
-            raise InputError(f"{part} is gone; run jobs/embed_gallery.py again")
-        verify_part(str(part))
-
-    assert found_or_equal(part, look, 200) == 201
+    assert found_or_equal(part, look_or_say_gone(part, lambda: verify_part(str(part))), 200) == 201
 
 
 def test_parts_without_seals_and_checksums_are_read_as_they_are(part: Path) -> None:
@@ -193,13 +205,74 @@ def test_a_damaged_list_of_a_table_is_named_and_written_again(tmp_path: Path) ->
     list_rejected(str(tmp_path), rows)
     path = tmp_path / "_rejected" / "rejected.parquet"
 
-    def look() -> Any:
-        if not path.exists():
-            raise InputError(f"{path} is gone; run jobs/embed_gallery.py again")
-        return read_rejected(str(tmp_path)).to_pylist()
-
+    look = look_or_say_gone(path, lambda: read_rejected(str(tmp_path)).to_pylist())
     assert found_or_equal(path, look, 100) > 80
     for data in damages(path.read_bytes(), 30, seed=1):
         path.write_bytes(data or b"")
         list_rejected(str(tmp_path), rows)
         assert len(read_rejected(str(tmp_path))) == 1
+
+
+def test_a_damaged_manifest_is_refused(tmp_path: Path) -> None:
+    shards = tuple(
+        Shard(name=f"train-drone-{n:06d}", split=Split.TRAIN, view=View.DRONE, samples=n, bytes=n, sha256=f"{n:064x}")
+        for n in range(5)
+    )
+    manifest = Manifest(shards=shards, classes=("a", "b"), packing={"source": "table", "check": "quick"}, rejected=0)
+    path = tmp_path / MANIFEST
+    sealed.write(str(path), asdict(manifest))
+    look = look_or_say_gone(path, lambda: asdict(read_manifest(str(tmp_path))))
+    assert found_or_equal(path, look, 400) > 300
+
+
+def test_a_damaged_index_json_is_refused(tmp_path: Path) -> None:
+    part = PartFacts(
+        faiss="index.faiss", ids="ids.arrow", first_row=0, rows=5, table_parts={"gallery-drone-000000.parquet": "s" * 64},
+        files={"index.faiss": {"bytes": 9, "sha256": "0" * 64}},
+    )  # fmt: skip
+    facts = IndexFacts(
+        factory="Flat", metric="inner product", rows=5, dimension=8, fingerprint="f" * 64, table="/t", asked={"split": None},
+        why="few rows", refine="none", on_disk=False, effort=Effort(breadth=1), target_recall=0.9, unit_rows=9, part_rows=9,
+        training_sample=0, build_seconds=0.1, bytes_per_vector=8.0, expected_bytes=None, measured={"recall_at_10": 1.0},
+        parts=(part,), trained={},
+    )  # fmt: skip
+    write_facts(str(tmp_path), facts)
+    path = tmp_path / FACTS
+    assert found_or_equal(path, look_or_say_gone(path, lambda: read_facts(str(tmp_path))), 400) > 300
+
+
+def test_a_damaged_calibration_is_refused(tmp_path: Path) -> None:
+    model = Logistic(
+        mean_F=(0.1, 0.2, 0.3, 0.4), scale_F=(1.0,) * 4, coefficient_F=(1.5, 2.5, 3.5, 4.5), intercept=0.25
+    )
+    calibration = Confidence(
+        fingerprint="f" * 64, gallery=5, asked="places held out", spacing_m=10.0, within_m=5.0, tolerance_m=3.0, outside=0.5,
+        model=model, threshold=0.5, sharpness=9.0, elsewhere=0.1, photos=3, locations=2, right=0.7, right_kept=0.6,
+        outside_unknown=0.8, calibration_error=0.02, bins=(Bin(said=0.5, seen=0.4, share=1.0),),
+    )  # fmt: skip
+    path = tmp_path / "calibration.json"
+    write_confidence(str(path), calibration)
+    look = look_or_say_gone(path, lambda: read_confidence(str(path), {"fingerprint": "f" * 64}))
+    assert found_or_equal(path, look, 400) > 300
+
+
+def test_an_evaluation_is_read_back_as_it_was_written_or_not_at_all(tmp_path: Path) -> None:
+    metrics = [{"task": "drone->satellite", "protocol": "full", "multi_query": False, "r1": 0.25, "ap": 0.5}]
+    storage.write_json(str(tmp_path / VIEWS), [{"views": 3, "r1": 0.5}])
+    write_inputs(str(tmp_path), {"ranked": {"queries": "q" * 64}, "shown": {}}, storage.as_json(metrics))
+    storage.write_json(str(tmp_path / METRICS), metrics)
+    for name, listed in ((METRICS, METRICS), (VIEWS, VIEWS)):
+        assert found_or_equal(tmp_path / name, lambda listed=listed: read_rows(str(tmp_path), listed), 200) == 201  # type: ignore[misc]
+    path = tmp_path / INPUTS
+    assert found_or_equal(path, look_or_say_gone(path, lambda: read_inputs(str(tmp_path))), 200) > 150
+
+
+def test_json_without_a_seal_is_believed_and_one_changed_on_purpose_is_told_what_to_do(tmp_path: Path) -> None:
+    path, said = str(tmp_path / "a.json"), {"b": 1.5, "a": [None, "é"], "n": {"2": 1, "10": 2}}
+    sealed.write(path, said)
+    assert sealed.read(path) == said
+    storage.write_json(path, said)
+    assert sealed.read(path) == said
+    storage.write_json(path, said | {"b": 2, "seal": sealed.seal_of(said)})
+    with pytest.raises(ValueError, match="whoever changed it on purpose takes that entry out"):
+        sealed.read(path)
