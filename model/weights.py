@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from model.backbone import BLOCKS, Depth
-from model.checkpoint import CheckpointError
+from model.checkpoint import CheckpointError, refuse_damaged
 
 TORCHVISION = (
     "a state dict of torchvision's ResNet: on a machine with a network, "
@@ -38,6 +38,7 @@ def parse_state_dict(data: bytes, name: str) -> dict[str, Tensor]:
 
     Raises CheckpointError.
     """
+    refuse_damaged(data, name)
     try:
         if name.endswith(".safetensors"):
             return safetensors.torch.load(data)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline import storage
+from pipeline import sealed, storage
 from pipeline.consensus import Consensus
 from pipeline.logistic import Logistic
 from pipeline.metrics import Doubles
@@ -76,7 +76,7 @@ class Confidence:
 
 def write_confidence(path: str, confidence: Confidence) -> None:
     """The calibration as a JSON file, whole or not at all."""
-    storage.write_json(path, {"schema_version": SCHEMA_VERSION, "features": FEATURES, **asdict(confidence)})
+    sealed.write(path, {"schema_version": SCHEMA_VERSION, "features": FEATURES, **asdict(confidence)})
 
 
 def read_confidence(path: str, facts: dict[str, Any]) -> Confidence:
@@ -85,7 +85,7 @@ def read_confidence(path: str, facts: dict[str, Any]) -> Confidence:
     Raises InputError when the file is none, or another network's.
     """
     try:
-        said = storage.read_json(path)
+        said = sealed.read(path)
         if said.pop("schema_version") != SCHEMA_VERSION or tuple(said.pop("features")) != FEATURES:
             raise ValueError("another version")
         model: dict[str, Any] = {
@@ -95,8 +95,8 @@ def read_confidence(path: str, facts: dict[str, Any]) -> Confidence:
         confidence = Confidence(**(said | {"model": Logistic(**model), "bins": bins}))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
-            f"{path} is not a calibration of schema {SCHEMA_VERSION} ({type(error).__name__}); expected what "
-            "jobs/calibrate.py writes; calibrate again"
+            f"{path} is not a calibration of schema {SCHEMA_VERSION} ({error!r}); expected what "
+            "jobs/calibrate.py writes; delete it and calibrate again"
         ) from None
     if confidence.fingerprint != facts["fingerprint"]:
         raise InputError(

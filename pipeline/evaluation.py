@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from pipeline import storage, stream
+from pipeline import parquet_files, sealed, storage, stream
 from pipeline.chosen_rows import vectors_by_key
 from pipeline.evaluation_files import Besides, Export, write_besides
+from pipeline.evaluation_folder import INPUTS, METRICS, RESULTS, read_inputs, read_rows, write_inputs
 from pipeline.exclusive import one_at_a_time
 from pipeline.features import FeatureTable, Floats, open_table
 from pipeline.progress import console, progress
@@ -29,7 +29,6 @@ from pipeline.shards import read_manifest
 ViewName = Literal["drone", "satellite", "street", "google"]
 SHOWN = ("title", "shards", "panels", "views", "parts", "by", "exports", "figures", "answer_order")
 "Settings that change what is written besides the ranking."
-METRICS, RESULTS, INPUTS = "metrics.json", "queries.parquet", "evaluation.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,14 +123,16 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
     if earlier and earlier["shown"] == shown:
         console.print(f"{settings.out} is complete: the same features were evaluated before; nothing to do")
     elif earlier:
-        _write_besides(settings, queries, gallery, tasks, read_findings(settings.out).results)
+        # Until all is written anew it is of nothing that could be asked for, and says of no file what is in it.
+        results = read_findings(settings.out).results
+        sealed.write(storage.join(settings.out, INPUTS), {"ranked": ranked, "shown": {}})
+        _write_besides(settings, queries, gallery, tasks, results)
         _write_report(settings, queries, gallery, read_findings(settings.out), extras)
-        storage.write_json(storage.join(settings.out, INPUTS), {"ranked": ranked, "shown": shown})
+        write_inputs(settings.out, {"ranked": ranked, "shown": shown})
         console.print(f"{settings.out}: ranked before; wrote report.html and what goes with it anew")
     else:
         _evaluate(settings, queries, gallery, tasks, {"ranked": ranked, "shown": shown}, extras)
-    rows: list[dict[str, Any]] = storage.read_json(storage.join(settings.out, METRICS))
-    return rows
+    return read_rows(settings.out, METRICS)
 
 
 def plan(settings: EvaluationSettings) -> tuple[FeatureTable, FeatureTable, list[Task]]:
@@ -172,6 +173,8 @@ def _evaluate(
     inputs: dict[str, Any], extras: Extras,
 ) -> None:  # fmt: skip
     begin = time.monotonic()
+    if storage.exists(storage.join(settings.out, INPUTS)):
+        storage.remove(storage.join(settings.out, INPUTS))  # of a run that was not finished
     found, spent = [], {}
     for task in tasks:
         started = time.monotonic()
@@ -182,8 +185,7 @@ def _evaluate(
         spent[str(task)] = time.monotonic() - started
     rows, results = [each.metrics for each in found], pa.concat_tables([each.queries for each in found])
     for name, table in ((RESULTS, results), ("metrics.parquet", pa.Table.from_pylist(rows, METRICS_SCHEMA))):
-        with storage.atomic(storage.join(settings.out, name)) as stream_out:
-            pq.write_table(table, stream_out)
+        parquet_files.write_table(storage.join(settings.out, name), table)
     started = time.monotonic()
     _write_besides(settings, queries, gallery, tasks, results)
     spent["views, groups and exports"] = time.monotonic() - started
@@ -191,8 +193,9 @@ def _evaluate(
     findings = Findings(name=settings.title, metrics=rows, results=results, **read_besides(settings.out))
     _write_report(settings, queries, gallery, findings, extras)
     spent["report"] = time.monotonic() - started
-    storage.write_json(storage.join(settings.out, INPUTS), inputs)
-    storage.write_json(storage.join(settings.out, METRICS), rows)
+    metrics = storage.as_json(rows)
+    write_inputs(settings.out, inputs, metrics)
+    storage.write_bytes(storage.join(settings.out, METRICS), metrics)
     parts = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.items())
     console.print(f"{storage.join(settings.out, METRICS)}: {time.monotonic() - begin:.1f} s ({parts})")
 
@@ -236,11 +239,11 @@ def _plain(value: Any) -> Any:
 def _earlier(out: str) -> dict[str, Any] | None:
     if not storage.exists(storage.join(out, METRICS)):
         return None
-    if not storage.exists(storage.join(out, INPUTS)):
+    said = read_inputs(out)
+    if said is None:
         raise InputError(
             f"{out} holds a {METRICS} without {INPUTS}; expected an evaluation's folder; choose another --out"
         )
-    said: dict[str, Any] = storage.read_json(storage.join(out, INPUTS))
     return said
 
 

@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 
 from pipeline import breakdowns, exports, storage, view_gap
 from pipeline.chosen_rows import taken
+from pipeline.evaluation_folder import GAP, GROUPS, PARTS, VIEWS
 from pipeline.features import FeatureTable
 from pipeline.part_measures import measure_parts
 from pipeline.progress import progress
@@ -23,7 +24,6 @@ from pipeline.retrieval import Protocol, Task, sides_of
 from pipeline.view_curve import view_curve
 
 Export = Literal["answer", "mat"]
-VIEWS, GROUPS, PARTS, GAP = "views.json", "groups.json", "parts.json", "view_gap.json"
 
 
 @dataclass(frozen=True, kw_only=True)

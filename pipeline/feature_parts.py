@@ -15,7 +15,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline import rejects, storage
+from pipeline import parquet_files, rejects, storage
 from pipeline.ahead import ahead
 from pipeline.records import InputError, Rejection
 
@@ -26,6 +26,9 @@ readers that look into folders: pandas, pyarrow and Spark."""
 REJECTED_SCHEMA = pa.schema([(name, pa.string()) for name in ("shard", "key", "reason", "found")])
 ROW_GROUP = 16_384
 "Rows: few enough that a reader's memory does not grow with a part of millions."
+PAGE_BYTES = 1 << 18
+"""Of a data page: whoever reads a single row holds the checksum of its whole page against it, 65 us; smaller pages would take
+longer to find when a part is opened."""
 READERS = 8
 "Footers read at once: on an object store each is a request of some 50 ms."
 Floats = npt.NDArray[np.float32]
@@ -92,11 +95,10 @@ def write_part(path: str, rows: PartRows, footer: PartFooter, dtype: str = "floa
     ]  # fmt: skip
     table = pa.Table.from_arrays(columns, schema=schema.with_metadata(footer.metadata()))
     text = [name for name in schema.names if name != "embedding"]
-    with storage.atomic(path) as stream:
-        # Embeddings do not compress and nobody filters on them: plain bytes are the fastest to read back.
-        pq.write_table(
-            table, stream, row_group_size=ROW_GROUP, compression="none", use_dictionary=text, write_statistics=text
-        )
+    # Embeddings do not compress and nobody filters on them: plain bytes are the fastest to read back.
+    parquet_files.write_table(
+        path, table, ROW_GROUP, compression="none", write_statistics=text, data_page_size=PAGE_BYTES
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,16 +117,29 @@ class PartHeader:
 def open_part(path: str) -> Iterator[pq.ParquetFile]:
     """A part to read from, a piece at a time.
 
-    Raises InputError when it is no whole Parquet file.
+    Raises InputError, here or while it is read, when it is no whole Parquet file.
     """
     try:
-        with storage.open_read(path) as stream:
-            # With a buffer, a row group is read as it is decoded and not fetched whole before.
-            yield pq.ParquetFile(stream, buffer_size=1 << 20)
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(
-            f"{path} is not a readable Parquet file ({error}); delete it and embed its shard again"
-        ) from None
+        with parquet_files.opened(path) as parquet:
+            yield parquet
+    except parquet_files.DAMAGE as error:
+        raise _unreadable(path, error) from None
+
+
+def verify_part(path: str) -> None:
+    """Look at every byte of a part. Raises InputError where one is not what was written."""
+    try:
+        if parquet_files.refuse_damaged(path):
+            return
+    except parquet_files.DAMAGE as error:
+        raise _unreadable(path, error) from None
+    with open_part(path) as parquet:  # from before there were seals
+        for _ in parquet.iter_batches():
+            pass
+
+
+def _unreadable(path: str, error: Exception) -> InputError:
+    return InputError(f"{path} is not a readable Parquet file ({error}); delete it and embed its shard again")
 
 
 def read_header(path: str) -> PartHeader:
@@ -190,17 +205,27 @@ def list_rejected(table: str, rejected: Iterable[tuple[str, str | None, str, str
         if there:
             storage.remove(path)
         return there
-    if there and read_rejected(table).equals(wanted):
-        return False
-    with storage.atomic(path) as stream:
-        pq.write_table(wanted, stream)
+    try:
+        if there and read_rejected(table).equals(wanted):
+            return False
+    except InputError:  # it is written again
+        pass
+    parquet_files.write_table(path, wanted)
     return True
 
 
 def read_rejected(table: str) -> pa.Table:
-    """What of the shards has no row in the table: `shard, key, reason, found`; no rows where there is no such list."""
+    """What of the shards has no row in the table: `shard, key, reason, found`; no rows where there is no such list.
+
+    Raises InputError when it cannot be read.
+    """
     path = storage.join(table, REJECTED)
     if not storage.exists(path):
         return REJECTED_SCHEMA.empty_table()
-    with storage.open_read(path) as stream:
-        return pq.read_table(stream)
+    try:
+        return parquet_files.read_table(path)
+    except parquet_files.DAMAGE as error:
+        raise InputError(
+            f"{path} cannot be read ({error}), expected the list that embedding writes; run jobs/embed_gallery.py again as it "
+            "was run before, which writes it from the parts"
+        ) from None

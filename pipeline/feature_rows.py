@@ -1,7 +1,8 @@
 """Single embeddings out of a feature table on a local disk: where in which part they stand in, their vectors out.
 
-Parts are mapped into memory, so only what is asked for is read and the operating system keeps what is asked for often. An
-index that refines its answers, or searches a few candidates exactly, needs no copy of the vectors.
+Parts are mapped into memory, so only what is asked for is read and the operating system keeps what is asked for often. The
+first time that a page is read from, all of it is, and held against its checksum: 65 us, once a page and reader. An index that
+refines its answers, or searches a few candidates exactly, needs no copy of the vectors.
 Shapes: R rows asked for, D dimensions.
 """
 
@@ -17,7 +18,7 @@ import pyarrow.parquet as pq
 from pipeline import storage
 from pipeline.feature_parts import Floats, Halves, header_of, open_part
 from pipeline.metrics import Whole
-from pipeline.parquet_pages import NotPlain, Pages, find_pages
+from pipeline.parquet_pages import Damaged, NotPlain, Pages, find_pages
 from pipeline.records import InputError
 
 OPEN_PARTS = 512
@@ -30,6 +31,8 @@ class _Mapped:
     "The whole file."
     pages: Pages
     dtype: "np.dtype[np.float16] | np.dtype[np.float32]"
+    sound_P: npt.NDArray[np.bool_]
+    "Pages whose checksum was found right."
 
 
 class RowReader:
@@ -53,11 +56,29 @@ class RowReader:
         page_R = np.searchsorted(pages.first_P, value_R, side="right") - 1
         begin_R = pages.begin_P[page_R] + (value_R - pages.first_P[page_R]) * mapped.dtype.itemsize
         whole_R = value_R + self._dimension <= end_P[page_R]
+        last_R = np.searchsorted(pages.first_P, value_R + self._dimension - 1, side="right") - 1
+        self._refuse_damaged(part, mapped, page_R, last_R)
         for row, begin in zip(np.flatnonzero(whole_R).tolist(), begin_R[whole_R].tolist(), strict=True):
             rows_RW[row] = mapped.bytes_N[begin : begin + width]
         for row in np.flatnonzero(~whole_R).tolist():
             rows_RW[row] = self._across_pages(mapped, int(value_R[row]), int(page_R[row]))
         return rows_RW.view(mapped.dtype)
+
+    def _refuse_damaged(self, part: str, mapped: _Mapped, first_R: Whole, last_R: Whole) -> None:
+        """Raise InputError where a page of rows that reach from a first to a last one is not what was written."""
+        if mapped.sound_P.all():
+            return
+        wanted_P = np.zeros(len(mapped.sound_P) + 1, np.int32)  # +1 where a row begins, -1 behind its end
+        np.add.at(wanted_P, first_R, 1)
+        np.add.at(wanted_P, last_R + 1, -1)
+        for page in np.flatnonzero((np.cumsum(wanted_P)[:-1] > 0) & ~mapped.sound_P).tolist():
+            try:
+                mapped.pages.refuse_damaged(mapped.bytes_N.data, page)
+            except Damaged as error:
+                raise InputError(
+                    f"{storage.join(self._table, part)} is damaged ({error}); delete it and embed its shard again"
+                ) from None
+            mapped.sound_P[page] = True
 
     def _across_pages(self, mapped: _Mapped, value: int, page: int) -> npt.NDArray[np.uint8]:
         """The bytes of a row that begins in one page and ends in another."""
@@ -109,7 +130,8 @@ def _map(parquet: pq.ParquetFile, path: str, dtype: str) -> _Mapped:
     except NotPlain:
         data.close()
         raise InputError(
-            f"the embeddings of {path} are compressed or encoded, expected plain ones, as jobs/embed_gallery.py writes them; "
-            "embed its shard again"
+            f"the embeddings of {path} are compressed, encoded or damaged, expected plain ones, as jobs/embed_gallery.py "
+            "writes them; delete it and embed its shard again"
         ) from None
-    return _Mapped(bytes_N=np.frombuffer(data, np.uint8), pages=pages, dtype=kept)
+    sound_P = np.zeros(len(pages.first_P), np.bool_)
+    return _Mapped(bytes_N=np.frombuffer(data, np.uint8), pages=pages, dtype=kept, sound_P=sound_P)

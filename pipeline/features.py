@@ -254,7 +254,7 @@ def _open_one(path: str) -> tuple[PartHeader, Counts]:
     counts: Counts = Counter()
     with open_part(path) as parquet:
         header = header_of(parquet, path)
-        table = parquet.read(columns=["split", "view"])
+        table = parquet.read(columns=["split", "view"]).unify_dictionaries()
     for row in table.group_by(["split", "view"]).aggregate([([], "count_all")]).to_pylist():
         counts[Split(row["split"]), View(row["view"])] += row["count_all"]
     return header, counts

@@ -8,7 +8,7 @@ import hashlib
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from pipeline import storage
+from pipeline import sealed, storage
 from pipeline.index_plan import Refine
 from pipeline.records import InputError
 
@@ -101,7 +101,7 @@ def as_said(facts: IndexFacts) -> dict[str, Any]:
 
 
 def write_facts(folder: str, facts: IndexFacts) -> None:
-    storage.write_json(storage.join(folder, FACTS), as_said(facts))
+    sealed.write(storage.join(folder, FACTS), as_said(facts))
 
 
 def read_facts(folder: str) -> IndexFacts:
@@ -113,13 +113,13 @@ def read_facts(folder: str) -> IndexFacts:
     if not storage.exists(path):
         raise InputError(f"no index at {folder}: found no {FACTS}; make one with jobs/build_index.py")
     try:
-        said = storage.read_json(path)
+        said = sealed.read(path)
         if said["schema_version"] != SCHEMA_VERSION:
             raise InputError(f"{path} is of version {said['schema_version']}, expected {SCHEMA_VERSION}; {AGAIN}")
         own = {name: said.pop(name) for name in IndexFacts.__dataclass_fields__ if name != "measured"}
         parts = tuple(PartFacts(**{**part, "removed": tuple(part["removed"])}) for part in own.pop("parts"))
         return IndexFacts(**{**own, "effort": Effort(**own["effort"])}, parts=parts, measured=said)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path} is damaged ({error!r}), expected what build_index writes; {AGAIN}") from None
 
 

@@ -10,9 +10,8 @@ from collections.abc import Iterable
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from pipeline import storage
+from pipeline import parquet_files, storage
 from pipeline.index_facts import AGAIN
 from pipeline.metrics import Whole
 from pipeline.records import InputError
@@ -31,9 +30,8 @@ BATCH_ROWS = 65_536
 def write_ids(parquet: str, arrow: str, first_row: int, parts: Iterable[tuple[int, pa.Table]]) -> None:
     """Write both files from the table's parts, each with its number and FeatureTable.numbered's columns COLUMNS."""
     with (
-        storage.atomic(parquet) as one,
+        parquet_files.writer(parquet, SCHEMA) as columns,
         storage.atomic(arrow) as other,
-        pq.ParquetWriter(one, SCHEMA) as columns,
         pa.ipc.new_file(other, SCHEMA) as mapped,
     ):
         for batch in _batches(first_row, parts):

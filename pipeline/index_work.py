@@ -14,7 +14,7 @@ from typing import Any
 import faiss
 import ray
 
-from pipeline import cluster, storage
+from pipeline import cluster, sealed, storage
 from pipeline.features import FeatureTable
 from pipeline.index_facts import PartFacts, measure_file
 from pipeline.index_ids import COLUMNS, local_copy, write_ids
@@ -34,9 +34,9 @@ class Workshop:
         self._scratch = storage.join(out, BUILDING)
         wanted = json.loads(json.dumps(identity))
         plan = storage.join(self._scratch, PLAN)
-        if not storage.exists(plan) or storage.read_json(plan) != wanted:
+        if _plan(plan) != wanted:
             self.clear()
-            storage.write_json(plan, wanted)
+            sealed.write(plan, wanted)
 
     def clear(self) -> None:
         storage.remove_folder(self._scratch)
@@ -130,6 +130,14 @@ class Workshop:
             table_parts=table.shards,
             files={name: measure_file(self._out, name) for name in names},
         )  # fmt: skip
+
+
+def _plan(path: str) -> dict[str, Any] | None:
+    """What unfinished work is of; None where there is none, or where that cannot be told."""
+    try:
+        return sealed.read(path) if storage.exists(path) else None
+    except ValueError:
+        return None
 
 
 def give_memory_back() -> None:

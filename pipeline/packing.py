@@ -12,7 +12,7 @@ from typing import Any
 
 import ray
 
-from pipeline import cluster, rejects, storage
+from pipeline import cluster, rejects, sealed, storage
 from pipeline.duplicates import COLUMNS, find_duplicates
 from pipeline.exclusive import one_at_a_time
 from pipeline.extension import new_records, next_numbers
@@ -112,7 +112,7 @@ def pack(source: Source, settings: PackingSettings) -> Manifest:
     full = {name: done for name, done in packed.items() if done.shard.samples}
     clear(out, old.union(full))
     manifest = compose(before, said, full, haul, refusals)
-    storage.write_json(storage.join(out, MANIFEST), asdict(manifest))
+    sealed.write(storage.join(out, MANIFEST), asdict(manifest))
     sum_up(settings, full, haul, scanned - began, time.monotonic() - scanned)
     return manifest
 

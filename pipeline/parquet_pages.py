@@ -1,11 +1,13 @@
 """Where the values of an uncompressed Parquet column lie in its file, so that single rows can be read without their row group.
 
-In: the bytes of a file whose column is stored plain and without nulls. Out: for each data page the number of its first value
-and the byte it begins at. pyarrow reads whole row groups only, and says no place of a page.
+In: the bytes of a file whose column is stored plain and without nulls. Out: for each data page the number of its first value,
+the byte it begins at, and the checksum that its header has, by which whoever reads it finds damage. pyarrow reads whole row
+groups only, and says no place of a page.
 Source: the Parquet format (parquet.thrift) and Thrift's compact protocol, of which a page's header is one struct.
 """
 
 import mmap
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,11 +17,18 @@ import pyarrow.parquet as pq
 DATA_PAGE, DATA_PAGE_V2 = 0, 3
 PLAIN = 0
 # Fields of a PageHeader, and of its struct on a data page of either version.
-KIND, SIZE, HEADER_V1, HEADER_V2 = 1, 3, 5, 8
+KIND, SIZE, CRC, HEADER_V1, HEADER_V2 = 1, 3, 4, 5, 8
 VALUES, ENCODING_V1, ENCODING_V2 = 1, 2, 4
 STOP, TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRUCT = range(13)
 Struct = dict[int, "int | Struct"]
 Whole = npt.NDArray[np.int64]
+
+
+NO_CRC = -1
+
+
+class Damaged(Exception):
+    """A page is not what was written."""
 
 
 class NotPlain(Exception):
@@ -34,8 +43,20 @@ class Pages:
     "Number of each page's first value."
     begin_P: Whole
     "Byte of the file at which its values begin."
+    page_P: Whole
+    "Byte at which each page begins, behind its header; the levels of the list stand before the values."
+    end_P: Whole
+    "Byte behind it."
+    crc_P: Whole
+    "CRC-32 of these bytes; NO_CRC where the header has none, as before 2026-11-24."
     values: int
     "Of the whole column."
+
+    def refuse_damaged(self, data: memoryview, page: int) -> None:
+        """Raise Damaged where a page's bytes have not the checksum of its header."""
+        crc = int(self.crc_P[page])
+        if crc != NO_CRC and zlib.crc32(data[int(self.page_P[page]) : int(self.end_P[page])]) != crc:
+            raise Damaged(f"the checksum of the page at byte {self.page_P[page]} is another")
 
 
 def find_pages(parquet: pq.ParquetFile, data: mmap.mmap, column: int, width: int) -> Pages:
@@ -43,8 +64,7 @@ def find_pages(parquet: pq.ParquetFile, data: mmap.mmap, column: int, width: int
 
     Raises NotPlain where it is compressed, encoded, or its pages do not add up.
     """
-    first: list[int] = []
-    begin: list[int] = []
+    pages: list[tuple[int, int, int, int, int]] = []
     values = 0
     for group in range(parquet.num_row_groups):
         chunk = parquet.metadata.row_group(group).column(column)
@@ -60,13 +80,15 @@ def find_pages(parquet: pq.ParquetFile, data: mmap.mmap, column: int, width: int
             size = header.get(SIZE)
             if not isinstance(size, int) or size < count * width or body + size > end:
                 raise NotPlain
-            first.append(values)
-            begin.append(body + size - count * width)  # the levels of the list stand before the values
+            said = header.get(CRC)
+            crc = said & 0xFFFFFFFF if isinstance(said, int) else NO_CRC
+            pages.append((values, body + size - count * width, body, body + size, crc))
             values += count
             at = body + size
         if values - before != chunk.num_values:
             raise NotPlain
-    return Pages(first_P=np.array(first, np.int64), begin_P=np.array(begin, np.int64), values=values)
+    first_P, begin_P, page_P, end_P, crc_P = np.array(pages, np.int64).reshape(-1, 5).T
+    return Pages(first_P=first_P, begin_P=begin_P, page_P=page_P, end_P=end_P, crc_P=crc_P, values=values)
 
 
 def _values(header: Struct) -> int:

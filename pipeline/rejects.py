@@ -7,26 +7,36 @@ from collections import Counter
 from collections.abc import Iterable
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from pipeline import storage
-from pipeline.records import Rejection
+from pipeline import parquet_files, storage
+from pipeline.records import InputError, Rejection
 
 FILE = "rejected.parquet"
 SCHEMA = pa.schema([("path", pa.string()), ("reason", pa.string()), ("found", pa.string())])
 
 
 def write(folder: str, rejected: Iterable[Rejection], keep: bool) -> int:
-    """Write the list, by path, and return its length; `keep`: beside what it holds already."""
+    """Write the list, by path, and return its length; `keep`: beside what it holds already.
+
+    Raises InputError where that cannot be read.
+    """
     path = storage.join(folder, FILE)
     listed = {(rejection.path, rejection.reason, rejection.found) for rejection in rejected}
     if keep and storage.exists(path):
-        with storage.open_read(path) as stream:
-            listed.update(zip(*pq.read_table(stream).to_pydict().values(), strict=True))
+        listed.update(zip(*_read(path).to_pydict().values(), strict=True))
     table = pa.Table.from_pylist([dict(zip(SCHEMA.names, row, strict=True)) for row in sorted(listed)], SCHEMA)
-    with storage.atomic(path) as stream:
-        pq.write_table(table, stream)
+    parquet_files.write_table(path, table)
     return len(table)
+
+
+def _read(path: str) -> pa.Table:
+    try:
+        return parquet_files.read_table(path)
+    except parquet_files.DAMAGE as error:
+        raise InputError(
+            f"{path} cannot be read ({error}), expected the list of refused images; delete it and run the same command again: "
+            "it lists what is refused from now on"
+        ) from None
 
 
 def commonest(rejected: Iterable[Rejection]) -> str:

@@ -8,10 +8,9 @@ from typing import Any, Literal
 
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
-from pipeline import storage
-from pipeline.evaluation_files import GAP, GROUPS, PARTS, VIEWS
+from pipeline import parquet_files, storage
+from pipeline.evaluation_folder import GAP, GROUPS, METRICS, PARTS, RESULTS, VIEWS, read_rows
 from pipeline.features import Floats
 from pipeline.records import InputError
 
@@ -86,22 +85,30 @@ def read_findings(folder: str) -> Findings:
 
     Raises InputError when there is none.
     """
-    if not storage.exists(storage.join(folder, "metrics.json")):
+    if not storage.exists(storage.join(folder, METRICS)):
         raise InputError(f"no finished evaluation at {folder}: found no metrics.json; make one with jobs/evaluate.py")
-    with storage.open_read(storage.join(folder, "queries.parquet")) as stream:
-        results = pq.read_table(stream)
+    path = storage.join(folder, RESULTS)
+    try:
+        results = parquet_files.read_table(path)
+    except parquet_files.DAMAGE as error:
+        raise InputError(
+            f"{path} cannot be read ({error}), expected the rows of a finished evaluation; delete {folder} and evaluate again "
+            "with jobs/evaluate.py"
+        ) from None
     return Findings(
         name=folder.rstrip("/").rsplit("/", 1)[-1],
-        metrics=storage.read_json(storage.join(folder, "metrics.json")),
+        metrics=read_rows(folder, METRICS),
         results=results,
         **read_besides(folder),
     )
 
 
 def read_besides(folder: str) -> dict[str, tuple[dict[str, Any], ...]]:
-    """What an evaluation holds besides its measures, by the names of Findings' fields; empty where it was not taken."""
-    paths = {name: storage.join(folder, file) for name, file in BESIDES.items()}
-    return {name: tuple(storage.read_json(path)) if storage.exists(path) else () for name, path in paths.items()}
+    """What an evaluation holds besides its measures, by the names of Findings' fields; empty where it was not taken.
+
+    Raises InputError where a file is not what was written.
+    """
+    return {name: tuple(read_rows(folder, file)) for name, file in BESIDES.items()}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,9 +11,8 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
-from pipeline import storage
+from pipeline import parquet_files, storage
 from pipeline.records import ImageRecord, InputError, Rejection, Split, View
 from pipeline.shards import Manifest, Shard
 
@@ -48,22 +47,21 @@ def row(record: ImageRecord, shard: str, facts: dict[str, Any], size: int) -> di
 def write_part(out: str, packed: Packed, rows: list[dict[str, Any]]) -> None:
     footer = {FOOTER: json.dumps(asdict(packed), sort_keys=True)}
     table = pa.Table.from_pylist(rows, SCHEMA.with_metadata(footer))
-    with storage.atomic(_path(out, packed.shard.name)) as stream:
-        pq.write_table(table, stream)
+    parquet_files.write_table(_path(out, packed.shard.name), table)
 
 
 def read_packed(out: str, name: str) -> Packed | None:
     """What became of a tar; None where its part is missing or cannot be read."""
     try:
-        with storage.open_read(_path(out, name)) as stream:
-            said = json.loads(pq.read_schema(stream).metadata[FOOTER])
+        with parquet_files.opened(_path(out, name)) as parquet:
+            said = json.loads(parquet.schema_arrow.metadata[FOOTER])
         shard = said["shard"]
         return Packed(
             shard=Shard(**shard | {"split": Split(shard["split"]), "view": View(shard["view"])}),
             plan=said["plan"],
             rejected=tuple(Rejection(**rejection) for rejection in said["rejected"]),
         )
-    except (OSError, pa.ArrowInvalid, KeyError, TypeError, ValueError):
+    except (*parquet_files.DAMAGE, KeyError, TypeError):
         return None
 
 
@@ -74,9 +72,8 @@ def read_part(out: str, name: str, columns: list[str] | None = None) -> pa.Table
     """
     path = _path(out, name)
     try:
-        with storage.open_read(path) as stream:
-            return pq.read_table(stream, columns=columns)
-    except (OSError, pa.ArrowInvalid) as error:
+        return parquet_files.read_table(path, columns)
+    except parquet_files.DAMAGE as error:
         raise InputError(
             f"{path} cannot be read ({error}); expected the record table that packing wrote beside the tars; run "
             "jobs/make_shards.py again as it was run first, which makes what is missing"
@@ -102,10 +99,10 @@ def export(shards: str, manifest: Manifest, file: str) -> tuple[int, int]:
     """
     if file.lower().endswith(".parquet"):
         written = 0
-        with storage.atomic(file) as stream, pq.ParquetWriter(stream, SCHEMA) as writer:
+        with parquet_files.writer(file, SCHEMA) as columns:
             for shard in manifest.shards:
                 table = read_part(shards, shard.name).cast(SCHEMA)
-                writer.write_table(table)
+                columns.write_table(table)
                 written += len(table)
         return written, 0
     if not file.lower().endswith((".geojson", ".json")):

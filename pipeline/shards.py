@@ -6,7 +6,7 @@ In: a folder or URI. Out: the Manifest.
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline import storage
+from pipeline import sealed, storage
 from pipeline.records import InputError, Split, View
 
 SCHEMA_VERSION = 1
@@ -54,7 +54,7 @@ def read_manifest(shards: str) -> Manifest:
     if not storage.exists(path):
         raise InputError(f"no {MANIFEST} in {shards}: not a finished set of shards; make one with jobs/make_shards.py")
     try:
-        said = storage.read_json(path)
+        said = sealed.read(path)
         if said["schema_version"] != SCHEMA_VERSION:
             raise InputError(
                 f"{path} has schema version {said['schema_version']}, expected {SCHEMA_VERSION}; pack again"
@@ -66,4 +66,7 @@ def read_manifest(shards: str) -> Manifest:
             **said | {"shards": shard_list, "classes": tuple(said["classes"]), "added": tuple(said.get("added", ()))}
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is damaged ({error}); delete it and run jobs/make_shards.py again") from None
+        raise InputError(
+            f"{path} is damaged ({error}), expected what packing writes last; put it back from a copy, or delete it and run "
+            "jobs/make_shards.py again as it was run, and after it each --extend"
+        ) from None

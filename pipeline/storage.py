@@ -195,5 +195,10 @@ def write_bytes(path: str, data: bytes) -> None:
         stream.write(data)
 
 
+def as_json(value: Any) -> bytes:
+    """The file that `write_json` writes."""
+    return (json.dumps(value, indent=2, ensure_ascii=False) + "\n").encode()
+
+
 def write_json(path: str, value: Any) -> None:
-    write_bytes(path, (json.dumps(value, indent=2, ensure_ascii=False) + "\n").encode())
+    write_bytes(path, as_json(value))

@@ -16,7 +16,7 @@ from typing import IO, Any
 import numpy as np
 import pytest
 
-from pipeline import cluster, storage
+from pipeline import cluster, sealed, storage
 from pipeline.embed import EmbeddingSettings, Encoder, Incomplete, Network, embed_gallery
 from pipeline.feature_parts import part_names, read_footer, read_rejected
 from pipeline.features import open_table, verify
@@ -235,7 +235,7 @@ def test_shards_added_later_are_all_that_is_embedded(
     tmp_path: Path, copied: Path, undisturbed: dict[str, bytes], ray_cluster: None
 ) -> None:
     out, manifest = tmp_path / "table", copied / "manifest.json"
-    said = storage.read_json(str(manifest))
+    said = sealed.read(str(manifest))
     shards = said["shards"]
     storage.write_json(str(manifest), said | {"shards": shards[:-2]})
     embed_gallery(settings_of(copied, out), network_of_colours())

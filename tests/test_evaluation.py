@@ -164,5 +164,8 @@ def test_an_evaluation_beside_must_be_of_the_same_images(tmp_path: Path) -> None
     (tmp_path / "reduced" / "metrics.json").write_text(
         (tmp_path / "reduced" / "metrics.json").read_text().replace('"gallery": 16', '"gallery": 9')
     )
+    with pytest.raises(InputError, match=r"reduced/metrics.json is damaged .* evaluate again"):
+        evaluate(EvaluationSettings(queries=queries, gallery=gallery, out=str(tmp_path / "one"), beside=other))
+    (tmp_path / "reduced" / "evaluation.json").unlink()
     with pytest.raises(InputError, match=r"reduced ranked 10 queries in 9 rows.*same images"):
         evaluate(EvaluationSettings(queries=queries, gallery=gallery, out=str(tmp_path / "one"), beside=other))

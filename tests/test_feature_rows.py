@@ -63,7 +63,7 @@ def test_embeddings_that_are_not_plain_are_refused(tmp_path: Path, stored: dict[
     write_table_part(tmp_path, 0, clustered(20, 8, 1))
     table = pq.read_table(tmp_path / NAME)
     pq.write_table(table, tmp_path / NAME, **stored)
-    with pytest.raises(InputError, match="compressed or encoded, expected plain ones"):
+    with pytest.raises(InputError, match="compressed, encoded or damaged, expected plain ones"):
         RowReader(str(tmp_path), 8).read(NAME, "shard 0", np.array([3]))
 
 

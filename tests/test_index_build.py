@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from index_tables import clustered, write_gallery, write_table_part
 
-from pipeline import index_build, index_work, storage
+from pipeline import index_build, index_work, sealed, storage
 from pipeline.features import open_table
 from pipeline.index import Index
 from pipeline.index_build import IndexSettings, build_index, parse_bytes
@@ -279,7 +279,7 @@ def test_a_torn_or_missing_file_is_named(table: str, tmp_path: Path, name: str) 
 def test_an_index_that_another_wrote_is_refused(table: str, tmp_path: Path, change: object, sentence: str) -> None:
     out = tmp_path / "index"
     build(table, out)
-    facts = json.loads((out / "index.json").read_text())
+    facts = sealed.read(str(out / "index.json"))
     (out / "index.json").write_text(json.dumps(change(facts)))  # type: ignore[operator]
     with pytest.raises(InputError, match=sentence):
         Index(str(out))

@@ -24,6 +24,7 @@ from jobs.photo_encoder import PhotoEncoder
 from jobs.serve import Settings, load, main
 from model.checkpoint import Checkpoint, dumps
 from model.pvda import FeatureEncoder, PVDAConfig
+from pipeline import sealed
 from pipeline.features import PartFooter, PartRows, write_part
 from pipeline.index_build import IndexSettings, build_index
 from pipeline.records import InputError
@@ -135,7 +136,7 @@ def test_a_network_that_did_not_make_the_index_ends_it_with_a_sentence(
     road: tuple[Path, Path], ray_cluster: None
 ) -> None:
     checkpoint, index = road
-    said = json.loads((index / "index.json").read_text())
+    said = sealed.read(str(index / "index.json"))
     (index / "index.json").write_text(json.dumps(said | {"fingerprint": "e" * 64}))
     with pytest.raises(InputError, match="did not make this index"):
         main(Settings(checkpoint=str(checkpoint), index=str(index), port=0, threads=1))

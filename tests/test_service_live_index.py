@@ -14,6 +14,7 @@ import pytest
 from aiohttp.test_utils import TestClient, TestServer
 from test_service_question import photo
 
+from pipeline import sealed
 from pipeline.features import Floats, PartFooter, PartRows, write_part
 from pipeline.index_build import IndexSettings, build_index
 from pipeline.locate import Answer
@@ -90,7 +91,7 @@ def test_a_new_index_is_taken_over_and_a_search_under_way_keeps_the_old_one(path
 
 def broken_files(path: Path) -> None:
     (path / "index.faiss").write_bytes(b"no index")
-    (path / "index.json").write_text(json.dumps(json.loads((path / "index.json").read_text()) | {"build_seconds": 9}))
+    (path / "index.json").write_text(json.dumps(sealed.read(str(path / "index.json")) | {"build_seconds": 9}))
 
 
 BROKEN = {

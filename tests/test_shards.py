@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from pipeline import storage
+from pipeline import sealed, storage
 from pipeline.packing import PackingSettings, TooManyRejected, pack
 from pipeline.records import ImageRecord, InputError, Split, View
 from pipeline.shard_plan import ShardSize, plan_shards
@@ -137,7 +137,7 @@ def test_street_images_come_when_asked_for(tmp_path: Path) -> None:
 
 
 def test_a_damaged_manifest_is_refused_with_the_remedy(tmp_path: Path, tiny_shards: str) -> None:
-    said = storage.read_json(storage.join(tiny_shards, "manifest.json"))
+    said = sealed.read(storage.join(tiny_shards, "manifest.json"))
     for damage in ({"schema_version": 9}, {"shards": [{"name": "x"}]}):
         storage.write_json(str(tmp_path / "manifest.json"), said | damage)
         with pytest.raises(InputError, match="again"):
