@@ -13,7 +13,7 @@ from typing import Any
 
 import ray
 
-from pipeline import cluster, rejects, storage
+from pipeline import cluster, part_list, rejects, storage
 from pipeline.crew import CannotWork, Crew, NobodyCame, SetAside, Terms
 from pipeline.exclusive import one_at_a_time
 from pipeline.feature_parts import REJECTED, PartHeader, list_rejected, part_names, read_header, read_headers
@@ -87,6 +87,7 @@ def embed_gallery(settings: EmbeddingSettings, network: Network) -> int:
     """
     wanted = wanted_shards(settings)
     missing = missing_shards(settings, network, wanted)
+    part_list.promise(settings.out, [f"{shard.name}.parquet" for shard in wanted])
     crew, lost, embedded = None, dict[str, SetAside](), 0
     if missing:
         cluster.connect()
@@ -95,7 +96,8 @@ def embed_gallery(settings: EmbeddingSettings, network: Network) -> int:
         placement = place(nodes, len(missing), *given)
         crew = Crew(terms_of(settings, network, placement, nodes))
         embedded, lost = run(settings, crew, missing, placement)
-    storage.sweep(settings.out, [f"{shard.name}.parquet" for shard in wanted])
+    part_list.give_up(settings.out, [f"{name}.parquet" for name in lost])
+    storage.sweep(settings.out, [part_list.LIST, *(f"{shard.name}.parquet" for shard in wanted)])
     rejections = [
         (header.name.removesuffix(".parquet"), one)
         for header in read_headers(settings.out)

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from pipeline import storage
+from pipeline import part_list, storage
 from pipeline.ahead import ahead
 from pipeline.feature_parts import (
     READERS,
@@ -236,6 +236,7 @@ def _open(path: str) -> FeatureTable:
     names = part_names(path)
     if not names:
         raise InputError(f"no feature table at {path}: found no Parquet part; make one with jobs/embed_gallery.py")
+    part_list.refuse_missing(path, names)
     found = list(ahead(lambda name: _open_one(storage.join(path, name)), names, READERS, 4 * READERS))
     headers = [header for header, _ in found]
     _refuse_mixed(path, headers)

@@ -18,7 +18,7 @@ from pipeline.exclusive import one_at_a_time
 from pipeline.feature_rows import readable
 from pipeline.features import FeatureTable, open_table
 from pipeline.index import Index
-from pipeline.index_facts import FACTS, Effort, IndexFacts, as_said, read_facts, write_facts
+from pipeline.index_facts import FACTS, Effort, IndexFacts, as_said, check_files, read_facts, write_facts
 from pipeline.index_measure import Held, efforts, hold_queries, speed, tuned
 from pipeline.index_plan import Gallery, Plan, plan_factory, plan_index
 from pipeline.index_training import SPECTRUM_ROWS, effective_dimension, new_index, sample, train
@@ -89,8 +89,11 @@ def build_index(settings: IndexSettings) -> dict[str, Any]:
     table = open_table(settings.table)
     chosen = table.select(settings.split, settings.view)
     asked = {name: getattr(settings, name) for name in ("split", "view", "factory", "refine", "parts")}
-    if storage.exists(storage.join(settings.out, FACTS)):
-        return _finished(settings.out, chosen, asked)
+    if (
+        storage.exists(storage.join(settings.out, FACTS))
+        and (told := _finished(settings.out, chosen, asked)) is not None
+    ):
+        return as_said(told)
     rows_of_part = rows_by_part(chosen)
     if not rows_of_part:
         held = ", ".join(f"{count} {split} {view}" for (split, view), count in table.counts.items())
@@ -171,8 +174,8 @@ def finish(out: str, facts: IndexFacts, held: Held, workshop: Workshop, start: f
     return as_said(facts)
 
 
-def _finished(out: str, table: FeatureTable, asked: dict[str, Any]) -> dict[str, Any]:
-    """A finished index of the same rows and settings.
+def _finished(out: str, table: FeatureTable, asked: dict[str, Any]) -> IndexFacts | None:
+    """A finished index of the same rows and settings; None where it was one and is to be built again.
 
     Raises InputError where it is another's.
     """
@@ -180,11 +183,32 @@ def _finished(out: str, table: FeatureTable, asked: dict[str, Any]) -> dict[str,
     held = told.table_parts
     missing = rows_by_part(table.only([name for name in table.parts if name not in held]))
     if told.asked == asked and told.fingerprint == table.fingerprint and held.items() <= table.shards.items():
-        if not missing:
+        if not missing and _is_whole(out, told):
             console.print(f"{out} is complete: {told.rows} rows, {told.factory}; nothing to do")
-            return as_said(told)
+            return told
+        if not missing:
+            storage.remove(storage.join(out, FACTS))
+            return None
         raise InputError(
             f"{out} holds an index of {len(held)} parts of the table, which has {len(missing)} more by now; say --extend to "
             "add them, or choose another --out"
         )
     raise InputError(f"{out} holds an index of other rows or settings; choose another --out or delete it")
+
+
+def _is_whole(out: str, told: IndexFacts) -> bool:
+    """Whether each file of an index is there and has its size.
+
+    Raises InputError where not, and building again would not give the same index.
+    """
+    try:
+        for files in (told.trained, *(part.files for part in told.parts)):
+            check_files(out, files)
+    except InputError as error:
+        if any(part.removed for part in told.parts):
+            raise InputError(
+                f"{error}, and remove the {sum(len(part.removed) for part in told.parts)} locations again"
+            ) from None
+        console.print(f"{out}: a file is missing or has another size; the index is built again", style="yellow")
+        return False
+    return True
