@@ -31,6 +31,7 @@ from pipeline.feature_parts import (
     part_names,
     part_schema,
     read_footer,
+    verify_part,
     write_part,
 )
 from pipeline.feature_selection import Box, Selection
@@ -221,10 +222,12 @@ def open_table(path: str) -> FeatureTable:
 
 
 def verify(path: str) -> FeatureTable:
-    """`open_table`, and every row is read: keys that are there once, embeddings of unit length. Takes 8 bytes a row.
+    """`open_table`, and every byte and row is looked at: keys there once, embeddings of unit length. Takes 8 bytes a row.
 
     Raises InputError, naming the part, where they are not.
     """
+    for name in part_names(path):
+        verify_part(storage.join(path, name))
     table = _open(path)
     _refuse_repeats(table)
     for _ in table.blocks(dtype="stored"):

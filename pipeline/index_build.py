@@ -16,7 +16,7 @@ import faiss
 from pipeline import storage
 from pipeline.exclusive import one_at_a_time
 from pipeline.feature_rows import readable
-from pipeline.features import FeatureTable, open_table
+from pipeline.features import FeatureTable, open_table, verify
 from pipeline.index import Index
 from pipeline.index_facts import FACTS, Effort, IndexFacts, as_said, read_facts, write_facts
 from pipeline.index_measure import Held, efforts, hold_queries, speed, tuned
@@ -53,6 +53,8 @@ class IndexSettings:
     "Parts of the index, each a file that a machine of a cluster can hold."
     workers: int = 0
     "Ray tasks that build units of the index, of one core each; 0: this process builds, on all cores."
+    verify: bool = False
+    "Look at every byte of the table first, and of an index that is finished."
 
     def __post_init__(self) -> None:
         if not 0 < self.target_recall <= 1:
@@ -86,10 +88,12 @@ def build_index(settings: IndexSettings) -> dict[str, Any]:
 
     Raises InputError on unusable input, and where no index fits the budget.
     """
-    table = open_table(settings.table)
+    table = verify(settings.table) if settings.verify else open_table(settings.table)
     chosen = table.select(settings.split, settings.view)
     asked = {name: getattr(settings, name) for name in ("split", "view", "factory", "refine", "parts")}
     if storage.exists(storage.join(settings.out, FACTS)):
+        if settings.verify:
+            Index(settings.out, whole=True)
         return _finished(settings.out, chosen, asked)
     rows_of_part = rows_by_part(chosen)
     if not rows_of_part:
