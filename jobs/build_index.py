@@ -1,7 +1,7 @@
 """Feature table -> FAISS index: `build_index.py --table TABLE --out INDEX`.
 
 And of a finished index: `--extend --table TABLE --out INDEX` adds the table's new parts, `--remove LOCATION ... --out INDEX`
-makes locations answer no more, `--verify --out INDEX` looks at every byte.
+makes locations answer no more, `--verify --out INDEX` looks at every byte. `--verify` while building: of the table.
 """
 
 import sys
@@ -39,4 +39,7 @@ def verify(out: str, verify: tyro.conf.FlagCreatePairsOff[bool] = False) -> None
 
 if __name__ == "__main__":
     words = {word.partition("=")[0] for word in sys.argv}
-    run(extend if "--extend" in words else remove if "--remove" in words else verify if "--verify" in words else main)
+    run(
+        extend if "--extend" in words else remove if "--remove" in words
+        else verify if "--verify" in words and "--table" not in words else main
+    )  # fmt: skip

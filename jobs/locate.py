@@ -23,6 +23,7 @@ from pipeline import answer_files, rejects, storage
 from pipeline.answer_files import Located
 from pipeline.answer_page import Place, Surroundings, render
 from pipeline.confidence import Confidence, find_confidence, read_confidence
+from pipeline.feature_parts import verify_part
 from pipeline.flight import LIKELIER, motion_over, settle
 from pipeline.gallery_map import GalleryMap, gallery_map
 from pipeline.index import Index
@@ -77,6 +78,8 @@ class Settings:
     "CSV table with the columns photo and time (seconds or ISO 8601); by default the camera's own times."
     interval: float | None = None
     "Seconds between photos in the order of their names, where neither tables nor cameras say when."
+    verify: bool = False
+    "Look at every byte of the index first, and of the table's parts where it answers by their vectors."
     calibration: str | None = None
     "What jobs/calibrate.py wrote; by default INDEX/calibration.json where it is there."
     csv: str | None = None
@@ -105,7 +108,10 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
     """
     photos = find_photos(settings.photos)
     checkpoint = read_checkpoint(settings.checkpoint)
-    index = Index(settings.index)
+    index = Index(settings.index, whole=settings.verify or None)
+    if settings.verify and index.told.refine == "table":
+        for name in index.told.table_parts:
+            verify_part(storage.join(index.told.table, name))
     confidence = confidence_of(settings, index)
     encoder = PhotoEncoder(checkpoint, settings.checkpoint, index.facts, settings.shards)
     gallery = gallery_map(index)

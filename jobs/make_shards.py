@@ -68,8 +68,8 @@ def check(out: str, verify: bool = False) -> None:
         console.print(sentence)
     if wrong:
         raise Unfinished(
-            f"{out} is damaged in {len(wrong)} places; delete the tars that are named and run the command that packed "
-            "them again: it makes only what is missing"
+            f"{out} is damaged in {len(wrong)} places; run the command that packed it again: it makes anew the shards that are "
+            "named, and no others"
         )
     console.print(f"{out}: all {count} shards are what was packed")
 

@@ -30,7 +30,9 @@ from model.weights import load_backbone, read_state_dict
 from pipeline import cluster, storage
 from pipeline.exclusive import one_at_a_time
 from pipeline.progress import Meter, console, progress
-from pipeline.records import InputError, Unfinished
+from pipeline.records import InputError, Split, Unfinished
+from pipeline.shards import read_manifest, refuse_missing
+from pipeline.verification import refuse_damaged
 
 if TYPE_CHECKING:
     RecipeChoice = Recipe
@@ -57,6 +59,8 @@ class Settings(Conduct):
     "Ray Train workers; 0 trains in this process."
     gpus_per_worker: float | None = None
     "GPUs of a worker; by default one where there are any."
+    verify: bool = False
+    "Look at every byte of the shards first; without it, that each tar is there and has its size."
     max_failures: int = 3
     "How often lost Ray workers are replaced and training goes on from the last checkpoint, before the job gives up."
 
@@ -88,6 +92,10 @@ def train(settings: Settings) -> str:
     if done == epochs:
         console.print(f"{path} is complete: {epochs} epochs of recipe {settings.recipe.name}; nothing to do")
         return path
+    if settings.verify:
+        refuse_damaged(this.shards, None if settings.workers else 0)
+    else:
+        refuse_missing(this.shards, read_manifest(this.shards).of(Split.TRAIN))
     steps = open_stream(this, Place(world=max(1, settings.workers))).steps
     if this.weights is not None and found is None:
         load_backbone(FeatureEncoder(this.recipe.network).backbone, read_state_dict(this.weights), this.weights)

@@ -16,7 +16,15 @@ import ray
 from pipeline import cluster, part_list, rejects, storage
 from pipeline.crew import CannotWork, Crew, NobodyCame, SetAside, Terms
 from pipeline.exclusive import one_at_a_time
-from pipeline.feature_parts import REJECTED, PartHeader, list_rejected, part_names, read_header, read_headers
+from pipeline.feature_parts import (
+    REJECTED,
+    PartHeader,
+    list_rejected,
+    part_names,
+    read_header,
+    read_headers,
+    verify_part,
+)
 from pipeline.foreign import open_manifest
 from pipeline.placement import Node, Placement, place
 from pipeline.progress import console, progress
@@ -30,7 +38,8 @@ from pipeline.shard_embedder import (
     Network,
     ShardEmbedder,
 )
-from pipeline.shards import Manifest, Shard
+from pipeline.shards import MANIFEST, Manifest, Shard, mending, missing_tars
+from pipeline.verification import refuse_damaged
 
 __all__ = ["EmbeddingSettings", "Encoder", "Incomplete", "Network", "embed_gallery"]
 
@@ -61,6 +70,8 @@ class EmbeddingSettings:
     "Threads of an actor that decode; by default its cores but one beside a GPU, else one per four cores."
     patience: float = 600.0
     "Seconds to wait for the first actor to start, before giving up."
+    verify: bool = False
+    "Look at every byte of the shards first, and of the parts that are done: damaged parts are embedded again."
 
     def __post_init__(self) -> None:
         if self.batch_size < 1:
@@ -85,17 +96,25 @@ def embed_gallery(settings: EmbeddingSettings, network: Network) -> int:
     `settings` must name paths that a worker can open (absolute, or URIs). Raises InputError on unusable input, Incomplete
     where shards are unreadable or kill their workers, the others being done.
     """
+    if settings.verify and storage.exists(storage.join(settings.shards, MANIFEST)):
+        refuse_damaged(settings.shards)
     wanted = wanted_shards(settings)
     missing = missing_shards(settings, network, wanted)
     part_list.promise(settings.out, [f"{shard.name}.parquet" for shard in wanted])
-    crew, lost, embedded = None, dict[str, SetAside](), 0
-    if missing:
+    absent = missing_tars(settings.shards, missing)  # said now, and not when their turn comes
+    asked = mending(settings.shards)
+    lost = {name: SetAside(reason="unusable", found=f"{said}; {asked}") for name, said in absent.items()}
+    embedded = 0
+    for name, aside in lost.items():
+        console.print(f"{name} is set aside ({aside.reason}): {aside.found}", style="yellow")
+    if todo := [shard for shard in missing if shard.name not in lost]:
         cluster.connect()
         nodes = cluster.nodes()
         given = (settings.workers, settings.cpus_per_worker, settings.gpus_per_worker)
-        placement = place(nodes, len(missing), *given)
+        placement = place(nodes, len(todo), *given)
         crew = Crew(terms_of(settings, network, placement, nodes))
-        embedded, lost = run(settings, crew, missing, placement)
+        embedded, given_up = run(settings, crew, todo, placement)
+        lost |= given_up
     part_list.give_up(settings.out, [f"{name}.parquet" for name in lost])
     storage.sweep(settings.out, [part_list.LIST, *(f"{shard.name}.parquet" for shard in wanted)])
     rejections = [
@@ -148,6 +167,8 @@ def missing_shards(settings: EmbeddingSettings, network: Network, wanted: Sequen
     for name in part_names(settings.out):
         try:
             header = read_header(storage.join(settings.out, name))
+            if settings.verify:
+                verify_part(storage.join(settings.out, name))
         except InputError as error:
             if name not in own:
                 raise

@@ -17,7 +17,7 @@ from pipeline.chosen_rows import vectors_by_key
 from pipeline.evaluation_files import Besides, Export, write_besides
 from pipeline.evaluation_folder import INPUTS, METRICS, RESULTS, read_inputs, read_rows, write_inputs
 from pipeline.exclusive import one_at_a_time
-from pipeline.features import FeatureTable, Floats, open_table
+from pipeline.features import FeatureTable, Floats, open_table, verify
 from pipeline.progress import console, progress
 from pipeline.records import InputError, Split, View
 from pipeline.report import render
@@ -25,6 +25,7 @@ from pipeline.report_inputs import Extras, Findings, Format, no_pictures, read_b
 from pipeline.report_panels import PANELS
 from pipeline.retrieval import METRICS_SCHEMA, Protocol, Task, possible_tasks, retrieve, side_of
 from pipeline.shards import read_manifest
+from pipeline.verification import refuse_damaged
 
 ViewName = Literal["drone", "satellite", "street", "google"]
 SHOWN = ("title", "shards", "panels", "views", "parts", "by", "exports", "figures", "answer_order")
@@ -63,6 +64,8 @@ class EvaluationSettings:
     "Hits, and as many misses, that the report shows of each task; a few are open, the others unfold."
     workers: int = 0
     "Ray tasks that rank, of one core each, each for some of the queries; 0: this process ranks, on all cores."
+    verify: bool = False
+    "Look at every byte of the tables first, and of the shards where they are given."
     views: bool = True
     "Whether to measure drone->satellite by the number of views a query is the mean of."
     parts: bool = True
@@ -110,6 +113,8 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
         "protocol": settings.protocol, "tasks": [str(task) for task in tasks],
     }  # fmt: skip
     if settings.shards:
+        if settings.verify:
+            refuse_damaged(settings.shards)
         read_manifest(settings.shards)  # that there are none is better said before the ranking than after it
     extras = read_extras(settings.title, settings.run, settings.beside)
     shown = {name: _plain(getattr(settings, name)) for name in SHOWN} | {"extras": extras.sha256}
@@ -140,8 +145,9 @@ def plan(settings: EvaluationSettings) -> tuple[FeatureTable, FeatureTable, list
 
     Raises InputError when they come from different networks, allow no task, or more than the one that was asked for.
     """
-    queries = open_table(settings.table or settings.queries or "")
-    gallery = queries if settings.table else open_table(settings.gallery or "")
+    opened = verify if settings.verify else open_table
+    queries = opened(settings.table or settings.queries or "")
+    gallery = queries if settings.table else opened(settings.gallery or "")
     if queries.fingerprint != gallery.fingerprint:
         raise InputError(
             f"queries were embedded by network {queries.fingerprint[:12]} and the gallery by {gallery.fingerprint[:12]}; "

@@ -191,6 +191,24 @@ def read_headers(path: str) -> list[PartHeader]:
     return list(ahead(lambda name: read_header(storage.join(path, name)), part_names(path), READERS, 4 * READERS))
 
 
+def refuse_mixed(path: str, headers: Sequence[PartHeader]) -> None:
+    """Raise InputError where parts cannot stand in one table: of different networks, or of different numbers."""
+    fingerprints = sorted({header.footer.fingerprint for header in headers})
+    if len(fingerprints) > 1:
+        other = next(one for one in headers if one.footer.fingerprint != headers[0].footer.fingerprint)
+        raise InputError(
+            f"{path} holds features of {len(fingerprints)} networks ({', '.join(f[:12] for f in fingerprints)}; {other.name} "
+            f"is not of {headers[0].name}'s), expected one; embed into an empty folder with jobs/embed_gallery.py --out"
+        )
+    first = headers[0]
+    for one in headers:
+        if (one.dimension, one.dtype) != (first.dimension, first.dtype):
+            raise InputError(
+                f"{storage.join(path, one.name)} holds {one.dtype} of {one.dimension} dimensions and {first.name} "
+                f"{first.dtype} of {first.dimension}, expected the same in all parts; delete it and embed its shard again"
+            )
+
+
 def list_rejected(table: str, rejected: Iterable[tuple[str, str | None, str, str]]) -> bool:
     """Write what has no row, as (shard, key, reason, found), in that order; the key is None where it is the whole shard.
 

@@ -31,6 +31,8 @@ from pipeline.feature_parts import (
     part_names,
     part_schema,
     read_footer,
+    refuse_mixed,
+    verify_part,
     write_part,
 )
 from pipeline.feature_selection import Box, Selection
@@ -211,7 +213,7 @@ class FeatureTable:
 def open_table(path: str) -> FeatureTable:
     """Open a feature table.
 
-    Raises InputError when there is none, when a part is torn or another's, when the parts come from different networks or
+    Raises InputError when there is none, when a part is missing, torn or another's, when the parts come from different networks or
     hold different numbers, and when a key is there twice (looked for in tables of up to KEYS_AT_OPENING rows).
     """
     table = _open(path)
@@ -221,10 +223,12 @@ def open_table(path: str) -> FeatureTable:
 
 
 def verify(path: str) -> FeatureTable:
-    """`open_table`, and every row is read: keys that are there once, embeddings of unit length. Takes 8 bytes a row.
+    """`open_table`, and every byte and row is looked at: keys there once, embeddings of unit length. Takes 8 bytes a row.
 
     Raises InputError, naming the part, where they are not.
     """
+    for name in part_names(path):
+        verify_part(storage.join(path, name))
     table = _open(path)
     _refuse_repeats(table)
     for _ in table.blocks(dtype="stored"):
@@ -239,7 +243,7 @@ def _open(path: str) -> FeatureTable:
     part_list.refuse_missing(path, names)
     found = list(ahead(lambda name: _open_one(storage.join(path, name)), names, READERS, 4 * READERS))
     headers = [header for header, _ in found]
-    _refuse_mixed(path, headers)
+    refuse_mixed(path, headers)
     return FeatureTable(
         path=path,
         fingerprint=headers[0].footer.fingerprint,
@@ -259,23 +263,6 @@ def _open_one(path: str) -> tuple[PartHeader, Counts]:
     for row in table.group_by(["split", "view"]).aggregate([([], "count_all")]).to_pylist():
         counts[Split(row["split"]), View(row["view"])] += row["count_all"]
     return header, counts
-
-
-def _refuse_mixed(path: str, headers: Sequence[PartHeader]) -> None:
-    fingerprints = sorted({header.footer.fingerprint for header in headers})
-    if len(fingerprints) > 1:
-        other = next(one for one in headers if one.footer.fingerprint != headers[0].footer.fingerprint)
-        raise InputError(
-            f"{path} holds features of {len(fingerprints)} networks ({', '.join(f[:12] for f in fingerprints)}; {other.name} "
-            f"is not of {headers[0].name}'s), expected one; embed into an empty folder with jobs/embed_gallery.py --out"
-        )
-    first = headers[0]
-    for one in headers:
-        if (one.dimension, one.dtype) != (first.dimension, first.dtype):
-            raise InputError(
-                f"{storage.join(path, one.name)} holds {one.dtype} of {one.dimension} dimensions and {first.name} "
-                f"{first.dtype} of {first.dimension}, expected the same in all parts; delete it and embed its shard again"
-            )
 
 
 def _refuse_repeats(table: FeatureTable) -> None:

@@ -22,6 +22,9 @@ from pipeline.metrics import Whole
 from pipeline.records import InputError, View
 from pipeline.where import Where
 
+LOOKED_AT = 1 << 30
+"Bytes of an index up to which opening it hashes them: a second, about."
+
 
 @dataclass(frozen=True, kw_only=True)
 class Hit:
@@ -53,10 +56,15 @@ class Index:
     """An index on disk, opened for searching. Not for several threads at once: FAISS spreads a search over the cores itself."""
 
     def __init__(
-        self, path: str, parts: Sequence[int] | None = None, threads: int | None = None, told: IndexFacts | None = None
+        self,
+        path: str,
+        parts: Sequence[int] | None = None,
+        threads: int | None = None,
+        told: IndexFacts | None = None,
+        whole: bool | None = None,
     ) -> None:
         """`parts`: numbers of those to open; all by default. `threads`: of FAISS; by default one per core. `told`: what
-        index.json says, where it is not written yet.
+        index.json says, where it is not written yet. `whole`: whether every byte is looked at, by default of small parts.
 
         Raises InputError when there is no index at `path`, or it is damaged.
         """
@@ -66,7 +74,7 @@ class Index:
         # Ray sets OMP_NUM_THREADS to a task's cores before FAISS is loaded, and in its jobs that is one.
         faiss.omp_set_num_threads(threads or os.cpu_count() or 1)
         with tempfile.TemporaryDirectory() as scratch:  # what is mapped of it lives on without its name
-            self._parts = list(opened_parts(path, self.told, scratch, parts))
+            self._parts = list(opened_parts(path, self.told, scratch, parts, whole))
 
     def __len__(self) -> int:
         """Rows that may answer."""
@@ -114,12 +122,17 @@ class Index:
         return pa.concat_tables(tables).take(pa.array(back))
 
 
-def opened_parts(path: str, told: IndexFacts, scratch: str, parts: Sequence[int] | None = None) -> Iterator[IndexPart]:
-    """The parts of an index, opened."""
+def opened_parts(
+    path: str, told: IndexFacts, scratch: str, parts: Sequence[int] | None = None, whole: bool | None = None
+) -> Iterator[IndexPart]:
+    """The parts of an index, opened. By default every byte is looked at where they are small: FAISS may end the process over a
+    damaged file."""
     reader = RowReader(told.table, told.dimension) if readable(told.table) else None
-    for number, facts in enumerate(told.parts):
-        if parts is None or number in parts:
-            yield IndexPart(path, facts, reader, told.on_disk, scratch)
+    wanted = [facts for number, facts in enumerate(told.parts) if parts is None or number in parts]
+    if whole is None:
+        whole = sum(file["bytes"] for facts in wanted for file in facts.files.values()) <= LOOKED_AT
+    for facts in wanted:
+        yield IndexPart(path, facts, reader, told.on_disk, scratch, whole)
 
 
 def merged(found: Sequence[tuple[Floats, Whole]], k: int) -> tuple[Floats, Whole]:

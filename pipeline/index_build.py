@@ -16,7 +16,7 @@ import faiss
 from pipeline import storage
 from pipeline.exclusive import one_at_a_time
 from pipeline.feature_rows import readable
-from pipeline.features import FeatureTable, open_table
+from pipeline.features import FeatureTable, open_table, verify
 from pipeline.index import Index
 from pipeline.index_facts import FACTS, Effort, IndexFacts, as_said, check_files, read_facts, write_facts
 from pipeline.index_measure import Held, efforts, hold_queries, speed, tuned
@@ -53,6 +53,8 @@ class IndexSettings:
     "Parts of the index, each a file that a machine of a cluster can hold."
     workers: int = 0
     "Ray tasks that build units of the index, of one core each; 0: this process builds, on all cores."
+    verify: bool = False
+    "Look at every byte of the table first, and of an index that is finished."
 
     def __post_init__(self) -> None:
         if not 0 < self.target_recall <= 1:
@@ -86,14 +88,13 @@ def build_index(settings: IndexSettings) -> dict[str, Any]:
 
     Raises InputError on unusable input, and where no index fits the budget.
     """
-    table = open_table(settings.table)
+    table = verify(settings.table) if settings.verify else open_table(settings.table)
     chosen = table.select(settings.split, settings.view)
     asked = {name: getattr(settings, name) for name in ("split", "view", "factory", "refine", "parts")}
-    if (
-        storage.exists(storage.join(settings.out, FACTS))
-        and (told := _finished(settings.out, chosen, asked)) is not None
-    ):
-        return as_said(told)
+    if storage.exists(storage.join(settings.out, FACTS)):
+        told = _finished(settings.out, chosen, asked, settings.verify)
+        if told is not None:
+            return as_said(told)
     rows_of_part = rows_by_part(chosen)
     if not rows_of_part:
         held = ", ".join(f"{count} {split} {view}" for (split, view), count in table.counts.items())
@@ -174,8 +175,9 @@ def finish(out: str, facts: IndexFacts, held: Held, workshop: Workshop, start: f
     return as_said(facts)
 
 
-def _finished(out: str, table: FeatureTable, asked: dict[str, Any]) -> IndexFacts | None:
-    """A finished index of the same rows and settings; None where it was one and is to be built again.
+def _finished(out: str, table: FeatureTable, asked: dict[str, Any], whole: bool) -> IndexFacts | None:
+    """A finished index of the same rows and settings; None where it was one and is to be built again. `whole`: every byte is
+    looked at.
 
     Raises InputError where it is another's.
     """
@@ -183,7 +185,7 @@ def _finished(out: str, table: FeatureTable, asked: dict[str, Any]) -> IndexFact
     held = told.table_parts
     missing = rows_by_part(table.only([name for name in table.parts if name not in held]))
     if told.asked == asked and told.fingerprint == table.fingerprint and held.items() <= table.shards.items():
-        if not missing and _is_whole(out, told):
+        if not missing and _is_whole(out, told, whole):
             console.print(f"{out} is complete: {told.rows} rows, {told.factory}; nothing to do")
             return told
         if not missing:
@@ -196,19 +198,19 @@ def _finished(out: str, table: FeatureTable, asked: dict[str, Any]) -> IndexFact
     raise InputError(f"{out} holds an index of other rows or settings; choose another --out or delete it")
 
 
-def _is_whole(out: str, told: IndexFacts) -> bool:
-    """Whether each file of an index is there and has its size.
+def _is_whole(out: str, told: IndexFacts, whole: bool) -> bool:
+    """Whether each file of an index is there and has its size, or is what was written.
 
     Raises InputError where not, and building again would not give the same index.
     """
     try:
         for files in (told.trained, *(part.files for part in told.parts)):
-            check_files(out, files)
+            check_files(out, files, whole)
     except InputError as error:
         if any(part.removed for part in told.parts):
             raise InputError(
                 f"{error}, and remove the {sum(len(part.removed) for part in told.parts)} locations again"
             ) from None
-        console.print(f"{out}: a file is missing or has another size; the index is built again", style="yellow")
+        console.print(f"{out}: a file is missing or not what was written; the index is built again", style="yellow")
         return False
     return True

@@ -45,7 +45,7 @@ def extend_index(table: str, out: str, workers: int = 0) -> dict[str, Any]:
         console.print(f"{out} holds all of {table}: {told.rows} rows; nothing to do")
         return as_said(told)
     faiss.omp_set_num_threads(os.cpu_count() or 1)  # Ray sets OMP_NUM_THREADS in its jobs; this one uses all cores
-    check_files(out, told.trained)
+    check_files(out, told.trained, whole=True)
     identity = {"extends": [asdict(part) for part in told.parts], "by": chosen.only(missing).digest}
     workshop = Workshop(out=out, table=chosen, identity=identity, workers=workers)
     workshop.take_trained()
@@ -90,9 +90,8 @@ def verify_index(out: str) -> IndexFacts:
     Raises InputError where one is not what was written.
     """
     told = read_facts(out)
-    for files in (told.trained, *(part.files for part in told.parts)):
-        check_files(out, files, whole=True)
-    Index(out)
+    check_files(out, told.trained, whole=True)
+    Index(out, whole=True)
     console.print(f"{out}: {told.rows:,} rows in {len(told.parts)} parts, every byte as it was written")
     return told
 

@@ -30,12 +30,15 @@ FAISS: Any = faiss  # whose types know nothing of its keyword arguments
 class IndexPart:
     """A part of an index, opened for searching. Not for several threads at once."""
 
-    def __init__(self, folder: str, facts: PartFacts, reader: RowReader | None, on_disk: bool, scratch: str) -> None:
+    def __init__(
+        self, folder: str, facts: PartFacts, reader: RowReader | None, on_disk: bool, scratch: str, whole: bool
+    ) -> None:
         """`reader`: of the table's vectors, None where they cannot be read singly. `scratch`: where remote files are copied to.
+        `whole`: whether every byte is looked at.
 
         Raises InputError where a file is damaged or gone.
         """
-        check_files(folder, facts.files)
+        check_files(folder, facts.files, whole)
         self.facts, self._reader = facts, reader
         self.ids = Ids(local_copy(storage.join(folder, facts.ids), scratch))
         self.index = read_faiss(local_copy(storage.join(folder, facts.faiss), scratch), on_disk)

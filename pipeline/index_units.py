@@ -1,6 +1,7 @@
 """The units of work of an index: some parts of the table, added to a copy of the trained index; and many units made into one.
 
-A unit's file is whole or not there, so a killed build goes on with the units that are missing. Units are added by one order
+A unit's file is whole or not there, and a file beside it vouches for its bytes; so a killed build goes on with the units that
+are missing or damaged. Units are added by one order
 of rows, and merged by their number: the index is the same whoever did which and when.
 Shapes: D dimensions.
 """
@@ -13,8 +14,9 @@ from typing import Any
 import faiss
 import numpy as np
 
-from pipeline import storage
+from pipeline import sealed, storage
 from pipeline.features import FeatureTable
+from pipeline.index_facts import measure_file
 from pipeline.index_ids import local_copy
 from pipeline.index_part import read_faiss
 
@@ -58,7 +60,23 @@ def build_unit(trained: str, table: FeatureTable, unit: Unit, out: str, threads:
         index.add(block_BD)
     with storage.atomic_file(out) as local:
         FAISS.write_index(index, local)
+    vouch(out)
     return int(index.ntotal)
+
+
+def vouch(file: str) -> None:
+    """Write beside a finished file how many bytes it has, and their hash: without that it is not believed later."""
+    folder, name = file.rsplit("/", 1)
+    sealed.write(f"{file}.json", measure_file(folder, name))
+
+
+def is_whole(file: str) -> bool:
+    """Whether a file is there and every byte is what was vouched for."""
+    folder, name = file.rsplit("/", 1)
+    try:
+        return storage.exists(f"{file}.json") and sealed.read(f"{file}.json") == measure_file(folder, name)
+    except (OSError, ValueError):
+        return False
 
 
 def mergeable(index: Any) -> bool:

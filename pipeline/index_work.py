@@ -19,7 +19,7 @@ from pipeline.features import FeatureTable
 from pipeline.index_facts import PartFacts, measure_file
 from pipeline.index_ids import COLUMNS, local_copy, write_ids
 from pipeline.index_part import read_faiss
-from pipeline.index_units import Unit, build_unit, even_groups, merge, mergeable, units_of
+from pipeline.index_units import Unit, build_unit, even_groups, is_whole, merge, mergeable, units_of, vouch
 from pipeline.progress import progress
 
 BUILDING, PLAN, TRAINED = "_building", "plan.json", "trained.faiss"
@@ -42,16 +42,18 @@ class Workshop:
         storage.remove_folder(self._scratch)
 
     def is_trained(self) -> bool:
-        return storage.exists(self._trained)
+        return is_whole(self._trained)
 
     def keep_trained(self, index: Any) -> None:
         with storage.atomic_file(self._trained) as local:
             faiss.write_index(index, local)
+        vouch(self._trained)
 
     def take_trained(self) -> None:
         """Go on with the trained index of the finished one."""
         if not self.is_trained():
             storage.copy(storage.join(self._out, TRAINED), self._trained)
+            vouch(self._trained)
 
     def hand_out_trained(self) -> dict[str, dict[str, Any]]:
         """Put the trained index beside what was built; its name, size and hash."""
@@ -98,7 +100,7 @@ class Workshop:
         give_memory_back()
 
     def _build_units(self, units: Sequence[Unit], files: Sequence[str]) -> None:
-        missing = [number for number, file in enumerate(files) if not storage.exists(file)]
+        missing = [number for number, file in enumerate(files) if not is_whole(file)]
         with progress(sum(unit.rows for unit in units), "indexing", "rows") as meter:
             meter.advance(sum(units[number].rows for number in range(len(units)) if number not in missing))
             if not self._workers:

@@ -16,12 +16,13 @@ from pipeline import cluster, rejects, sealed, storage
 from pipeline.duplicates import COLUMNS, find_duplicates
 from pipeline.exclusive import one_at_a_time
 from pipeline.extension import new_records, next_numbers
+from pipeline.mending import damaged_shards, mend, whole_part
 from pipeline.progress import console, progress
 from pipeline.records import ImageRecord, InputError, Rejection, Split, Unfinished
 from pipeline.shard_plan import ShardPlan, ShardSize, plan_shards
 from pipeline.shard_records import FOLDER, Packed, read_packed, read_part
 from pipeline.shard_writing import UNREADABLE, Check, write_shard
-from pipeline.shards import MANIFEST, Manifest, read_manifest
+from pipeline.shards import MANIFEST, Manifest, note_damaged, noted_damaged, read_manifest
 from pipeline.sources import name_of
 from pipeline.sources.source import Source
 
@@ -82,10 +83,15 @@ def pack(source: Source, settings: PackingSettings) -> Manifest:
     """
     began, out, said = time.monotonic(), storage.absolute(settings.out), describe(source, settings)
     before = finished(settings, said)
-    if before is not None and not settings.extend:
+    damaged = [] if before is None else damaged_shards(out, before)
+    if before is not None and not settings.extend and not damaged:
         console.print(f"{settings.out} is complete: {len(before.shards)} shards; nothing to do")
         return before
     haul = gather(source, storage.absolute(settings.root))  # workers may stand in another folder
+    if before is not None and damaged:
+        console.print(f"{settings.out}: {mend(source, out, before, haul.records)} damaged shards were made anew")
+        if not settings.extend:
+            return before
     if before is not None:
         haul.records, refused, haul.known = new_records(haul.records, source, out, before)
         haul.rejected += refused
@@ -113,6 +119,7 @@ def pack(source: Source, settings: PackingSettings) -> Manifest:
     clear(out, old.union(full))
     manifest = compose(before, said, full, haul, refusals)
     sealed.write(storage.join(out, MANIFEST), asdict(manifest))
+    note_damaged(out, ())
     sum_up(settings, full, haul, scanned - began, time.monotonic() - scanned)
     return manifest
 
@@ -125,7 +132,7 @@ def describe(source: Source, settings: PackingSettings) -> dict[str, Any]:
 
 
 def finished(settings: PackingSettings, said: dict[str, Any]) -> Manifest | None:
-    """The manifest of the set in `out`, where there is a whole one.
+    """The manifest of the set in `out`, where there is a whole one; with damaged shards, where it is to be mended.
 
     Raises InputError when it is another set than the settings ask for, or when there is nothing that could be extended.
     """
@@ -142,20 +149,10 @@ def finished(settings: PackingSettings, said: dict[str, Any]) -> Manifest | None
         raise InputError(
             f"{out} holds shards packed with another {changed}; choose another --out, delete it, or add to it with --extend"
         )
-    sizes = storage.walk(out)
-    damaged = [
-        shard.name
-        for shard in manifest.shards
-        if sizes.get(f"{shard.name}.tar") != shard.bytes or f"{FOLDER}/{shard.name}.parquet" not in sizes
-    ]
-    if not damaged:
+    damaged = damaged_shards(out, manifest)
+    if not damaged or settings.extend or manifest.added:
         return manifest
-    if settings.extend or manifest.added:
-        raise InputError(
-            f"{len(damaged)} shards of {out} are missing or have another size than its manifest says, {damaged[0]} first, and "
-            "it was extended, or is to be; put them back from a copy, or pack all anew to another --out"
-        )
-    console.print(f"{out}: {len(damaged)} shards are missing or have another size; they are packed again")
+    console.print(f"{out}: {len(damaged)} shards are missing or damaged; they are packed again")
     return None
 
 
@@ -210,6 +207,8 @@ def pack_plans(
     digests = {plan.name: plan.digest(said) for plan in plans}
     if doubles is None:
         sizes = storage.walk(out) if storage.is_folder(out) else {}
+        for name in noted_damaged(out):
+            sizes.pop(f"{name}.tar", None)
         packed = {name: done for name in digests if (done := already(out, name, digests[name], sizes)) is not None}
         if packed:
             console.print(f"{len(packed)} of {len(plans)} shards are there already")
@@ -236,7 +235,9 @@ def already(out: str, name: str, digest: str, sizes: Mapping[str, int]) -> Packe
     done = read_packed(out, name) if f"{FOLDER}/{name}.parquet" in sizes else None
     if done is None or done.plan != digest or sizes.get(f"{name}.tar") != done.shard.bytes:
         return None
-    return None if any(rejection.reason == UNREADABLE for rejection in done.rejected) else done
+    if any(rejection.reason == UNREADABLE for rejection in done.rejected):
+        return None
+    return done if whole_part(out, name) else None
 
 
 def write_all(arguments: Iterable[tuple[Any, ...]], workers: int | None) -> Iterator[Packed]:

@@ -99,6 +99,12 @@ def make_key(split: Split, view: View, location: str, stem: str) -> str:
     return f"{slug[: LONGEST_KEY - 9]}-{hashlib.sha256(named.encode('utf-8', 'surrogateescape')).hexdigest()[:8]}"
 
 
+def key_names(key: str, split: Split, view: View, location: str) -> bool:
+    """Whether a key that `make_key` made is of this split, view and location."""
+    begin = re.sub(r"[^a-z0-9_-]", "_", f"{split}-{view}-{location}-".lower())
+    return key.startswith(begin[: LONGEST_KEY - 9])
+
+
 @dataclass(frozen=True, kw_only=True)
 class Rejection:
     """An image that was refused, and why."""

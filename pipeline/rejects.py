@@ -29,6 +29,12 @@ def write(folder: str, rejected: Iterable[Rejection], keep: bool) -> int:
     return len(table)
 
 
+def paths(folder: str) -> frozenset[str]:
+    """The images that are listed; none where there is no list. Raises InputError where it cannot be read."""
+    path = storage.join(folder, FILE)
+    return frozenset(_read(path)["path"].to_pylist()) if storage.exists(path) else frozenset()
+
+
 def _read(path: str) -> pa.Table:
     try:
         return parquet_files.read_table(path)

@@ -6,12 +6,13 @@ In: one tar, by name. Out: samples in their order.
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import IO, Any, cast
 
 from pipeline import storage
 from pipeline.foreign import facts_of
 from pipeline.records import InputError, Split, View
-from pipeline.tars import IMAGES, read_tar
+from pipeline.shards import mending
+from pipeline.tars import IMAGES, SAID, HashedStream, read_members, read_tar
 
 OURS = {"key", "location", "view", "split", "geotag"}
 "What the JSON of a shard of ours says at least."
@@ -28,14 +29,17 @@ class Sample:
     "The JSON beside it; of shards that others made, what could be found out in its words."
 
 
-def read_shard(shards: str, name: str, split: Split | None = None, view: View | None = None) -> Iterator[Sample]:
+def read_shard(
+    shards: str, name: str, split: Split | None = None, view: View | None = None, sha256: str | None = None
+) -> Iterator[Sample]:
     """The samples of one tar in their order; what has no image is none.
 
     `split` and `view` are those of a tar that others made, whose samples do not say; of ours they are not needed. Raises
-    InputError where the tar is cut off or hostile, or where the samples are another's and it was not said what they are.
+    InputError where the tar is cut off or hostile, or where the samples are another's and it was not said what they are; behind
+    the last one, where the tar's hash is not `sha256`.
     """
     path = storage.join(shards, f"{name}.tar")
-    for key, members in read_tar(path):
+    for key, members in read_tar(path) if sha256 is None else _read_whole(shards, path, sha256):
         data = next((members[ending] for ending in IMAGES if ending in members), None)
         if data is None:
             continue
@@ -52,10 +56,27 @@ def read_shard(shards: str, name: str, split: Split | None = None, view: View | 
         yield Sample(key=facts["key"], data=data, facts=facts)
 
 
+def _read_whole(shards: str, path: str, sha256: str) -> Iterator[tuple[str, dict[str, bytes]]]:
+    """`read_tar`, and behind its end the hash is compared."""
+    with storage.open_read(path) as stream:
+        hashed = HashedStream(stream)
+        yield from read_members(cast(IO[bytes], hashed), path, IMAGES + SAID)
+        hashed.drain()
+    if hashed.digest.hexdigest() != sha256:
+        raise InputError(f"{path} has not the hash that the manifest says, expected what was packed; {mending(shards)}")
+
+
 def read_locations(shards: str, name: str) -> Iterator[str]:
-    """The locations of one tar's samples, without reading its images."""
-    for _, members in read_tar(storage.join(shards, f"{name}.tar"), ("json",)):
-        yield json.loads(members["json"])["location"]
+    """The locations of one tar's samples, without reading its images.
+
+    Raises InputError where a sample does not say, and as `read_tar` does.
+    """
+    path = storage.join(shards, f"{name}.tar")
+    for key, members in read_tar(path, ("json",)):
+        location = _json(members["json"]).get("location")
+        if not isinstance(location, str):
+            raise InputError(f"{path}: the JSON of {key} says no location, expected what was packed; {mending(shards)}")
+        yield location
 
 
 def _json(data: bytes | None) -> dict[str, Any]:

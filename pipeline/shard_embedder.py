@@ -139,7 +139,7 @@ class ShardEmbedder:
     ) -> Iterator[npt.NDArray[np.uint8]]:
         """Images (B, 3, H, W) of a shard: all batches but the last are full, whatever had to be left out."""
         given = self._given
-        samples = _timed(read_shard(given.shards, shard.name, shard.split, shard.view), seconds)
+        samples = _timed(read_shard(given.shards, shard.name, shard.split, shard.view, shard.sha256), seconds)
         images: list[Pixels] = []
         for (sample, image), spent in ahead(self._open, samples, self._decoders, given.batch_size):
             seconds["decode"] += spent

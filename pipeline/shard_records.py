@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from pipeline import parquet_files, storage
 from pipeline.records import ImageRecord, InputError, Rejection, Split, View
-from pipeline.shards import Manifest, Shard
+from pipeline.shards import Manifest, Shard, mending
 
 FOLDER = "records"
 SCHEMA = pa.schema(
@@ -75,8 +75,7 @@ def read_part(out: str, name: str, columns: list[str] | None = None) -> pa.Table
         return parquet_files.read_table(path, columns)
     except parquet_files.DAMAGE as error:
         raise InputError(
-            f"{path} cannot be read ({error}); expected the record table that packing wrote beside the tars; run "
-            "jobs/make_shards.py again as it was run first, which makes what is missing"
+            f"{path} cannot be read ({error}), expected the record table that packing wrote beside the tars; {mending(out)}"
         ) from None
 
 

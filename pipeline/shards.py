@@ -3,6 +3,7 @@
 In: a folder or URI. Out: the Manifest.
 """
 
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,8 @@ from pipeline.records import InputError, Split, View
 
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
+NOTE = "damaged.json"
+"Names of the shards that verification found damaged: packing makes them anew, and takes the note away."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,3 +73,59 @@ def read_manifest(shards: str) -> Manifest:
             f"{path} is damaged ({error}), expected what packing writes last; put it back from a copy, or delete it and run "
             "jobs/make_shards.py again as it was run, and after it each --extend"
         ) from None
+
+
+def note_damaged(shards: str, names: Iterable[str]) -> None:
+    """Leave a note of the shards that are damaged, for packing; with none, take it away."""
+    path, listed = storage.join(shards, NOTE), sorted(set(names))
+    if listed:
+        sealed.write(path, {"shards": listed})
+    elif storage.exists(path):
+        storage.remove(path)
+
+
+def noted_damaged(shards: str) -> frozenset[str]:
+    """The shards that the note names; none where there is no note.
+
+    Raises InputError where it cannot be read.
+    """
+    path = storage.join(shards, NOTE)
+    try:
+        return frozenset(sealed.read(path)["shards"]) if storage.exists(path) else frozenset()
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path} is damaged ({error!r}), expected the names of damaged shards; delete it and run jobs/make_shards.py "
+            f"--verify --out {shards}"
+        ) from None
+
+
+def missing_tars(shards: str, described: Iterable[Shard]) -> dict[str, str]:
+    """By name, what is wrong with the tars that are not there or have another size than the manifest says. One listing."""
+    sizes, wrong = storage.walk(shards), dict[str, str]()
+    for shard in described:
+        path, size = storage.join(shards, f"{shard.name}.tar"), sizes.get(f"{shard.name}.tar")
+        if size is None:
+            wrong[shard.name] = f"{path} is missing"
+        elif size != shard.bytes:
+            wrong[shard.name] = f"{path} has {size} bytes, the manifest says {shard.bytes}"
+    return wrong
+
+
+def refuse_missing(shards: str, described: Iterable[Shard]) -> None:
+    """Raise InputError where tars are not there or have another size than the manifest says."""
+    if wrong := missing_tars(shards, described):
+        raise InputError(f"{len(wrong)} shards cannot be used: {some(wrong.values())}; {mending(shards)}")
+
+
+def mending(shards: str) -> str:
+    """What to do about damaged shards."""
+    return (
+        f"run jobs/make_shards.py --verify --out {shards} and then the command that packed them again, which makes anew what "
+        "is damaged"
+    )
+
+
+def some(sentences: Collection[str]) -> str:
+    """The first three."""
+    told = list(sentences)
+    return "; ".join(told[:3]) + (f"; and {len(told) - 3} more" if len(told) > 3 else "")

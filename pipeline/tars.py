@@ -51,7 +51,7 @@ def read_members(stream: IO[bytes], path: str, endings: tuple[str, ...]) -> Iter
     except (tarfile.TarError, EOFError) as error:
         raise InputError(
             f"{path} is cut off or damaged after {samples} samples ({error}), expected a whole tar; copy it again from where "
-            "it came from, or pack again"
+            "it came from, or pack again with jobs/make_shards.py"
         ) from None
     if held:
         yield key, held

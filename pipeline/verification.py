@@ -5,6 +5,8 @@ In: a folder or URI of shards. Out: what is wrong, a sentence each.
 
 import hashlib
 import json
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from typing import IO, cast
 
 import ray
@@ -13,25 +15,41 @@ from pipeline import cluster, storage
 from pipeline.progress import progress
 from pipeline.records import InputError
 from pipeline.shard_records import read_part
-from pipeline.shards import Shard, read_manifest
+from pipeline.shards import Shard, mending, note_damaged, read_manifest, some
 from pipeline.tars import IMAGES, SAID, HashedStream, read_members
 
 
-def verify(shards: str) -> tuple[int, list[str]]:
+def refuse_damaged(shards: str, workers: int | None = None) -> None:
+    """Look at every byte of a set. Raises InputError where one is not what was packed, as `verify` does besides."""
+    _, wrong = verify(shards, workers)
+    if wrong:
+        raise InputError(f"{shards} is damaged in {len(wrong)} places: {some(wrong)}; {mending(shards)}")
+
+
+def verify(shards: str, workers: int | None = None) -> tuple[int, list[str]]:
     """How many shards there are, and what is wrong with them; nothing where all is well.
 
-    Raises InputError when there is no manifest.
+    The damaged ones are noted in the set, so that packing makes them anew. `workers`: Ray tasks at once, 0 for
+    none: this process looks. Raises InputError when there is no manifest.
     """
     manifest, root = read_manifest(shards), storage.absolute(shards)
     found: list[tuple[str, str]] = []
-    cluster.connect()
-    task = ray.remote(num_cpus=1)(check_shard)
     with progress(sum(shard.samples for shard in manifest.shards), "verifying") as meter:
-        calls = cluster.bounded(lambda shard: task.remote(root, shard), manifest.shards, 2 * cluster.cpus())
-        for shard, wrong in calls:
+        for shard, wrong in _check_all(root, manifest.shards, workers):
             found += [(shard.name, sentence) for sentence in wrong]
             meter.advance(shard.samples, damaged=len({name for name, _ in found}))
+    with suppress(OSError):  # of a set that cannot be written to, somebody else's, nothing is noted
+        note_damaged(shards, {name for name, _ in found})
     return len(manifest.shards), [sentence for _, sentence in sorted(found)]
+
+
+def _check_all(root: str, shards: Sequence[Shard], workers: int | None) -> Iterator[tuple[Shard, list[str]]]:
+    if workers == 0:
+        yield from ((shard, check_shard(root, shard)) for shard in shards)
+        return
+    cluster.connect()
+    task = ray.remote(num_cpus=1)(check_shard)
+    yield from cluster.bounded(lambda shard: task.remote(root, shard), shards, workers or 2 * cluster.cpus())
 
 
 def check_shard(root: str, shard: Shard) -> list[str]:

@@ -1,13 +1,17 @@
 """Files damaged in seeded ways, and the verdict on who reads them: a sentence naming file and remedy, or the same content."""
 
+import hashlib
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipeline import sealed
 from pipeline.records import InputError
+from pipeline.shards import read_manifest
 
 MENDS = re.compile(r"jobs/\w+\.py|embed its shard again|run the same command again|calibrate again|taking checkpoint")
 
@@ -68,3 +72,11 @@ def look_or_say_gone(path: Path, look: Callable[[], Any], error: type[Exception]
         return look()
 
     return looked
+
+
+def say_again(shards: Path, name: str) -> None:
+    """Have the manifest say what a tar is now, as if it had been packed so."""
+    manifest = read_manifest(str(shards))
+    digest = hashlib.sha256((shards / f"{name}.tar").read_bytes()).hexdigest()
+    said = tuple(replace(one, sha256=digest) if one.name == name else one for one in manifest.shards)
+    sealed.write(str(shards / "manifest.json"), asdict(replace(manifest, shards=said)))

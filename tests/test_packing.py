@@ -131,7 +131,7 @@ def test_a_tar_that_was_lost_is_made_again(tmp_path: Path, capsys: pytest.Captur
     (out / "train-drone-000001.tar").unlink()
     (out / "train-drone-000000.tar").write_bytes(b"short")
     pack(SOURCE, said(root, out))
-    assert "2 shards are missing or have another size" in capsys.readouterr().err.replace("\n", " ")
+    assert "2 shards are missing or damaged" in capsys.readouterr().err.replace("\n", " ")
     assert content(out) == before
 
 
@@ -383,7 +383,7 @@ def test_the_job_checks_and_exports_a_finished_set(
     assert f"all {len(manifest.shards)} shards are what was packed" in told
     assert "0 images, 15 without a place left out" in told
     (out / f"{manifest.shards[0].name}.tar").unlink()
-    with pytest.raises(Unfinished, match="is damaged in 1 places; delete the tars that are named"):
+    with pytest.raises(Unfinished, match="is damaged in 1 places; run the command that packed it again"):
         make_shards.check(str(out), verify=True)
 
 

@@ -14,7 +14,7 @@ from pipeline import confidence, storage
 from pipeline.confidence import Confidence, find_confidence
 from pipeline.gallery_map import gallery_map
 from pipeline.index import Index
-from pipeline.index_facts import FACTS, check_files
+from pipeline.index_facts import FACTS
 from pipeline.records import InputError
 
 LOOK_EVERY_S = 2.0
@@ -41,7 +41,7 @@ class Opened:
 
 def open_whole(path: str) -> Opened:
     """Raises InputError when there is no index at `path`, or a calibration that is another's."""
-    index = Index(path)
+    index = Index(path, whole=True)  # a damaged list is met by few searches, and late
     calibration = find_confidence(path, index.facts)
     spacing_m = None if calibration else gallery_map(index).spacing_m
     return Opened(index=index, confidence=calibration, spacing_m=spacing_m)
@@ -106,8 +106,6 @@ def prove(fresh: Index, old: Index) -> None:
             f"it was made by network {made_by[:12]}, the service's is {expected[:12]}, expected the same; start the service "
             "again with the other network"
         )
-    for part in fresh.told.parts:
-        check_files(fresh.path, part.files, whole=True)  # every byte: a damaged list is met by few searches, and late
     trial_1D = np.full((1, fresh.dimension), fresh.dimension**-0.5, np.float32)
     if not fresh.search(trial_1D, 1)[0]:
         raise InputError("a trial search found nothing, expected a row; build the index again")

@@ -107,7 +107,7 @@ STAGES = (
     Stage(
         name="train", job="train", reads=("shards",), writes="run", alone="--workers 0", spread="--workers 1",
         arguments="smoke --shards {here}/shards --out {here}/run --checkpoint-minutes 0 --keep 3 --epochs 2 "
-        "--batch-size 2 --part-dim 16 --discriminator-channels 16 --probe-epochs 0", content=trained,
+        "--batch-size 2 --part-dim 16 --discriminator-channels 16 --probe-epochs 0", guard="--verify", content=trained,
     ),
     Stage(
         name="embed", job="embed_gallery", reads=("shards", "run"), writes="table", alone="", spread="--workers 2",
