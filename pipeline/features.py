@@ -213,8 +213,8 @@ class FeatureTable:
 def open_table(path: str) -> FeatureTable:
     """Open a feature table.
 
-    Raises InputError when there is none, when a part is missing, torn or another's, when the parts come from different networks or
-    hold different numbers, and when a key is there twice (looked for in tables of up to KEYS_AT_OPENING rows).
+    Raises InputError when there is none, when a part is missing, torn or another's, when the parts come from different
+    networks or hold different numbers, and when a key is there twice (looked for in tables of up to KEYS_AT_OPENING rows).
     """
     table = _open(path)
     if table.rows <= KEYS_AT_OPENING:

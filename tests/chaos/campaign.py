@@ -267,10 +267,12 @@ def _bring_to_its_end(ground: Ground, case: Case, usual: Undisturbed, verdict: V
             verdict.found = verdict.found or ("no difference" if damaged else "")
             return
         checked = _look_closely(ground, case, damaged)
-        if checked is None or checked.code == 0:
+        if checked is None or (checked.code == 0 and any(_differences(ground, stage, usual))):
             verdict.lost, verdict.doubled = wrong
             return
         verdict.found = "by --verify"
+        if checked.code == 0:  # and mended
+            return
         _mend(ground, case, checked, damaged)
     verdict.lost = [f"no end after {TRIES} runs: {ended.said.strip().splitlines()[-1:]}"]
 
@@ -280,12 +282,15 @@ def _look_closely(ground: Ground, case: Case, damaged: list[Damaged]) -> Ended |
 
     Of an input, the stage is begun anew on the same damage and told to look first.
     """
-    if case.place == "input" and case.stage.guard:
+    if not damaged:
+        return None
+    if case.place == "input":
         ground.prepare(case.stage)
         for one in damaged:
             one.repeat()
-        return ground.run(case.stage, spread=False, guarded=True)
-    return ground.check(case.stage) if damaged and case.place != "input" and case.stage.verify else None
+    elif case.stage.verify:
+        return ground.check(case.stage)
+    return ground.run(case.stage, spread=False, guarded=True) if case.stage.guard else None
 
 
 def _mend(ground: Ground, case: Case, ended: Ended, damaged: list[Damaged]) -> None:

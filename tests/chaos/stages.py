@@ -33,9 +33,9 @@ class Stage:
     alone: str
     "What makes one process do it; empty where it always asks Ray."
     verify: str | None = None
-    "Arguments that check every byte of what it wrote; None where running it again does."
+    "Arguments that check every byte of what it wrote; None where `guard` does, or running it again."
     guard: str = ""
-    "Added to its arguments, checks every byte of what it reads; empty where that is always done."
+    "Added to its arguments, has every byte checked first."
     blind: tuple[str, ...] = ()
     "Damage that nobody can know of, because no hash of the file was ever told: it is not tried."
     content: Callable[[Path], Content]
@@ -113,15 +113,16 @@ STAGES = (
         name="embed", job="embed_gallery", reads=("shards", "run"), writes="table", alone="", spread="--workers 2",
         arguments="--shards {here}/shards --checkpoint {here}/run/last.pt --out {here}/table --batch-size 2 "
         "--cpus-per-worker 1",
-        content=files_of,
+        guard="--verify", content=files_of,
     ),
     Stage(
         name="index", job="build_index", reads=("table",), writes="index", alone="--workers 0", spread="--workers 2",
         arguments="--table {here}/table --out {here}/index --factory IVF4,SQ8 --refine --parts 3",
-        verify="--verify --out {here}/index", content=searched,
+        verify="--verify --out {here}/index", guard="--verify", content=searched,
     ),
     Stage(
         name="evaluate", job="evaluate", reads=("table", "shards"), writes="evaluation", alone="", spread="--workers 2",
-        arguments="--table {here}/table --shards {here}/shards --out {here}/evaluation --panels 2", content=measured,
+        arguments="--table {here}/table --shards {here}/shards --out {here}/evaluation --panels 2",
+        guard="--verify", content=measured,
     ),
 )  # fmt: skip
