@@ -24,6 +24,7 @@ from pipeline.progress import console, progress
 from pipeline.records import InputError, Split, View
 from pipeline.reliability import diagram
 from pipeline.samples import read_shard
+from pipeline.shards import refuse_missing
 
 BATCH = 256
 "Photos that are encoded and asked at a time."
@@ -102,6 +103,7 @@ def embedded(
     Shards are in the order of hashes, so the first ones are a fair sample.
     """
     shards = open_manifest(settings.shards, settings.split, view).of(settings.split, view)
+    refuse_missing(settings.shards, shards)
     samples = (
         sample
         for shard in shards

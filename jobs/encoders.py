@@ -22,10 +22,10 @@ from pipeline.embed import EmbeddingSettings, Network
 from pipeline.features import Floats
 from pipeline.foreign import open_manifest
 from pipeline.records import InputError
-from pipeline.samples import read_shard
-from pipeline.shards import Manifest
-from pipeline.stream import decoded, stack
-from pipeline.transforms import DecodeError, Resizer, preprocessing
+from pipeline.samples import Sample, read_shard
+from pipeline.shards import Manifest, mending, refuse_missing
+from pipeline.stream import CHANGED, decoded, stack
+from pipeline.transforms import DecodeError, Pixels, Resizer, preprocessing
 
 PROBES, CALIBRATING = 16, 128
 "Images by which the fast encoder is checked, and by which int8 is calibrated."
@@ -145,14 +145,15 @@ def some_images(shards: str, manifest: Manifest, size: int, resizer: Resizer, co
 
     Of the whole set, whatever of it is to be embedded: queries and gallery may be embedded one after the other into one
     table. Within a shard images stand in the order of their keys' hashes: its first ones are a fair sample. Raises InputError
-    where none of them can be decoded.
+    where none of them can be decoded, or one is not the image that was packed.
     """
     first = {(shard.split, shard.view): shard for shard in reversed(manifest.shards) if shard.samples}
     found = []
+    refuse_missing(shards, first.values())
     for shard in first.values():
         samples = read_shard(shards, shard.name, shard.split, shard.view)
-        images = (image for _, image in decoded(samples, size, 1, 4, resizer) if not isinstance(image, DecodeError))
-        found.append(list(islice(images, -(-count // len(first)))))
+        images = (usable(shards, *opened) for opened in decoded(samples, size, 1, 4, resizer))
+        found.append(list(islice((image for image in images if image is not None), -(-count // len(first)))))
     mixed = [group[place] for place in range(count) for group in found if place < len(group)][:count]
     if not mixed:
         raise InputError(
@@ -160,3 +161,13 @@ def some_images(shards: str, manifest: Manifest, size: int, resizer: Resizer, co
             "make_shards.py --verify, and pack again"
         )
     return stack(mixed)
+
+
+def usable(shards: str, sample: Sample, image: Pixels | DecodeError) -> Pixels | None:
+    """An image's pixels, None where it has none. Raises InputError where it is not the one that was packed."""
+    if isinstance(image, DecodeError) and image.reason == CHANGED:
+        raise InputError(
+            f"image {sample.key} of {shards} is not the one that was packed, expected it to check the encoder by; "
+            f"{mending(shards)}"
+        )
+    return None if isinstance(image, DecodeError) else image

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import ray
 
-from pipeline import cluster, storage
+from pipeline import cluster, sealed, storage
 from pipeline.exclusive import one_at_a_time
 from pipeline.progress import console, progress
 from pipeline.records import InputError
@@ -86,11 +86,11 @@ def simulate(settings: SimulationSettings) -> Path:
     if passed_over:
         console.print(f"{settings.textures}: {passed_over} files are no usable images and were passed over")
     (root / ".parts").mkdir(parents=True, exist_ok=True)
-    storage.write_json(str(root / ".parts" / "settings.json"), described)
+    sealed.write(str(root / ".parts" / "settings.json"), described)
     todo = [job for job in jobs if not part(job).exists()]
     spent = _make(todo, len(jobs), settings.views + 1)
     write_tables(root, jobs)
-    storage.write_json(str(root / "simulation.json"), described)
+    sealed.write(str(root / "simulation.json"), described)
     shutil.rmtree(root / ".parts")
     share = ", ".join(f"{step} {seconds:.1f} s" for step, seconds in spent.items())
     console.print(f"{root}: {len(jobs)} locations ({share or 'all were there'}, over all cores)")
@@ -165,7 +165,12 @@ def _is_complete(root: Path, described: dict[str, Any]) -> bool:
                 f"{root} holds files that no simulation wrote; expected a new or empty folder; choose another --out"
             )
         return False
-    found = storage.read_json(str(there))
+    try:
+        found = sealed.read(str(there))
+    except ValueError as error:
+        raise InputError(
+            f"{there} is damaged ({error}), expected the settings of a simulation; remove {root} and run jobs/simulate.py again"
+        ) from None
     other = [f"{name} {found.get(name)!r} instead of {described.get(name)!r}"
              for name in sorted({*found, *described}) if found.get(name) != described.get(name)]  # fmt: skip
     if other:

@@ -23,6 +23,7 @@ from pipeline.transforms import Augmentation, DecodeError, Pixels, Resizer, augm
 
 Opened = tuple[Sample, Pixels | DecodeError]
 "A sample and its pixels, or why there are none."
+CHANGED = "changed since it was packed"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +203,7 @@ def refuse_changed(sample: Sample) -> None:
     """Raise DecodeError where an image is not the one that was packed: 25 us, where decoding takes a millisecond or more."""
     said = sample.facts.get("sha256")
     if said is not None and hashlib.sha256(sample.data).hexdigest() != said:
-        raise DecodeError("damaged image", "other bytes than were packed")
+        raise DecodeError(CHANGED, "other bytes than were packed")
 
 
 def stack(images_HW3: Sequence[Pixels]) -> npt.NDArray[np.uint8]:
@@ -220,6 +221,7 @@ def decoded(
 def opened(sample: Sample, image_size: int, resizer: Resizer = "torch") -> Opened:
     """One sample's image, decoded and resized, or why it cannot be."""
     try:
+        refuse_changed(sample)
         return sample, resize(decode(sample.data), image_size, resizer)
     except DecodeError as error:
         return sample, error

@@ -15,7 +15,7 @@ from pipeline import cluster, storage
 from pipeline.progress import progress
 from pipeline.records import InputError
 from pipeline.shard_records import read_part
-from pipeline.shards import Shard, mending, note_damaged, read_manifest, some
+from pipeline.shards import Shard, note_damaged, read_manifest, some
 from pipeline.tars import IMAGES, SAID, HashedStream, read_members
 
 
@@ -23,7 +23,10 @@ def refuse_damaged(shards: str, workers: int | None = None) -> None:
     """Look at every byte of a set. Raises InputError where one is not what was packed, as `verify` does besides."""
     _, wrong = verify(shards, workers)
     if wrong:
-        raise InputError(f"{shards} is damaged in {len(wrong)} places: {some(wrong)}; {mending(shards)}")
+        raise InputError(
+            f"{shards} is damaged in {len(wrong)} places: {some(wrong)}; run the command that packed it again "
+            "(jobs/make_shards.py), which makes anew what is damaged"
+        )
 
 
 def verify(shards: str, workers: int | None = None) -> tuple[int, list[str]]:

@@ -9,6 +9,7 @@ import pytest
 from damaging import damages, found_or_equal, look_or_say_gone
 from index_tables import write_gallery
 
+from pipeline.evaluation import EvaluationSettings, plan
 from pipeline.features import open_table
 from pipeline.index import Index
 from pipeline.index_build import IndexSettings, build_index
@@ -129,3 +130,13 @@ def test_a_table_is_looked_at_before_an_index_is_built_of_it(table: str, tmp_pat
     for out in ("index", "another"):
         with pytest.raises(InputError, match=rf"{path} is not a readable Parquet file .*embed its shard again"):
             build_index(settings(str(spoilt), tmp_path / out, verify=True))
+
+
+def test_an_evaluation_looks_at_every_byte_of_its_tables_when_asked(table: str, tmp_path: Path) -> None:
+    spoilt = Path(shutil.copytree(table, tmp_path / "table"))
+    asked = EvaluationSettings(table=str(spoilt), out=str(tmp_path / "out"), verify=True)
+    plan(asked)
+    path = next(spoilt.glob("query*"))
+    path.write_bytes(path.read_bytes().replace(b"query", b"quary", 1))
+    with pytest.raises(InputError, match=rf"{path} is not a readable Parquet file .*embed its shard again"):
+        plan(asked)

@@ -188,7 +188,7 @@ def test_training_starts_from_given_weights(tiny_shards: str, tmp_path: Path) ->
 
 def test_a_damaged_checkpoint_is_named(tiny_shards: str, tmp_path: Path) -> None:
     (tmp_path / "last.pt").write_bytes(b"PK\x03\x04 torn")
-    with pytest.raises(CheckpointError, match="is not a checkpoint of format 1"):
+    with pytest.raises(CheckpointError, match=r"last.pt is damaged .*copy it again"):
         read_checkpoint(Run(shards=tiny_shards, out=str(tmp_path), recipe=tiny()))
 
 

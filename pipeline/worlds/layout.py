@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline import storage
+from pipeline import sealed, storage
+from pipeline.records import InputError
 from pipeline.worlds.location import Order, Photographs, geotag, offset, photograph
 
 Role = Literal["train", "test", "distractor"]
@@ -55,7 +56,7 @@ def make_location(job: Job) -> dict[str, float]:
             for name in files:
                 _share(home / name, folder / name)
             _settle(folder)
-    storage.write_json(str(part(job)), _pose_rows(job, taken))
+    sealed.write(str(part(job)), {"poses": _pose_rows(job, taken)})
     return taken.seconds
 
 
@@ -104,14 +105,27 @@ def _pose_rows(job: Job, taken: Photographs) -> list[dict[str, Any]]:
     return rows
 
 
+def _read_poses(path: Path) -> list[dict[str, Any]]:
+    try:
+        poses: list[dict[str, Any]] = sealed.read(str(path))["poses"]
+    except (KeyError, ValueError) as error:
+        raise InputError(
+            f"{path} is damaged ({error!r}), expected the poses of a location; delete it and run jobs/simulate.py again"
+        ) from None
+    return poses
+
+
 def write_tables(root: Path, jobs: list[Job]) -> None:
-    """Write `locations.csv` and `poses.csv`, once all locations are there."""
+    """Write `locations.csv` and `poses.csv`, once all locations are there.
+
+    Raises InputError where a location's part is not what was written.
+    """
     ordered = sorted(jobs, key=lambda job: job.order.location)
     places = []
     for job in ordered:
         lat, lon = geotag(job.order.location)
         places.append({"location": job.name, "lat": f"{lat:.7f}", "lon": f"{lon:.7f}"})
-    poses = [row for job in ordered for row in storage.read_json(str(part(job)))]
+    poses = [row for job in ordered for row in _read_poses(part(job))]
     for name, rows in (("locations.csv", places), ("poses.csv", sorted(poses, key=lambda row: str(row["path"])))):
         text = io.StringIO()
         writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")

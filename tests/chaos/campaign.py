@@ -154,7 +154,10 @@ class Ground:
         return self._known[stage.name]
 
 
-ENVIRONMENT = {"RAY_AUTH_MODE": "disabled", "RAY_USAGE_STATS_ENABLED": "0", "OMP_WAIT_POLICY": "PASSIVE"}
+ENVIRONMENT = {
+    "RAY_AUTH_MODE": "disabled", "RAY_USAGE_STATS_ENABLED": "0", "OMP_WAIT_POLICY": "PASSIVE",
+    "RAY_gcs_rpc_server_reconnect_timeout_s": "5",  # a lost cluster is given up after a minute otherwise
+}  # fmt: skip
 
 
 @contextmanager
