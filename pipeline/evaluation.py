@@ -248,7 +248,7 @@ def _earlier(out: str) -> dict[str, Any] | None:
     said = read_inputs(out)
     if said is None:
         raise InputError(
-            f"{out} holds a {METRICS} without {INPUTS}; expected an evaluation's folder; choose another --out"
+            f"{out} holds a {METRICS} without {INPUTS}; expected an evaluation's folder; choose another --out or delete {out}"
         )
     return said
 

@@ -301,9 +301,13 @@ def _mend(ground: Ground, case: Case, ended: Ended, damaged: list[Damaged]) -> N
     if case.place == "input":
         for one in damaged:
             one.restore()
+        return
+    folder = ground.here / case.stage.writes
     said = re.sub(r"\s*\n\s*", "", ended.said) + " " + ended.said.replace("\n", " ")
-    for path in sorted((ground.here / case.stage.writes).rglob("*"), reverse=True):
-        if path.is_file() and str(path) in said and case.place != "input":
+    if re.search(rf"delete {re.escape(str(folder))}(?![^ ;,])", said):
+        shutil.rmtree(folder)
+    for path in sorted(folder.rglob("*"), reverse=True):
+        if path.is_file() and str(path) in said:
             path.unlink()
 
 

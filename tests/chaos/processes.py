@@ -64,7 +64,8 @@ def cluster(cpus: int, environment: dict[str, str]) -> Iterator[tuple[int, str]]
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    words = ["start", "--head", "--block", f"--port={port}", f"--num-cpus={cpus}", "--include-dashboard=false"]
+    # With its dashboard: Ray Train asks it whether a controller lives, and keeps a dead one's places where there is none.
+    words = ["start", "--head", "--block", f"--port={port}", f"--num-cpus={cpus}"]
     ray = Path(sys.executable).with_name("ray")
     head = subprocess.Popen(
         [str(ray), *words, "--disable-usage-stats", "--node-ip-address=127.0.0.1"], env=os.environ | environment,
