@@ -117,7 +117,8 @@ def train(settings: Settings) -> str:
 def train_on_ray(this: Run, settings: Settings, meter: Meter) -> None:
     """Train with Ray Train's workers. When one dies, the group is started again and goes on from the last checkpoint.
 
-    Not by Ray Train's own FailureConfig: that would try a run that has diverged again, and nobody would hear of it.
+    Not by Ray Train's own FailureConfig: that would try a run that has diverged again, and nobody would hear of it. Where Ray
+    Train's controller dies, the job ends (RayActorError): the places that it had asked for may be lost until then.
     """
     cluster.connect()
     gpus = settings.gpus_per_worker
@@ -138,11 +139,10 @@ def train_on_ray(this: Run, settings: Settings, meter: Meter) -> None:
         try:
             train_group(this, scaling, cpus, meter)
             break
-        except (WorkerGroupError, RayActorError) as error:
+        except WorkerGroupError as error:
             if failures > settings.max_failures:
                 raise
-            failed = error.worker_failures.values() if isinstance(error, WorkerGroupError) else [error]
-            lost = ", ".join(sorted({type(failure).__name__ for failure in failed}))
+            lost = ", ".join(sorted({type(failure).__name__ for failure in error.worker_failures.values()}))
             meter.note(
                 f"lost a worker ({lost}); going on from the last checkpoint, {failures} of {settings.max_failures}"
             )
