@@ -27,6 +27,10 @@ def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lamb
     except (InputError, CheckpointError) as error:
         _say(str(error))
         sys.exit(2)
+    except OSError as error:  # the system's word: no right to, no room for, a folder for a file
+        where = f"{error.filename}: " if error.filename else ""
+        _say(f"{where}{error.strerror or error}; check the path, its rights and the room on its disk")
+        sys.exit(1)
     except Unfinished as error:
         _say(str(error))
         sys.exit(1)
@@ -37,4 +41,4 @@ def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lamb
 
 def _say(sentence: str) -> None:
     console.print("error:", style="bold red", end=" ")
-    console.print(sentence)
+    console.print(sentence.replace("\n", "\\n"))  # one sentence is one line, whatever a file in it is called
