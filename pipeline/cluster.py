@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import ray
 
 from pipeline.placement import Node
+from pipeline.records import InputError
 
 Item = TypeVar("Item")
 
@@ -25,7 +26,15 @@ def connect() -> None:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's coming default; unset, each init warns
     # A token for a local cluster is what we want, and no news.
     logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
-    ray.init(log_to_driver=False, logging_level=logging.WARNING)
+    try:
+        ray.init(log_to_driver=False, logging_level=logging.WARNING)
+    except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+        if not (address := os.environ.get("RAY_ADDRESS")):
+            raise
+        why = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(
+            f"no Ray answers at RAY_ADDRESS {address} ({why}); expected a cluster; start it, or unset RAY_ADDRESS"
+        ) from None
 
 
 def cpus() -> int:

@@ -73,7 +73,7 @@ def read_times(path: str, photos: Sequence[str]) -> dict[str, str]:
 
     Raises InputError where it is no such table, or says nothing of one of the photos.
     """
-    if not storage.exists(path):
+    if not storage.is_file(path):
         raise InputError(f"no table at {path}; expected a CSV file with the columns photo and time; check --times")
     try:
         rows = list(csv.DictReader(io.StringIO(storage.read_bytes(path).decode("utf-8-sig", "replace"))))

@@ -23,6 +23,8 @@ Format = Literal["png", "pdf"]
 "Of the figures for a paper."
 Vectors = Callable[[Iterable[str]], dict[str, Floats]]
 "Embeddings (D,) by key; keys that are not known are absent."
+RESULTS = frozenset({"query", "task", "protocol", "multi_query", "first_match_rank", "ap"})
+"Columns of a result that are always there."
 BESIDES = {"views": VIEWS, "groups": GROUPS, "parts": PARTS, "gaps": GAP}
 
 
@@ -88,20 +90,42 @@ def read_findings(folder: str) -> Findings:
     """
     if not storage.exists(storage.join(folder, "metrics.json")):
         raise InputError(f"no finished evaluation at {folder}: found no metrics.json; make one with jobs/evaluate.py")
-    with storage.open_read(storage.join(folder, "queries.parquet")) as stream:
-        results = pq.read_table(stream)
+    try:
+        with storage.open_read(storage.join(folder, "queries.parquet")) as stream:
+            results = pq.read_table(stream)
+        metrics = storage.read_json(storage.join(folder, "metrics.json"))
+        strange = [row for row in metrics if not _is_measured(row)]
+        if strange or not isinstance(metrics, list) or not RESULTS <= set(results.column_names):
+            raise ValueError("rows or columns that jobs/evaluate.py does not write")
+        besides = read_besides(folder)
+    except (ValueError, TypeError, OSError, pa.ArrowException) as error:
+        raise InputError(
+            f"the evaluation at {folder} cannot be read ({error}); expected what jobs/evaluate.py writes; evaluate again"
+        ) from None
     return Findings(
-        name=folder.rstrip("/").rsplit("/", 1)[-1],
-        metrics=storage.read_json(storage.join(folder, "metrics.json")),
-        results=results,
-        **read_besides(folder),
+        name=folder.rstrip("/").rsplit("/", 1)[-1], metrics=metrics, results=results, **besides,
+    )  # fmt: skip
+
+
+def _is_measured(row: Any) -> bool:
+    """Whether this is a row of metrics.json as whoever compares and shows them needs it."""
+    return (
+        isinstance(row, dict)
+        and all(isinstance(row.get(name), str) for name in ("task", "protocol"))
+        and all(type(row.get(name)) is int for name in ("queries", "gallery"))
+        and all(type(row.get(name)) in (int, float) for name in ("r1", "r5", "r10", "r1p", "ap"))
+        and isinstance(row.get("multi_query"), bool)
     )
 
 
 def read_besides(folder: str) -> dict[str, tuple[dict[str, Any], ...]]:
     """What an evaluation holds besides its measures, by the names of Findings' fields; empty where it was not taken."""
     paths = {name: storage.join(folder, file) for name, file in BESIDES.items()}
-    return {name: tuple(storage.read_json(path)) if storage.exists(path) else () for name, path in paths.items()}
+    found = {name: tuple(storage.read_json(path)) if storage.exists(path) else () for name, path in paths.items()}
+    for name, rows in found.items():
+        if not all(isinstance(row, dict) for row in rows):
+            raise ValueError(f"{paths[name]} holds something else than rows")
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -96,6 +96,10 @@ def is_folder(path: str) -> bool:
     return bool(filesystem.isdir(inner))
 
 
+def is_file(path: str) -> bool:
+    return exists(path) and not is_folder(path)
+
+
 def size(path: str) -> int:
     """Bytes of a file."""
     filesystem, inner = locate(path)
