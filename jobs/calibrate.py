@@ -20,7 +20,7 @@ from pipeline.confidence import FILE, Confidence, read_confidence, write_confide
 from pipeline.foreign import open_manifest
 from pipeline.gallery_map import gallery_map
 from pipeline.index import Index
-from pipeline.progress import console, progress
+from pipeline.progress import console, progress, results
 from pipeline.records import InputError, Split, View
 from pipeline.reliability import diagram
 from pipeline.samples import read_shard
@@ -83,7 +83,7 @@ def calibrate_index(settings: Settings) -> Confidence:
     picture = f"{out.removesuffix('.json')}.svg"
     storage.write_bytes(picture, diagram(confidence.bins, f"Reliability over {confidence.photos} photos").encode())
     console.print(told(confidence))
-    print(f"calibration: {out}, diagram: {picture}")
+    results.print(f"calibration: {out}, diagram: {picture}", soft_wrap=True)
     return confidence
 
 

@@ -28,11 +28,14 @@ def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lamb
     except (InputError, CheckpointError) as error:
         _say(str(error))
         sys.exit(2)
+    except OSError as error:  # the system's word: no right to, no room for, a folder for a file
+        where = f"{error.filename}: " if error.filename else ""
+        _say(
+            f"{where}{error.strerror or error}; check the path, its rights and the room on its disk, and run the same command again to go on"
+        )
+        sys.exit(1)
     except Unfinished as error:
         _say(str(error))
-        sys.exit(1)
-    except OSError as error:  # no place on the disk, a file that cannot be read, a cluster that does not answer
-        _say(f"{error}; mend that and run the same command again to go on")
         sys.exit(1)
     except RayError as error:
         if isinstance(error, RayTaskError):
@@ -46,4 +49,4 @@ def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lamb
 
 def _say(sentence: str) -> None:
     console.print("error:", style="bold red", end=" ")
-    console.print(sentence)
+    console.print(sentence.replace("\n", "\\n"))  # one sentence is one line, whatever a file in it is called

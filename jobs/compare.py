@@ -10,7 +10,7 @@ import tyro
 from jobs.cli import run
 from pipeline import storage
 from pipeline.comparison import compare, latex, markdown
-from pipeline.progress import console
+from pipeline.progress import console, results
 from pipeline.report_inputs import read_findings
 
 
@@ -25,7 +25,7 @@ def main(
         published: Add the figures that papers published for University-1652's official test.
     """
     rows = compare([read_findings(folder) for folder in runs])
-    print(markdown(rows, published))
+    results.print(markdown(rows, published), soft_wrap=True)
     if out is not None:
         storage.write_bytes(storage.join(out, "comparison.md"), markdown(rows, published).encode())
         storage.write_bytes(storage.join(out, "comparison.tex"), latex(rows, published).encode())

@@ -8,7 +8,6 @@ import io
 from dataclasses import dataclass, replace
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from jobs.calibrate import Settings as CalibrationSettings
@@ -18,7 +17,7 @@ from jobs.locate import locate_photos
 from pipeline import storage
 from pipeline.answer_files import Located
 from pipeline.answer_page import Place, away_m, told_m
-from pipeline.progress import console
+from pipeline.progress import console, results
 from pipeline.records import InputError
 
 PHOTOS = 10
@@ -61,7 +60,7 @@ def locate_some(demo: Demo) -> str:
         table.add_column(heading, justify="left" if heading == "place" else "right", no_wrap=True)
     for name, one, all_ in zip(names, alone, together, strict=True):
         table.add_row(name, *_cells(one, places[name]), *_cells(all_, places[name]))
-    Console().print(table)
+    results.print(table)
     return page
 
 

@@ -67,7 +67,7 @@ def read_checkpoint(path: str) -> bytes:
 
     Raises InputError when there is none.
     """
-    if not storage.exists(path):
+    if not storage.is_file(path):
         raise InputError(f"no checkpoint at {path}; expected a last.pt of jobs/train.py; check --checkpoint")
     return storage.read_bytes(path)
 

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from jobs.cli import run
 from pipeline.evaluation import EvaluationSettings, evaluate
 from pipeline.part_measures import part_label
+from pipeline.progress import results
 from pipeline.published import ABLATION, TABLE
 from pipeline.report_inputs import read_besides
 
@@ -49,14 +49,14 @@ def print_table(rows: list[dict[str, Any]]) -> None:
     for row in rows:
         counts = (f"{row['queries']:,}", f"{row['gallery']:,}")
         table.add_row(_task(row), *(f"{100 * row[measure]:.2f}" for measure in MEASURES), *counts)
-    Console().print(table)
+    results.print(table)
     table = _table("95 % intervals: locations resampled")
     table.add_column("task")
     for measure in SURE:
         table.add_column(MEASURES[measure], justify="right", no_wrap=True)
     for row in rows:
         table.add_row(_task(row), *(_interval(row, measure) for measure in SURE))
-    Console().print(table)
+    results.print(table)
 
 
 def print_published(tasks: list[str]) -> None:
@@ -70,7 +70,7 @@ def print_published(tasks: list[str]) -> None:
             if figures := line.of(task):
                 table.add_row(line.method, str(line.pixels), *(f"{figure:.2f}" for figure in figures))
         if table.row_count:
-            Console().print(table)
+            results.print(table)
 
 
 def print_positions(rows: list[dict[str, Any]]) -> None:
@@ -85,7 +85,7 @@ def print_positions(rows: list[dict[str, Any]]) -> None:
         shares = (f"{100 * row[f'within_{metres}m']:.2f}" for metres in (25, 50, 100))
         marks = ("-" if row[f"sdm{k}"] is None else f"{100 * row[f'sdm{k}']:.2f}" for k in (1, 3, 5))
         table.add_row(row["task"], f"{row['distance_median_m']:.1f} m", *shares, *marks, f"{row['geo_queries']:,}")
-    Console().print(table)
+    results.print(table)
 
 
 def print_gaps(gaps: Sequence[dict[str, Any]]) -> None:
@@ -98,7 +98,7 @@ def print_gaps(gaps: Sequence[dict[str, Any]]) -> None:
     for gap in gaps:
         said = (f"{of['mean']:.3f} ({of['low']:.2f} to {of['high']:.2f})" for of in (gap["true"], gap["other"]))
         table.add_row(gap["task"], *said, f"{gap['distance']:.3f}")
-    Console().print(table)
+    results.print(table)
 
 
 def print_groups(rows: Sequence[dict[str, Any]], first: str) -> None:
@@ -112,7 +112,7 @@ def print_groups(rows: Sequence[dict[str, Any]], first: str) -> None:
             if (row["task"], row.get("by", "views a query")) == (task, heading):
                 cells = (cell for name in ("r1", "ap") for cell in (f"{100 * row[name]:.2f}", _interval(row, name)))
                 table.add_row(str(row[first]), *cells, f"{row['queries']:,}")
-        Console().print(table)
+        results.print(table)
 
 
 def _task(row: dict[str, Any]) -> str:

@@ -46,7 +46,7 @@ class Settings:
 
     @property
     def source(self) -> str:
-        source = self.torchvision or self.lpn
+        source = self.lpn if self.torchvision is None else self.torchvision
         assert source is not None
         return source
 

@@ -12,7 +12,6 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from jobs.cli import run
@@ -29,7 +28,7 @@ from pipeline.gallery_map import GalleryMap, gallery_map
 from pipeline.index import Index
 from pipeline.locate import Answer, locate
 from pipeline.photo_files import find_photos, read_times, seconds
-from pipeline.progress import console
+from pipeline.progress import console, results
 from pipeline.records import InputError, Unfinished
 from pipeline.report_inputs import no_pictures
 from pipeline.shard_records import footprints
@@ -229,7 +228,7 @@ def print_answers(located: Sequence[Located]) -> None:
         table.add_column(heading, justify="left" if heading in ("photo", "location") else "right", overflow="fold")
     for one in located:
         table.add_row(one.name, *_cells(one))
-    Console().print(table)
+    results.print(table)
 
 
 def _cells(one: Located) -> list[str]:
@@ -250,7 +249,7 @@ def main(settings: Settings) -> None:
     """Answer where photos were taken: a position, how sure it is, and the candidates behind it."""
     located = locate_photos(settings)
     print_answers(located)
-    print(f"answers: {settings.out}" + (f", page: {settings.page}" if settings.page else ""))
+    results.print(f"answers: {settings.out}" + (f", page: {settings.page}" if settings.page else ""), soft_wrap=True)
     damaged = [refused for one in located for refused in one.rejected]
     if damaged:
         raise Unfinished(

@@ -69,7 +69,7 @@ def main(settings: Settings) -> None:
         ("checkpoint", settings.checkpoint, "a last.pt of jobs/train.py"),
         ("index", storage.join(settings.index, FACTS), "an index of jobs/build_index.py"),
     ):
-        if not storage.exists(path):
+        if not storage.is_file(path):
             raise InputError(f"no {name} at {path}; expected {hint}; check --{name}")
     token = settings.token()
     cluster.connect()

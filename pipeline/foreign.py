@@ -3,13 +3,14 @@
 In: a folder of tars in webdataset's layout without a manifest.json. Out: what read_manifest and a JSON of ours would say.
 """
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from typing import IO, Any, cast
 
 from pipeline import storage
 from pipeline.progress import console, progress
-from pipeline.records import InputError, Split, View, make_key
+from pipeline.records import InputError, Split, View, is_place, make_key
 from pipeline.shards import MANIFEST, Manifest, Shard, read_manifest
 from pipeline.tars import IMAGES, HashedStream, read_members
 
@@ -80,6 +81,9 @@ def facts_of(key: str, said: Mapping[str, Any], label: bytes | None, split: Spli
         (str(said[name]) for name in LOCATIONS if isinstance(said.get(name), str | int) and said[name] != ""), ""
     )
     location = named or (label or b"").decode(errors="replace").strip() or folder.rpartition("/")[2] or key
+    location = location.encode(
+        "utf-8", "backslashreplace"
+    ).decode()  # JSON and names of files may hold half a character
     return {
         "key": make_key(split, view, location, key), "location": location, "view": view, "split": split,
         "geotag": _position(said) or (_position(said["geotag"]) if isinstance(said.get("geotag"), dict) else None),
@@ -88,13 +92,11 @@ def facts_of(key: str, said: Mapping[str, Any], label: bytes | None, split: Spli
 
 
 def _position(said: Mapping[str, Any]) -> dict[str, float] | None:
-    lat, lon = (next(_numbers(said, names), None) for names in (LATITUDES, LONGITUDES))
-    if lat is None or lon is None or not (-90 <= lat <= 90 and -180 <= lon <= 180):
-        return None
-    return {"lat": lat, "lon": lon}
+    lat, lon = (next(_numbers(said, names), math.nan) for names in (LATITUDES, LONGITUDES))
+    return {"lat": float(lat), "lon": float(lon)} if is_place(lat, lon) else None
 
 
 def _numbers(said: Mapping[str, Any], names: tuple[str, ...]) -> Iterator[float]:
     for name in names:
         if isinstance(value := said.get(name), int | float) and not isinstance(value, bool):
-            yield float(value)
+            yield value

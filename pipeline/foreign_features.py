@@ -51,7 +51,7 @@ def import_features(settings: ImportSettings) -> dict[str, tuple[str, int]]:
     A location is the name of the image's folder where the file gives paths for both sides, else the label as text. Vectors
     are brought to unit length. Raises InputError when the file is not what it should be, or OUT holds other features.
     """
-    if not storage.exists(settings.mat):
+    if not storage.is_file(settings.mat):
         raise InputError(f"no file at {settings.mat}; expected a .mat file of features; check the path")
     data = storage.read_bytes(settings.mat)
     said = _load(settings.mat, data)

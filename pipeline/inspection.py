@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import simplejpeg
 from PIL import Image
 
-from pipeline.transforms import DecodeError, decode, orientation_of, refusing
+from pipeline.transforms import FORMATS, DecodeError, decode, orientation_of, refusing
 
 MAX_PIXELS = 178_956_970
 "Where Pillow sees a decompression bomb: twice what 24 bits a pixel make of a quarter of a GiB. Beyond it decode refuses."
@@ -65,7 +65,7 @@ def _decoded(data: bytes) -> tuple[int, int]:
 
 def _upright(data: bytes) -> tuple[int, int]:
     """The size of an image that may say how it is to be turned: decode's own reader is asked."""
-    with Image.open(io.BytesIO(data)) as opened:  # reads the header only
+    with Image.open(io.BytesIO(data), formats=FORMATS) as opened:  # reads the header only
         width, height = opened.size
         return (height, width) if orientation_of(opened) >= SIDEWAYS else (width, height)
 

@@ -18,7 +18,7 @@ from pipeline.exclusive import one_at_a_time
 from pipeline.extension import new_records, next_numbers
 from pipeline.mending import damaged_shards, mend, whole_part
 from pipeline.progress import console, progress
-from pipeline.records import ImageRecord, InputError, Rejection, Split, Unfinished
+from pipeline.records import ImageRecord, InputError, Rejection, Split, Unfinished, is_text
 from pipeline.shard_plan import ShardPlan, ShardSize, plan_shards
 from pipeline.shard_records import FOLDER, Packed, read_packed, read_part
 from pipeline.shard_writing import UNREADABLE, Check, write_shard
@@ -162,7 +162,7 @@ def gather(source: Source, root: str) -> Haul:
     rejected: list[Rejection] = []
     for found in source.scan(root):
         name = found.path if isinstance(found, Rejection) else f"{found.name}{found.location}"
-        if not _is_text(name):
+        if not is_text(name):
             told = found.path.encode("utf-8", "backslashreplace").decode()
             rejected.append(Rejection(path=told, reason="name is not UTF-8", found=told.rsplit("/", 1)[-1]))
         elif isinstance(found, Rejection):
@@ -170,14 +170,6 @@ def gather(source: Source, root: str) -> Haul:
         else:
             records.append(found)
     return Haul(records=records, rejected=rejected, found=len(records) + len(rejected))
-
-
-def _is_text(name: str) -> bool:
-    try:
-        name.encode()
-    except UnicodeEncodeError:  # bytes of a file's name that are no UTF-8 come as lone surrogates
-        return False
-    return True
 
 
 def clear(out: str, wanted: frozenset[str]) -> None:

@@ -73,9 +73,14 @@ def read_times(path: str, photos: Sequence[str]) -> dict[str, str]:
 
     Raises InputError where it is no such table, or says nothing of one of the photos.
     """
-    if not storage.exists(path):
+    if not storage.is_file(path):
         raise InputError(f"no table at {path}; expected a CSV file with the columns photo and time; check --times")
-    rows = list(csv.DictReader(io.StringIO(storage.read_bytes(path).decode("utf-8-sig", "replace"))))
+    try:
+        rows = list(csv.DictReader(io.StringIO(storage.read_bytes(path).decode("utf-8-sig", "replace"))))
+    except csv.Error as error:
+        raise InputError(
+            f"{path} cannot be read as CSV ({error}); expected the columns photo and time; mend it"
+        ) from None
     if not rows or not {"photo", "time"} <= rows[0].keys():
         raise InputError(f"{path} has no rows with the columns photo and time; expected both; write its first line so")
     said = {row["photo"]: row["time"] or "" for row in rows}

@@ -1,20 +1,51 @@
 """Progress of long work: a bar on a terminal, a JSON line every few seconds elsewhere; rate and time left in both."""
 
 import json
+import re
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Any, Protocol
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
 
 SECONDS_BETWEEN_LINES = 5.0
 
-console = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
-"""Where progress and remarks go; results go to standard output. Paths are no markup, and stay whole for whoever copies
-them."""
+UNSEEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+"""What a terminal would obey and not show, line ends and tabs aside; what turns the direction of writing round; and halves of
+characters, which stand for the bytes of names that are no UTF-8."""
+
+
+def visible(text: str) -> str:
+    """Text as a terminal may be given it: files may be called anything, also what clears a screen."""
+    return UNSEEN.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+class _Plain(Console):
+    """A console that shows text as it is: names are no markup and no emoji, and command nothing."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(highlight=False, markup=False, emoji=False, **kwargs)
+
+    def render_str(self, text: str, **kwargs: Any) -> Text:  # type: ignore[override]
+        return super().render_str(visible(text), **kwargs)
+
+
+console = _Plain(stderr=True, soft_wrap=True)
+"Where progress and remarks go. Paths stay whole for whoever copies them."
+results = _Plain()
+"Where results go: standard output."
 
 
 class Meter(Protocol):
@@ -36,11 +67,21 @@ def progress(total: float | None, label: str, unit: str = "images") -> Iterator[
         meter.line(last=True)
         return
     columns = (
-        TextColumn("{task.description}"), BarColumn(bar_width=30), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[facts]}"),
+        _Told("{task.description}"), BarColumn(bar_width=30), MofNCompleteColumn(), _Told("{task.fields[rate]}"),
+        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), _Told("{task.fields[facts]}"),
     )  # fmt: skip
     with Progress(*columns, console=console) as bar:
         yield _Bar(bar, total, label, unit)
+
+
+class _Told(TextColumn):
+    """A column of text that is no markup."""
+
+    def __init__(self, form: str) -> None:
+        super().__init__(form, markup=False)
+
+    def render(self, task: Task) -> Text:
+        return Text(visible(super().render(task).plain), style="none")
 
 
 class _Bar:

@@ -87,6 +87,31 @@ LONGEST_KEY = 90
 "A tar header of the oldest kind holds names of 100 characters, ending included."
 
 
+KEY = re.compile(rf"[a-z0-9_-]{{1,{LONGEST_KEY}}}")
+"What a key looks like."
+
+
+def is_text(name: str) -> bool:
+    """Whether it can be written down as UTF-8: names of files in other encodings hold lone surrogates."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def is_place(lat: object, lon: object) -> bool:
+    """Whether these are degrees north and east of some place."""
+    plain = all(isinstance(value, int | float) and not isinstance(value, bool) for value in (lat, lon))
+    return plain and -90 <= lat <= 90 and -180 <= lon <= 180  # type: ignore[operator]  # false of a NaN
+
+
+def excerpt(value: object) -> str:
+    """So much of what was found as a sentence can hold."""
+    said = repr(value)
+    return said if len(said) <= LONGEST_EXCERPT else f"{said[:LONGEST_EXCERPT]}..."
+
+
 def make_key(split: Split, view: View, location: str, stem: str) -> str:
     """Key of an image: stable under re-sharding, without dots (webdataset cuts a name at the first one).
 
@@ -105,6 +130,12 @@ def key_names(key: str, split: Split, view: View, location: str) -> bool:
     return key.startswith(begin[: LONGEST_KEY - 9])
 
 
+LONGEST_EXCERPT = 200
+"Characters of a damaged value that are shown."
+LONGEST_FOUND = 600
+"Characters of what was found that are written down."
+
+
 @dataclass(frozen=True, kw_only=True)
 class Rejection:
     """An image that was refused, and why."""
@@ -113,4 +144,10 @@ class Rejection:
     reason: str
     "Short and countable: the same words for the same fault."
     found: str
-    "What this file held, for the person who mends it."
+    "What this file held, for the person who mends it; cut where it is longer than LONGEST_FOUND."
+
+    def __post_init__(self) -> None:
+        found = self.found if is_text(self.found) else self.found.encode("utf-8", "backslashreplace").decode()
+        if len(found) > LONGEST_FOUND:  # a damaged file may hold a megabyte where a number was expected
+            found = f"{found[: LONGEST_FOUND - 3]}..."
+        object.__setattr__(self, "found", found)

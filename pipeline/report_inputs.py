@@ -22,6 +22,8 @@ Format = Literal["png", "pdf"]
 "Of the figures for a paper."
 Vectors = Callable[[Iterable[str]], dict[str, Floats]]
 "Embeddings (D,) by key; keys that are not known are absent."
+COLUMNS = frozenset({"query", "task", "protocol", "multi_query", "first_match_rank", "ap"})
+"Columns of a result that are always there."
 BESIDES = {"views": VIEWS, "groups": GROUPS, "parts": PARTS, "gaps": GAP}
 
 
@@ -95,11 +97,28 @@ def read_findings(folder: str) -> Findings:
             f"{path} cannot be read ({error}), expected the rows of a finished evaluation; delete {folder} and evaluate again "
             "with jobs/evaluate.py"
         ) from None
-    return Findings(
-        name=folder.rstrip("/").rsplit("/", 1)[-1],
-        metrics=read_rows(folder, METRICS),
-        results=results,
-        **read_besides(folder),
+    metrics, besides = read_rows(folder, METRICS), read_besides(folder)
+    rows = [row for held in besides.values() for row in held]
+    if (
+        not set(results.column_names) >= COLUMNS
+        or not all(_is_measured(row) for row in metrics)
+        or not all(isinstance(row, dict) for row in rows)
+    ):
+        raise InputError(
+            f"the evaluation at {folder} holds rows or columns that jobs/evaluate.py does not write; delete {folder} and "
+            "evaluate again with jobs/evaluate.py"
+        )
+    return Findings(name=folder.rstrip("/").rsplit("/", 1)[-1], metrics=metrics, results=results, **besides)
+
+
+def _is_measured(row: Any) -> bool:
+    """Whether this is a row of metrics.json as whoever compares and shows them needs it."""
+    return (
+        isinstance(row, dict)
+        and all(isinstance(row.get(name), str) for name in ("task", "protocol"))
+        and all(type(row.get(name)) is int for name in ("queries", "gallery"))
+        and all(type(row.get(name)) in (int, float) for name in ("r1", "r5", "r10", "r1p", "ap"))
+        and isinstance(row.get("multi_query"), bool)
     )
 
 

@@ -10,7 +10,7 @@ from typing import IO, Any, cast
 
 from pipeline import storage
 from pipeline.foreign import facts_of
-from pipeline.records import InputError, Split, View
+from pipeline.records import KEY, InputError, Split, View, excerpt, is_place, is_text
 from pipeline.shards import mending
 from pipeline.tars import IMAGES, SAID, HashedStream, read_members, read_tar
 
@@ -45,6 +45,8 @@ def read_shard(
             continue
         said = _json(members.get("json"))
         if said.keys() >= OURS:
+            if wrong := next(_faults(key, said), None):
+                raise InputError(f"the JSON of sample {key!r} in {path} has {wrong}; have the tar packed again")
             yield Sample(key=key, data=data, facts=said)
             continue
         if split is None or view is None:
@@ -73,16 +75,32 @@ def read_locations(shards: str, name: str) -> Iterator[str]:
     """
     path = storage.join(shards, f"{name}.tar")
     for key, members in read_tar(path, ("json",)):
-        location = _json(members["json"]).get("location")
+        location = _json(members.get("json")).get("location")
         if not isinstance(location, str):
-            raise InputError(f"{path}: the JSON of {key} says no location, expected what was packed; {mending(shards)}")
+            raise InputError(
+                f"{path}: the JSON of {key!r} says no location, expected what was packed; {mending(shards)}"
+            )
         yield location
+
+
+def _faults(key: str, said: dict[str, Any]) -> Iterator[str]:
+    """What of the JSON of a shard of ours cannot be as packing wrote it: whoever reads on may rely on the rest."""
+    if not KEY.fullmatch(key) or said["key"] != key:
+        yield f"the key {excerpt(said['key'])}, expected that of its file"
+    for name, allowed in (("view", View), ("split", Split)):
+        if said[name] not in list(allowed):
+            yield f"the {name} {excerpt(said[name])}, expected one of {', '.join(allowed)}"
+    if not isinstance(said["location"], str) or not is_text(said["location"]):
+        yield f"the location {excerpt(said['location'])}, expected text"
+    tag = said["geotag"]
+    if tag is not None and not (isinstance(tag, dict) and is_place(tag.get("lat"), tag.get("lon"))):
+        yield f"the geotag {excerpt(tag)}, expected null or a latitude and a longitude in degrees"
 
 
 def _json(data: bytes | None) -> dict[str, Any]:
     """A JSON object; nothing where there is none or it is none."""
     try:
         said = json.loads(data or b"{}")
-    except ValueError:
+    except (ValueError, RecursionError):
         return {}
     return said if isinstance(said, dict) else {}

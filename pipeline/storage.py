@@ -13,13 +13,26 @@ from typing import IO, Any
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
+from pipeline.records import InputError
+
 TEMPORARY = re.compile(r"\.(.+)\.[0-9a-f]{8}")
 "Names that `atomic` gives to files until they are whole."
 
 
 def locate(path: str) -> tuple[Any, str]:
-    """The fsspec file system of a path and the path on it."""
-    filesystem, inner = fsspec.core.url_to_fs(path)
+    """The fsspec file system of a path and the path on it.
+
+    Raises InputError where no file system is known by a URI's scheme, or what it needs is not installed.
+    """
+    if "://" not in path:  # to fsspec a name with :: in it would be a chain of file systems
+        local = LocalFileSystem()
+        return local, local._strip_protocol(path)
+    try:
+        filesystem, inner = fsspec.core.url_to_fs(path)
+    except (ValueError, ImportError) as error:
+        raise InputError(
+            f"{path} is on no storage that is known here ({error}); expected a path, file://, s3:// or gs://"
+        ) from None
     return filesystem, inner
 
 
@@ -83,6 +96,10 @@ def is_folder(path: str) -> bool:
     return bool(filesystem.isdir(inner))
 
 
+def is_file(path: str) -> bool:
+    return exists(path) and not is_folder(path)
+
+
 def size(path: str) -> int:
     """Bytes of a file."""
     filesystem, inner = locate(path)
@@ -103,7 +120,11 @@ def read_head(path: str, size: int) -> bytes:
 
 
 def read_json(path: str) -> Any:
-    return json.loads(read_bytes(path))
+    """Raises ValueError where it is no JSON, or nested deeper than anything of ours."""
+    try:
+        return json.loads(read_bytes(path))
+    except RecursionError:
+        raise ValueError("lists within lists without end") from None
 
 
 def open_read(path: str) -> IO[bytes]:

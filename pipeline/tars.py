@@ -16,6 +16,13 @@ IMAGES = ("jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp", "gif", "ppm")
 SAID = ("json", "cls")
 "Endings of the members that say what an image shows. All others are passed over: captions, masks, pickles."
 
+LONGEST_HEADER = 1 << 16
+"Bytes of a long name, or of a pax header; a path has four thousand at most."
+NAMING = (
+    tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE,
+)  # fmt: skip
+"Kinds of headers that only say something of the one behind them."
+
 
 def read_tar(path: str, endings: tuple[str, ...] = IMAGES + SAID) -> Iterator[tuple[str, dict[str, bytes]]]:
     """Key and members (ending -> bytes) of each sample of a tar, in its order; members of other endings are not read.
@@ -48,7 +55,12 @@ def read_members(stream: IO[bytes], path: str, endings: tuple[str, ...]) -> Iter
                 file = tar.extractfile(member)
                 assert file is not None  # of a regular file there is one
                 held[ending.lower()] = file.read()
-    except (tarfile.TarError, EOFError) as error:
+    except (
+        tarfile.TarError,
+        EOFError,
+        ValueError,
+        RecursionError,
+    ) as error:  # the last two: of headers that make no sense
         raise InputError(
             f"{path} is cut off or damaged after {samples} samples ({error}), expected a whole tar; copy it again from where "
             "it came from, or pack again with jobs/make_shards.py"
@@ -67,7 +79,11 @@ def refuse_name(name: str, path: str) -> None:
 
 
 class _Header(tarfile.TarInfo):
-    """A member's header. Left to itself tarfile takes a broken header, or the end of the file, for the end of the tar."""
+    """A member's header. Left to itself tarfile takes a broken header, or the end of the file, for the end of the tar.
+
+    And it fills the holes of a sparse file with as many zeros as the header says, reads a name of any length, and takes the
+    square of a pax header's length to read it.
+    """
 
     @classmethod
     def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Self:
@@ -76,9 +92,20 @@ class _Header(tarfile.TarInfo):
         if not any(buf):
             return super().frombuf(buf, encoding, errors)  # raises: the end marker
         try:
-            return super().frombuf(buf, encoding, errors)
+            said = super().frombuf(buf, encoding, errors)
         except tarfile.HeaderError as error:
             raise tarfile.ReadError(str(error)) from None
+        if said.type == tarfile.GNUTYPE_SPARSE:
+            cls._refuse_sparse()
+        if said.size < 0 or (said.type in NAMING and said.size > LONGEST_HEADER):
+            raise tarfile.ReadError(f"it has a header of {said.size} bytes")
+        return said
+
+    @staticmethod
+    def _refuse_sparse(*_: object) -> None:
+        raise tarfile.ReadError("it holds a sparse file")
+
+    _proc_gnusparse_00 = _proc_gnusparse_01 = _proc_gnusparse_10 = _refuse_sparse
 
 
 class HashedStream:

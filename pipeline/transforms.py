@@ -19,6 +19,9 @@ from pipeline.records import View
 Pixels = npt.NDArray[np.uint8]
 Resizer = Literal["torch", "pillow"]
 "Whose antialiased bicubic. Torch's is several times as fast on a CPU with AVX2 and half as fast on one without."
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF", "PPM")
+"""What Pillow may take bytes for, whatever their name says. It knows forty more, some of them seldom looked at, and has
+Ghostscript run what calls itself EPS."""
 ORIENTATION_TAG = 0x0112
 UPRIGHT = {
     1: (slice(None), slice(None)),
@@ -45,7 +48,7 @@ def decode(data: bytes) -> Pixels:
 
     Raises DecodeError.
     """
-    with refusing(data), Image.open(io.BytesIO(data)) as opened:  # reads the header only
+    with refusing(data), Image.open(io.BytesIO(data), formats=FORMATS) as opened:  # reads the header only
         if opened.format in ("JPEG", "MPO") and opened.mode in ("RGB", "L"):  # MPO: a JPEG that others follow
             return upright(simplejpeg.decode_jpeg(data, "RGB"), orientation_of(opened))
         opened.load()  # Pillow turns a TIFF upright here, and its tag is gone

@@ -73,7 +73,7 @@ def check_shard(root: str, shard: Shard) -> list[str]:
                     wrong.append(f"{path}: the image of {key} has not the hash that its JSON says")
         except InputError as error:
             wrong.append(str(error))
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
             wrong.append(f"{path}: the sample behind {keys[-1][0] if keys else 'its beginning'} is damaged ({error})")
         hashed.drain()
     if hashed.bytes != shard.bytes:

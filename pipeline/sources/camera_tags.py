@@ -39,7 +39,7 @@ XMP_HEADING = ("GimbalYawDegree", "CameraYawDegree", "CameraOrientationNED.Yaw")
 XMP_BODY_HEADING = ("FlightYawDegree", "DroneYawDegree")
 XMP_PITCH = ("GimbalPitchDegree", "CameraPitchDegree", "CameraOrientationNED.Pitch")
 BEYOND_VERTICAL = 1.0  # degrees by which gimbals overshoot straight down: -90.1 is common
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?", re.ASCII)
+NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d{1,3})?", re.ASCII)  # in one way only: a square of time else
 
 
 @dataclass(frozen=True, kw_only=True)

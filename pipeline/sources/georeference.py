@@ -23,6 +23,8 @@ EQUATOR_M, POLE_M = 6378137.0, 6356752.314245  # the ellipsoid's half axes [WGS8
 BASELINE = (
     10.0  # pixels either side of the place measured: enough against rounding, little against the map's distortion
 )
+FARTHEST = 1e12
+"In any unit: beyond it nothing is on Earth, and PROJ goes round Web Mercator's equator turn by turn to find out."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +43,10 @@ class Georeference:
         """
         x, y = places_N2.T
         a, b, c, d, e, f = self.affine[:6]
-        lon, lat = _to_wgs84(self.crs, a * x + b * y + c, d * x + e * y + f)
+        xs, ys = a * x + b * y + c, d * x + e * y + f
+        near = (np.abs(xs) < FARTHEST) & (np.abs(ys) < FARTHEST)  # false of a NaN
+        lon, lat = _to_wgs84(self.crs, np.where(near, xs, 0.0), np.where(near, ys, 0.0))
+        lon, lat = np.where(near, lon, np.nan), np.where(near, lat, np.nan)
         lon = np.where(np.abs(lon) > 180, (lon + 180) % 360 - 180, lon)  # mosaics may run on beyond the date line
         return np.stack([np.clip(lat, -90, 90), lon], axis=1)
 

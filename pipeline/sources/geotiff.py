@@ -3,6 +3,7 @@
 Tiles are told from coordinates and masks alone; their pixels are cut out, and encoded, when they are read.
 """
 
+import math
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -14,16 +15,20 @@ from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 
 from pipeline import storage
+from pipeline.inspection import MAX_PIXELS
 from pipeline.progress import console, progress
 from pipeline.records import ImageRecord, InputError, Rejection, Split, View
 from pipeline.sources.colours import Colours
 from pipeline.sources.georeference import Georeference, named_crs
 from pipeline.sources.mosaic import Encoding, colours, encoded, first_cause, nodata_share, opened
 from pipeline.sources.source import Source
-from pipeline.sources.tiles import Tile, plan_tiles, window_of
+from pipeline.sources.tiles import Tile, count_tiles, plan_tiles, window_of
 from pipeline.transforms import DecodeError
 
 TILE_PIXELS = 512  # where no size is asked for
+SMALLEST_M = 1e-6  # below it pixels are no places: all lie on one point, or on one line
+MOST_TILES = 2_000_000
+"Of one mosaic: with their records they take a few gigabytes. A header alone may say sides of four thousand million pixels."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,14 +63,18 @@ class GeoTiff(Source):
             raise InputError("--tile-m and --tile-pixels are both given; expected one of them: leave the other out")
         sides = {"tile-m": self.tile_m, "tile-pixels": self.tile_pixels, "output-pixels": self.output_pixels}
         for flag, value in sides.items():
-            if value is not None and not value > 0:
-                raise InputError(f"--{flag} is {value}, expected more than 0")
+            if value is not None and not 0 < value < math.inf:
+                raise InputError(f"--{flag} is {value}, expected a number above 0")
+        if self.output_pixels is not None and self.output_pixels**2 > MAX_PIXELS:
+            raise InputError(f"--output-pixels is {self.output_pixels}, expected at most {math.isqrt(MAX_PIXELS)}")
         if not 0 <= self.overlap < 1:
             raise InputError(f"--overlap is {self.overlap}, expected a share from 0 to below 1")
         if not 0 <= self.max_nodata <= 1:
             raise InputError(f"--max-nodata is {self.max_nodata}, expected a share from 0 to 1")
-        if self.stretch is not None and not self.stretch[0] < self.stretch[1]:
-            raise InputError(f"--stretch is {self.stretch[0]} {self.stretch[1]}, expected the smaller value first")
+        if self.stretch is not None and not -math.inf < self.stretch[0] < self.stretch[1] < math.inf:
+            raise InputError(
+                f"--stretch is {self.stretch[0]} {self.stretch[1]}, expected two numbers, the smaller one first"
+            )
         if self.crs is not None and named_crs(self.crs) is None:
             raise InputError(
                 f"--crs is {self.crs!r}, which names no coordinate system; expected one such as EPSG:32633"
@@ -101,10 +110,10 @@ class GeoTiff(Source):
     def _tiles(self, path: str, name: str) -> Iterator[ImageRecord]:
         """The tiles of one mosaic. Raises _Refused, RasterioError."""
         dataset = opened(path)
-        if np.issubdtype(np.dtype(dataset.dtypes[0]), np.complexfloating):
+        if dataset.dtypes[0].startswith("complex"):  # GDAL has some that NumPy has no name for
             raise _Refused("not a picture", f"{dataset.dtypes[0]} values; expected integers or floats")
         place = self._georeference(dataset)
-        planned = plan_tiles((dataset.width, dataset.height), self._tile_size(dataset, place), self.overlap)
+        planned = self._plan((dataset.width, dataset.height), self._tile_size(dataset, place))
         shown = colours(path, self.stretch)
         kept = self._without_nodata(path, planned, shown)
         tags = place.geotags(tile.window for tile in kept)
@@ -123,6 +132,19 @@ class GeoTiff(Source):
                 location=f"{name}-{tile.row}-{tile.column}", geotag=tag,
             )  # fmt: skip
 
+    def _plan(self, size: tuple[int, int], tile: tuple[int, int]) -> list[Tile]:
+        """Raises _Refused where a tile is larger than an image may be, or there are more than anybody could want."""
+        said = f"{size[0]} x {size[1]} pixels in tiles of {tile[0]} x {tile[1]}"
+        if min(tile[0], size[0]) * min(tile[1], size[1]) > MAX_PIXELS:
+            raise _Refused(
+                "absurd dimensions", f"{said}, expected tiles of at most {MAX_PIXELS} pixels: cut smaller ones"
+            )
+        if (count := count_tiles(size, tile, self.overlap)) > MOST_TILES:
+            raise _Refused(
+                "too many tiles", f"{said} make {count}, expected at most {MOST_TILES}: cut larger ones, or the mosaic"
+            )
+        return plan_tiles(size, tile, self.overlap)
+
     def _georeference(self, dataset: Any) -> Georeference:
         """Where the mosaic lies. Raises _Refused where it does not say."""
         with_gcps = f"{len(dataset.gcps[0])} ground control points alone" if dataset.gcps[0] else ""
@@ -133,8 +155,13 @@ class GeoTiff(Source):
         if not crs:
             raise _Refused("no coordinates", "no coordinate system; expected one: name it with --crs EPSG:...")
         place = Georeference(crs=crs, affine=dataset.transform)
-        if not np.isfinite(place.ground_pixel((dataset.width / 2, dataset.height / 2))).all():
+        ground = place.ground_pixel((dataset.width / 2, dataset.height / 2))
+        if not np.isfinite(ground).all():
             raise _Refused("no coordinates", f"its centre lies nowhere on Earth by {place.name}")
+        if not min(ground) > SMALLEST_M:
+            raise _Refused(
+                "no coordinates", f"pixels of {ground[0]:g} x {ground[1]:g} m by {place.name}, expected larger ones"
+            )
         return place
 
     def _tile_size(self, dataset: Any, place: Georeference) -> tuple[int, int]:

@@ -103,7 +103,7 @@ def best_pair(entry: Any, pairs: str) -> tuple[str, str | None]:
         tiles, weights = entry[f"pair_{pairs}_sate_img_list"], entry[f"pair_{pairs}_sate_weight_list"]
         if not (isinstance(folder, str) and isinstance(name, str) and len(tiles) == len(weights)):
             raise Unreadable(f"{name!r} has {len(tiles)} tiles and {len(weights)} weights")
-        if not all(isinstance(tile, str) for tile in tiles):
+        if not (isinstance(tiles, list) and all(isinstance(tile, str) for tile in tiles)):
             raise Unreadable(f"{name!r} has tiles that are no names")
         weighed = [number(str(weight)) for weight in weights]
     except Unreadable:

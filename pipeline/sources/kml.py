@@ -14,11 +14,27 @@ from pipeline.sources.tables import Unreadable, place
 
 LARGEST = 1 << 20
 "Bytes. A KML of one placemark has one or two thousand."
+DEEPEST = 64
+"Elements within elements; folders within folders of placemarks have about ten."
 
 
-class _WithoutDoctype(ElementTree.TreeBuilder):
+class _Bounded(ElementTree.TreeBuilder):
+    """A tree without a document type, and no deeper than DEEPEST: searching it costs what its size says."""
+
+    _depth = 0
+
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
         raise Unreadable(f"it declares a document type ({name}), expected none")
+
+    def start(self, tag: str, attrs: dict[str, str], /) -> ElementTree.Element:
+        self._depth += 1
+        if self._depth > DEEPEST:
+            raise Unreadable(f"it has more than {DEEPEST} elements within each other")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str, /) -> ElementTree.Element:
+        self._depth -= 1
+        return super().end(tag)
 
 
 def read_kmls(folder: str) -> tuple[dict[str, GeoTag], list[Rejection]]:
@@ -48,8 +64,10 @@ def place_of_kml(data: bytes) -> tuple[float, float]:
     Raises Unreadable.
     """
     try:
-        root = ElementTree.fromstring(data, ElementTree.XMLParser(target=_WithoutDoctype()))
-    except (ElementTree.ParseError, LookupError) as error:  # LookupError: an encoding that nobody knows
+        root = ElementTree.fromstring(data, ElementTree.XMLParser(target=_Bounded()))
+    except Unreadable:
+        raise
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the last two: an encoding that nobody knows
         raise Unreadable(f"not XML ({error})") from None
     point = next((inner for outer in _all(root, "Point") for inner in _all(outer, "coordinates")), None)
     if point is not None:

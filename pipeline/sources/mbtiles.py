@@ -5,18 +5,27 @@ nothing.
 """
 
 import sqlite3
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from urllib.parse import quote
 
 from pipeline import storage
-from pipeline.records import InputError
-from pipeline.sources.web_mercator import flipped
+from pipeline.records import InputError, Rejection
+from pipeline.sources.web_mercator import DEEPEST, flipped
 
 VECTOR = ("pbf", "mvt")
 MAGIC = 12  # bytes from which `kind_of` knows an image
 TILE = "FROM tiles WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
+LARGEST = 1 << 26
+"Bytes of any value: what SQLite would make of `zeroblob(1e9)` in a view is no tile."
+PATIENCE_S = 600.0
+"Seconds without a row until a query is given up: `tiles` may be a view, and a view may have no end."
+STEPS = 1_000_000
+"Of SQLite's machine between two looks at the clock (and at Ctrl-C): some milliseconds."
+READING = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION)
+"What a query of ours, and the views behind it, may do. Recursion is not among it: it may go on for ever."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,11 +54,12 @@ def zooms(path: str) -> list[int]:
             raise InputError(
                 f"{path} holds vector tiles ({form}), which show no pixels; expected png, jpg or webp tiles"
             )
-        return [zoom for (zoom,) in database.execute("SELECT DISTINCT zoom_level FROM tiles ORDER BY zoom_level")]
+        found = [zoom for (zoom,) in database.execute("SELECT DISTINCT zoom_level FROM tiles ORDER BY zoom_level")]
+        return [zoom for zoom in found if isinstance(zoom, int) and 0 <= zoom <= DEEPEST]
 
 
-def stored(path: str, zoom: int) -> Iterator[StoredTile]:
-    """Every tile of one zoom, by column and row.
+def stored(path: str, zoom: int) -> Iterator[StoredTile | Rejection]:
+    """Every tile of one zoom, by column and row; a Rejection for one whose column or row is no whole number.
 
     Raises InputError when it finds vector tiles, or the file is damaged.
     """
@@ -57,6 +67,10 @@ def stored(path: str, zoom: int) -> Iterator[StoredTile]:
     with _connected(path) as database:
         from_north = _metadata(database).get("scheme") == "xyz"
         for x, row, start in database.execute(query, (zoom,)):
+            database.waits_since = time.monotonic()
+            if not (isinstance(x, int) and isinstance(row, int)):
+                yield Rejection(path=f"{path}#{zoom}", reason="outside of the map", found=f"column {x!r}, row {row!r}")
+                continue
             start = start if isinstance(start, bytes) else b""
             if start[:2] == b"\x1f\x8b":  # only vector tiles are packed with gzip
                 raise InputError(
@@ -96,12 +110,26 @@ def _one(path: str, what: str, zoom: int, x: int, y: int) -> bytes:
     return row[0]
 
 
+class _Connection(sqlite3.Connection):
+    """Of a file that anybody may have written: it reads, in bounded time and memory."""
+
+    waits_since: float
+    "When the last row came."
+
+    def bound(self) -> None:
+        self.waits_since = time.monotonic()
+        self.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST)
+        self.set_authorizer(lambda action, *_: sqlite3.SQLITE_OK if action in READING else sqlite3.SQLITE_DENY)
+        self.set_progress_handler(lambda: time.monotonic() - self.waits_since > PATIENCE_S, STEPS)
+
+
 @contextmanager
-def _connected(path: str) -> Iterator[sqlite3.Connection]:
+def _connected(path: str) -> Iterator[_Connection]:
     """A connection that cannot write. Raises InputError when the file is no MBTiles, whenever that shows."""
     inner = storage.locate(path)[1]
     try:
-        with closing(sqlite3.connect(f"file:{quote(inner)}?mode=ro", uri=True)) as database:
+        with closing(sqlite3.connect(f"file:{quote(inner)}?mode=ro", uri=True, factory=_Connection)) as database:
+            database.bound()
             yield database
     except sqlite3.Error as error:
         raise InputError(f"{path} cannot be read as MBTiles ({error}); mend it or take another file") from None

@@ -47,7 +47,7 @@ class Table(Source):
     def _record(self, row: Row, path: str, whole: str) -> ImageRecord:
         """Raises BadRow."""
         if BROKEN in row:
-            raise BadRow("wrong number of cells", row[BROKEN])
+            raise BadRow(*row[BROKEN])
         if not path:
             raise BadRow("missing path", "no path")
         name = path.rpartition("/")[2]
@@ -135,6 +135,10 @@ def _taken_at(row: Row) -> str | None:
 def _size(path: str) -> int | None:
     """Bytes of a file on this machine; None elsewhere, where asking takes a request each. Raises BadRow."""
     if "://" in path and not path.startswith("file://"):
+        try:
+            storage.locate(path)
+        except InputError as error:
+            raise BadRow("no such storage", str(error)) from None
         return None
     try:
         return os.stat(path.removeprefix("file://")).st_size

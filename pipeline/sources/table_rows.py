@@ -24,7 +24,9 @@ NUMBERS = ("lat", "lon", "altitude_m", "heading_deg", "pitch_deg")
 SHAPE = "shape"
 "Under this name a GeoJSON row holds its geometry, a Shape."
 BROKEN = "broken"
-"Under this name a row of CSV that has more or fewer cells than the header says how many."
+"Under this name a row that cannot be one holds a countable reason, and what was found."
+LONGEST_CELL = 4096
+"Characters: the longest path that a file system opens."
 DELIMITERS = ",;\t"
 BATCH = 10_000  # rows of Parquet at once
 
@@ -46,7 +48,15 @@ def read_rows(path: str) -> Iterator[tuple[int, Row]]:
     ending = path.rpartition("/")[2].rpartition(".")[2].lower()
     if ending not in readers:
         raise InputError(f"{path} is no table by its name, expected {kinds}; write the table as one of these")
-    return enumerate(readers[ending](path), 1)
+    return enumerate(map(_bounded, readers[ending](path)), 1)
+
+
+def _bounded(row: Row) -> Row:
+    """The row without cells longer than any value of ours: what is held and told of a hostile one stays small."""
+    for name, value in row.items():
+        if isinstance(value, str | bytes) and len(value) > LONGEST_CELL:
+            return row | {name: value[:LONGEST_CELL], BROKEN: ("cell too long", f"{name} of {len(value)} characters")}
+    return row
 
 
 def _columns(path: str, found: Iterable[str]) -> dict[str, str]:
@@ -85,7 +95,7 @@ def _csv(path: str) -> Iterator[Row]:
                     continue  # an empty line
                 row: Row = {ours[name]: cell for name, cell in zip(names, cells, strict=False) if name in ours}
                 if len(cells) != len(names):  # an unquoted comma in a name shifts all that follows
-                    row[BROKEN] = f"{len(cells)} cells below {len(names)} columns"
+                    row[BROKEN] = ("wrong number of cells", f"{len(cells)} cells below {len(names)} columns")
                 if delimiter != ",":  # a spreadsheet of half of the world: 50,1
                     row |= {name: row[name].replace(",", ".") for name in NUMBERS if name in row}
                 yield row
@@ -101,15 +111,45 @@ def _csv(path: str) -> Iterator[Row]:
 def _parquet(path: str) -> Iterator[Row]:
     with storage.open_read(path) as stream:
         try:
-            table = pq.ParquetFile(stream)
-            ours = _columns(path, table.schema_arrow.names)
+            schema = pq.read_schema(stream)
+            ours = _columns(path, schema.names)
+            for name in ours:
+                if not _is_plain(schema.field(name).type):
+                    kind = str(schema.field(name).type)[:80]
+                    raise InputError(
+                        f"{path} has a column {name} of {kind}, expected text, numbers or times; write it as these"
+                    )
+            # As dictionaries: a text that stands there once, and is named by ten thousand rows, is held once.
+            table = pq.ParquetFile(stream, read_dictionary=list(ours))
             for batch in table.iter_batches(BATCH, columns=list(ours)):
-                for row in batch.to_pylist():
-                    yield {ours[name]: value for name, value in row.items()}
-        except (pa.ArrowException, OSError) as error:
+                columns = {ours[name]: _values(batch.column(name)) for name in batch.schema.names}
+                for cells in zip(*columns.values(), strict=True):
+                    yield dict(zip(columns, cells, strict=True))
+        except InputError:
+            raise
+        except (
+            Exception
+        ) as error:  # pyarrow raises whatever a damaged file, a date of no calendar or a time zone leads it to
             raise InputError(
                 f"{path} cannot be read as Parquet ({error}); expected a Parquet file; write it again"
             ) from None
+
+
+def _values(column: Any) -> list[Any]:
+    """A column's values; equal ones of a dictionary are one object."""
+    if not pa.types.is_dictionary(column.type):
+        values: list[Any] = column.to_pylist()
+        return values
+    named = column.dictionary.to_pylist()
+    return [None if place is None else named[place] for place in column.indices.to_pylist()]
+
+
+def _is_plain(kind: Any) -> bool:
+    of = pa.types
+    if of.is_dictionary(kind):
+        return _is_plain(kind.value_type)
+    tests = (of.is_string, of.is_large_string, of.is_integer, of.is_floating, of.is_boolean, of.is_decimal, of.is_null, of.is_date, of.is_timestamp)  # fmt: skip
+    return any(test(kind) for test in tests)
 
 
 def _geojson(path: str) -> Iterator[Row]:

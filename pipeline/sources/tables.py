@@ -13,7 +13,8 @@ from collections.abc import Iterable, Iterator
 from pipeline import storage
 from pipeline.records import InputError, Rejection
 
-NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+"In one way only: what could be matched in two takes the square of a long cell's length to refuse."
 LONGEST_EXCERPT = 200
 "Characters of a damaged line that are shown."
 

@@ -63,12 +63,19 @@ def plan_tiles(size: tuple[int, int], tile: tuple[int, int], overlap: float) -> 
     ]
 
 
+def count_tiles(size: tuple[int, int], tile: tuple[int, int], overlap: float) -> int:
+    """How many `plan_tiles` gives, known at once whatever the sizes are."""
+    columns, rows = (1 + len(_before_last(length, side, overlap)) for length, side in zip(size, tile, strict=True))
+    return columns * rows
+
+
 def starts(length: int, side: int, overlap: float) -> list[int]:
     """Where tiles of `side` pixels begin along `length` pixels: ascending, and the last one ends at the border."""
-    if length <= side:
-        return [0]
-    step = max(1, round(side * (1 - overlap)))
-    return [*range(0, length - side, step), length - side]
+    return [*_before_last(length, side, overlap), max(0, length - side)]
+
+
+def _before_last(length: int, side: int, overlap: float) -> range:
+    return range(0, length - side, max(1, round(side * (1 - overlap))))
 
 
 def window_of(part: str) -> Window:

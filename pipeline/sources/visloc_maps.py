@@ -139,12 +139,12 @@ def _placed_parts(
 ) -> Iterator[SatelliteMap]:
     """Parts by row and column, from 1, each at its place in the whole. Raises Unreadable where they do not fill it."""
     rows, columns = max(row for row, _ in cells), max(column for _, column in cells)
-    wanted = {(row, column) for row in range(1, rows + 1) for column in range(1, columns + 1)}
-    if set(cells) != wanted:
+    # Counted first: a name may number as many parts as it likes.
+    if len(cells) != rows * columns or not all(row and column for row, column in cells):
         raise Unreadable(f"{len(cells)} parts in {rows} rows and {columns} columns, expected one for each")
     heights = [cells[row, 1][2] for row in range(1, rows + 1)]
     widths = [cells[1, column][1] for column in range(1, columns + 1)]
-    if any(cells[row, column][1:] != (widths[column - 1], heights[row - 1]) for row, column in wanted):
+    if any(cells[row, column][1:] != (widths[column - 1], heights[row - 1]) for row, column in cells):
         raise Unreadable("parts of one row differ in height, or parts of one column in width")
     tall, wide = sum(heights), sum(widths)
     for row, column in sorted(cells):

@@ -52,6 +52,9 @@ class Xyz(Source):
     def _scan_file(self, root: str) -> Iterator[ImageRecord | Rejection]:
         zoom = self._choose(root, mbtiles.zooms(root))
         for tile in mbtiles.stored(root, zoom):
+            if isinstance(tile, Rejection):
+                yield tile
+                continue
             part = f"{zoom}-{tile.x}-{tile.y}"
             if not is_on_grid(zoom, tile.x, tile.y):
                 yield _outside(f"{root}#{part}", zoom, tile.x, tile.y)

@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from pipeline.records import InputError
+from pipeline.transforms import FORMATS
 from pipeline.worlds.flight import FlightPlan
 from pipeline.worlds.town import TEXELS_PER_RADIUS
 from pipeline.worlds.world import FloatMap, World
@@ -50,7 +51,7 @@ def _is_usable(path: Path) -> bool:
     if not path.name.lower().endswith(IMAGE_NAMES):
         return False
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=FORMATS) as image:
             least = min(image.size)
             # A truncated file shows only when it is decoded; a JPEG at an eighth of its size shows it as well.
             image.draft("RGB", (LEAST_PIXELS, LEAST_PIXELS))
@@ -66,7 +67,7 @@ def textured_world(path: str, *, metres_per_pixel: float, frame_pixels: int = 25
     `metres_per_pixel` is the picture's own. Raises InputError for a picture or height map that cannot be read.
     """
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=FORMATS) as image:
             picture = image.convert("RGB")
     except UNREADABLE as error:
         raise InputError(f"{path} cannot be decoded ({error}); expected an image; take it out of --textures") from None

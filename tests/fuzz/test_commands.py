@@ -1,0 +1,146 @@
+"""Command lines from anybody: each job ends with 0, 1 or 2 and one sentence, and writes nothing beside its output.
+
+The inputs are such that no job gets to its work: missing, empty, files for folders, folders for files, junk of the right name.
+"""
+
+import importlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fuzz.bounds import bounded, examples
+from jobs import cli
+
+NUMBERS = ["0", "-1", "1", "nan", "inf", "-inf", "1e309", "1e-320", str(10**12), str(2**63), str(10**30), "1.5", "", " ", "x", "1_0", "0x1", "None", "١", "--", "true"]  # fmt: skip
+TEXTS = ["", " ", "None", "a\nb", "[/]", "é", "%s", "{0}", "*", "x" * 5000, "--help", "-1", "IVF1000000000,Flat", "IVF0,PQ0", "10 bananas", "-4GB", "1e30GB", "EPSG:1"]  # fmt: skip
+PATHS = ["missing", "file", "empty", "junk", "file/below", "", ".", "~nobody/x", "a\nb", "\udcff", "x" * 300, "foo://x", "memory://x", "memory://", "http://127.0.0.1:9/x", "s3://x/y", "file:///", "::", "a::b://c", "link", "fifo"]  # fmt: skip
+INSIDE = ["empty", "junk", "file", "new", "new/deep", "file/below", "", "foo://x", "link", "x" * 300, "loop"]
+"Where output may go: never to a place that would survive the test, nor to the storage of another process."
+
+JOBS: dict[str, tuple[list[str], list[str], list[str], list[str]]] = {  # inputs, outputs, numbers, texts
+    "simulate": (["textures"], ["out"], ["train-locations", "test-locations", "distractors", "views", "size", "seed", "texture-metres-per-pixel"], []),
+    "make_shards": (["root"], ["out"], ["samples-per-shard", "megabytes-per-shard", "max-bad-fraction", "workers"], ["check"]),
+    "train": (["shards", "weights"], ["out"], ["workers", "keep", "checkpoint-minutes", "probe-epochs", "gpus-per-worker", "max-failures"], []),
+    "embed_gallery": (["shards", "checkpoint"], ["out"], ["batch-size", "workers", "cpus-per-worker", "gpus-per-worker", "patience"], ["split", "view", "dtype"]),
+    "build_index": (["table"], ["out"], ["target-recall", "parts", "workers"], ["memory-budget", "factory", "split"]),
+    "calibrate": (["checkpoint", "shards", "index"], ["out"], ["tolerance", "outside", "photos"], ["view"]),
+    "locate": (["checkpoint", "index", "times", "calibration", "shards"], ["out", "csv", "page"], ["top", "max-speed", "elsewhere", "interval"], []),
+    "serve": (["checkpoint", "index", "token-file"], [], ["port", "max-megabytes", "max-megapixels", "batch", "waiting", "timeout-s", "replicas", "threads"], ["host"]),
+    "evaluate": (["table", "shards", "run", "beside"], ["out"], ["panels", "workers"], ["protocol", "query-view", "title", "by"]),
+    "compare": ([], ["out"], [], []),
+    "import_features": (["mat"], ["out"], [], ["query-view"]),
+    "import_weights": (["torchvision", "lpn"], ["out"], ["image-size"], []),
+}  # fmt: skip
+SOURCES = {
+    "university1652": ["kml", "views"], "sues200": ["heights"], "denseuav": [], "gta-uav": ["division", "pairs"],
+    "visloc": ["tile-pixels", "overlap", "train-flights"], "photos": ["view", "split", "location", "geotags"],
+    "geotiff": ["tile-m", "tile-pixels", "overlap", "output-pixels", "max-nodata", "crs", "resampling"], "xyz": ["zoom", "view"], "table": ["view", "split"],
+    "nothing": [], "": [],
+}  # fmt: skip
+RECIPES = ["smoke", "paper", "lpn", "nothing", "", "--help", "-x"]
+OVERRIDES = ["batch-size", "seed", "image-size", "depth", "width", "parts", "part-dim", "epochs", "hold-out", "dropout", "threads", "shuffle-buffer", "learning-rate", "pad"]  # fmt: skip
+
+
+def job_of(name: str) -> tuple[Callable[..., Any], Callable[[list[str]], list[str]]]:
+    module = importlib.import_module(f"jobs.{name}")
+    reword = {"make_shards": "source_as_subcommand", "train": "known_recipe"}.get(name)
+    return module.main, getattr(module, reword) if reword else lambda arguments: arguments
+
+
+def call(
+    name: str, arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> tuple[int, str]:
+    """Exit code, and what was said on the error stream."""
+    job, reword = job_of(name)
+    monkeypatch.setattr("sys.argv", [name, *arguments])
+    capsys.readouterr()
+    code: Any = 0
+    with bounded(megabytes=600, seconds=20):
+        try:
+            cli.run(job, reword)
+        except SystemExit as ended:
+            code = ended.code or 0
+    return code, capsys.readouterr().err
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with one thing of each kind that an input may wrongly be."""
+    inner = tmp_path / "here"
+    (inner / "empty").mkdir(parents=True)
+    (inner / "junk").mkdir()
+    (inner / "file").write_bytes(b"junk" * 100)
+    for junk in ("manifest.json", "index.json", "part.parquet", "last.pt", "evaluation.json", "metrics.json", "queries.parquet", "calibration.json", "locations.csv", "a.jpg", "a.tif", "x.tar", "simulation.json"):  # fmt: skip
+        (inner / "junk" / junk).write_bytes(b"[]" if junk.endswith("json") else b"junk")
+    (inner / "link").symlink_to("junk")
+    (inner / "loop").symlink_to("loop")
+    monkeypatch.chdir(inner)
+    monkeypatch.setenv("RAY_ADDRESS", "nowhere:1")  # none gets as far as to look for it
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    return inner
+
+
+@st.composite
+def line(draw: st.DrawFn) -> tuple[str, list[str]]:
+    name = draw(st.sampled_from(list(JOBS)))
+    inputs, outputs, numbers, texts = JOBS[name]
+    told: list[str] = []
+    if name == "make_shards":
+        source = draw(st.sampled_from(list(SOURCES)))
+        told += ["--source", source] if draw(st.integers(0, 9)) else [f"--source={source}"]
+        for flag in SOURCES[source]:
+            if not draw(st.integers(0, 2)):
+                told += [f"--{flag}", draw(st.sampled_from(NUMBERS + TEXTS))]
+    if name == "train":
+        told += [draw(st.sampled_from(RECIPES))]
+        for flag in OVERRIDES:
+            if not draw(st.integers(0, 9)):
+                told += [f"--{flag}", draw(st.sampled_from(NUMBERS))]
+    for flag in inputs:
+        if draw(st.integers(0, 3)):
+            told += [f"--{flag}", draw(st.sampled_from(PATHS[:-1]))]
+    for flag in outputs:
+        if draw(st.integers(0, 9)):
+            told += [f"--{flag}", draw(st.sampled_from(INSIDE + ([] if flag != "out" else ["."])))]
+    for flag in numbers:
+        if not draw(st.integers(0, 5)):
+            told += [f"--{flag}", draw(st.sampled_from(NUMBERS))]
+    for flag in texts:
+        if not draw(st.integers(0, 4)):
+            told += [f"--{flag}", draw(st.sampled_from(TEXTS))]
+    if name == "simulate":
+        told += ["--size", "31"] if draw(st.booleans()) else ["--textures", "empty"]  # it makes towns of anything else
+        told += ["--train-locations", "1", "--test-locations", "1", "--distractors", "1"] if draw(st.booleans()) else []
+    if name in ("locate", "compare"):
+        told += draw(st.lists(st.sampled_from(PATHS[:-1]), max_size=2))
+        told += (
+            ["--near", *draw(st.lists(st.sampled_from(NUMBERS), min_size=3, max_size=3))]
+            if not draw(st.integers(0, 4))
+            else []
+        )
+    return name, told
+
+
+def test_a_command_of_any_words(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    above = {path for path in folder.parent.iterdir()}
+
+    @given(line())
+    @examples(120)
+    def check(command: tuple[str, list[str]]) -> None:
+        code, said = call(*command, capsys, monkeypatch)
+        assert code in (0, 1, 2), f"{command}: {code}"
+        assert "Traceback" not in said, said
+        if code:
+            assert said.strip(), command
+        assert {path for path in folder.parent.iterdir()} == above, command
+        assert (folder / "file").read_bytes() == b"junk" * 100
+        assert os.path.islink(folder / "link")
+
+    check()

@@ -1,0 +1,101 @@
+"""Files called anything: what is said of them reaches a terminal as text, and what is packed of them is packed or refused."""
+
+import io
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from fuzz.bounds import bounded, examples
+from fuzz.hostile import NAMES
+from jobs import cli
+from pipeline import progress as told
+from pipeline.packing import PackingSettings, pack
+from pipeline.photo_files import find_photos
+from pipeline.progress import UNSEEN, console, progress, results, visible
+from pipeline.records import InputError, Unfinished
+from pipeline.rejects import FILE
+from pipeline.shards import read_manifest
+from pipeline.sources.photos import Photos
+from pipeline.sources.university1652 import University1652
+
+text = st.text(max_size=30) | st.sampled_from(NAMES)
+
+
+@given(text)
+@examples(100)
+def test_a_terminal_is_given_text(name: str) -> None:
+    assert not UNSEEN.search(visible(name))
+    for each in (console, results):
+        with each.capture() as captured:
+            each.print(name, soft_wrap=True)
+        assert captured.get() == visible(name).expandtabs(8) + "\n" or "\t" in name or "\n" in name
+
+
+@given(text)
+@examples(30)
+def test_a_bar_shows_names_as_they_are(name: str) -> None:
+    stream = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(told, "console", told._Plain(file=stream, force_terminal=True, width=200))
+        with progress(2, name) as meter:
+            meter.advance(1, fact=name)
+            meter.note(name)
+    assert "\x07" not in stream.getvalue()
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name.isprintable()])
+def test_an_error_is_one_line(name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def job() -> None:
+        raise InputError(f"no file {name}\n; expected one")
+
+    monkeypatch.setattr("sys.argv", ["job"])
+    with pytest.raises(SystemExit) as ended:
+        cli.run(job)
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert visible(name) in said
+
+
+def raw(name: str) -> bytes:
+    return name.encode(
+        "utf-8",
+        "surrogateescape" if all(ord(c) >= 0xDC80 for c in name if 0xD800 <= ord(c) <= 0xDFFF) else "surrogatepass",
+    )
+
+
+FILES = [
+    raw(name)
+    for name in NAMES
+    if name not in ("", ".", "..") and "/" not in name and "\0" not in name and len(raw(name)) < 200
+]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photos in folders called each of these, called each of these."""
+    root = tmp_path_factory.mktemp("names") / "world"
+    for number, name in enumerate(FILES):
+        stream = io.BytesIO()
+        Image.new("RGB", (16, 16), (number, 0, 0)).save(stream, "JPEG")
+        folder = os.path.join(os.fsencode(root), b"test", b"query_drone", name)
+        os.makedirs(folder, exist_ok=True)
+        with open(os.path.join(folder, name + b".jpg"), "wb") as file:
+            file.write(stream.getvalue())
+    return root
+
+
+@pytest.mark.parametrize("source", [Photos(), University1652()])
+def test_files_of_any_name_are_packed_or_refused(source: Photos | University1652, world: Path, tmp_path: Path) -> None:
+    out = tmp_path / "shards"
+    with bounded(InputError, Unfinished):
+        pack(source, PackingSettings(root=str(world), out=str(out), workers=0, max_bad_fraction=1))
+        packed = sum(shard.samples for shard in read_manifest(str(out)).shards)
+        assert packed >= len(FILES) - 6
+    assert (out / FILE).exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["shards"]
+    assert len(find_photos([str(world)])) == len(FILES)

@@ -1,0 +1,201 @@
+"""Tars from anybody, and the JSON within: samples, or a sentence why not. Nothing is unpacked, and no size is believed."""
+
+import io
+import json
+import tarfile
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fuzz.bounds import bounded, examples
+from fuzz.hostile import damaged, names, twisted, values
+from pipeline.foreign import open_manifest
+from pipeline.records import InputError, Split, View
+from pipeline.samples import read_locations, read_shard
+from pipeline.shards import Shard
+from pipeline.tars import read_members
+from pipeline.verification import check_shard
+
+FACTS = {
+    "key": "query-drone-0001-0", "location": "0001", "view": "drone", "split": "query", "variant": "", "source": "photos",
+    "geotag": {"lat": 47.5, "lon": 8.5, "altitude_m": 100.0, "heading_deg": 1.0, "pitch_deg": -90.0, "footprint": [[1, 2], [3, 4]]},
+    "taken_at": None, "sha256": "0" * 64, "width": 16, "height": 16,
+}  # fmt: skip
+KINDS = [tarfile.REGTYPE, tarfile.AREGTYPE, tarfile.LNKTYPE, tarfile.SYMTYPE, tarfile.CHRTYPE, tarfile.BLKTYPE, tarfile.DIRTYPE, tarfile.FIFOTYPE, tarfile.CONTTYPE, tarfile.GNUTYPE_SPARSE, b"Z"]  # fmt: skip
+PAX = ["size", "path", "linkpath", "mtime", "uid", "GNU.sparse.map", "GNU.sparse.major", "GNU.sparse.minor", "GNU.sparse.size", "GNU.sparse.realsize", "GNU.sparse.name", "GNU.sparse.offset", "GNU.sparse.numbytes", "GNU.sparse.numblocks", "hdrcharset", "comment"]  # fmt: skip
+NUMBERS = [
+    "0",
+    "1",
+    "-1",
+    "1.5",
+    "nan",
+    "9" * 30,
+    "0,1000000000000",
+    "0,1,",
+    "a,b",
+    "1" * 50,
+    "",
+    "1000000000000",
+    "0,512",
+]
+
+
+def packed(members: list[tuple[tarfile.TarInfo, bytes]], form: int) -> bytes:
+    stream = io.BytesIO()
+    with tarfile.open(fileobj=stream, mode="w", format=form) as tar:
+        for info, data in members:
+            try:
+                tar.addfile(info, io.BytesIO(data) if info.isreg() else None)
+            except (ValueError, OverflowError, UnicodeError, OSError):
+                continue
+    return stream.getvalue()
+
+
+def member(
+    name: str, data: bytes, kind: bytes = tarfile.REGTYPE, pax: dict[str, str] | None = None
+) -> tuple[tarfile.TarInfo, bytes]:
+    info = tarfile.TarInfo(name)
+    info.size, info.type, info.linkname, info.pax_headers = len(data), kind, "/etc/passwd", pax or {}
+    return info, data
+
+
+@cache
+def plain(form: int = tarfile.PAX_FORMAT) -> bytes:
+    long = "folder/" * 40
+    told = json.dumps(FACTS).encode()
+    return packed(
+        [
+            member("0.jpg", b"x" * 600),
+            member("0.json", told),
+            member(f"{long}1.png", b"y"),
+            member(f"{long}1.cls", b"7"),
+        ],
+        form,
+    )
+
+
+def read(data: bytes) -> None:
+    with bounded(InputError):
+        for key, members in read_members(io.BytesIO(data), "it.tar", ("jpg", "json", "cls", "png")):
+            assert isinstance(key, str)
+            assert ".." not in key.split("/")
+            assert sum(map(len, members.values())) <= len(data)
+
+
+@given(st.data(), st.sampled_from([tarfile.USTAR_FORMAT, tarfile.GNU_FORMAT, tarfile.PAX_FORMAT]))
+@examples(150)
+def test_a_damaged_tar(data: st.DataObject, form: int) -> None:
+    read(data.draw(damaged(plain(form), head=2048)))
+
+
+@given(st.lists(st.tuples(names | st.just("0.jpg"), st.binary(max_size=600), st.sampled_from(KINDS), st.dictionaries(st.sampled_from(PAX), st.sampled_from(NUMBERS) | names, max_size=4)), max_size=5), st.data())  # fmt: skip
+@examples(150)
+def test_members_of_any_name_and_kind(
+    told: list[tuple[str, bytes, bytes, dict[str, str]]], data: st.DataObject
+) -> None:
+    form = data.draw(st.sampled_from([tarfile.USTAR_FORMAT, tarfile.GNU_FORMAT, tarfile.PAX_FORMAT]))
+    whole = packed([member(f"{name}.jpg" if data.draw(st.booleans()) else name, *rest) for name, *rest in told], form)
+    read(whole)
+    read(data.draw(damaged(whole)))
+
+
+def header(kind: bytes, size: int, name: bytes = b"0.jpg", sparse: bytes = b"") -> bytes:
+    """One header with a checksum that is right; sizes beyond 8 GiB, and below 0, as GNU's tar writes them."""
+    block = bytearray(tarfile.TarInfo(name.decode()).tobuf(tarfile.GNU_FORMAT))
+    block[156:157] = kind
+    block[124:136] = (
+        b"%011o\0" % size
+        if 0 <= size < 8**11
+        else (b"\x80" if size >= 0 else b"\xff") + size.to_bytes(11, "big", signed=True)
+    )
+    block[386 : 386 + len(sparse)] = sparse
+    block[148:156] = b" " * 8
+    block[148:156] = b"%06o\0 " % sum(block)
+    return bytes(block)
+
+
+@pytest.mark.parametrize("kind", [tarfile.REGTYPE, tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE, tarfile.DIRTYPE, tarfile.GNUTYPE_SPARSE, tarfile.SYMTYPE])  # fmt: skip
+@pytest.mark.parametrize("size", [2**40, 2**62, 2**80, -1, -512, -(2**40), 3 << 20])
+def test_a_header_that_says_another_size(kind: bytes, size: int) -> None:
+    read(header(kind, size) + bytes(4096))
+    read(header(tarfile.REGTYPE, 512) + b"x" * 512 + header(kind, size) + bytes(4096))
+
+
+def test_a_file_that_is_mostly_a_hole_is_refused() -> None:
+    """GNU's sparse file of old: a terabyte of nothing in a kilobyte."""
+    sparse = b"%011o\0%011o\0" % (0, 0) + bytes(72) + b"\0" + (b"\x80" + (2**40).to_bytes(11, "big"))
+    read(header(tarfile.GNUTYPE_SPARSE, 0, sparse=sparse) + bytes(1024))
+    for pax in ({"GNU.sparse.size": str(2**40), "GNU.sparse.map": "0,0"}, {"GNU.sparse.major": "0", "GNU.sparse.minor": "1", "GNU.sparse.realsize": str(2**40), "GNU.sparse.map": "0,1"}):  # fmt: skip
+        read(packed([member("0.jpg", b"x", pax=pax)], tarfile.PAX_FORMAT))
+    with pytest.raises(InputError, match="sparse"):
+        list(
+            read_members(io.BytesIO(header(tarfile.GNUTYPE_SPARSE, 0, sparse=sparse) + bytes(1024)), "it.tar", ("jpg",))
+        )
+
+
+@pytest.mark.parametrize("kind", [tarfile.GNUTYPE_LONGNAME, tarfile.XHDTYPE])
+def test_headers_before_headers_without_end(kind: bytes) -> None:
+    content = (
+        b"a/0.jpg\0".ljust(512, b"\0") if kind == tarfile.GNUTYPE_LONGNAME else b"16 path=a/0.jpg\n".ljust(512, b"\0")
+    )
+    size = 8 if kind == tarfile.GNUTYPE_LONGNAME else 16
+    read((header(kind, size) + content) * 20_000 + header(tarfile.REGTYPE, 0) + bytes(1024))
+
+
+def test_a_long_pax_header_is_read_in_time() -> None:
+    content = b"1" * 900_000
+    read(
+        header(tarfile.XHDTYPE, len(content))
+        + content.ljust(-(-len(content) // 512) * 512, b"\0")
+        + header(tarfile.REGTYPE, 0)
+        + bytes(1024)
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("shards")
+
+
+def usable(facts: dict[str, Any]) -> None:
+    """What embedding, training and calibrating take from a sample's facts can be written down."""
+    tag = facts["geotag"] or {}
+    pa.array([facts["key"]], pa.string()), pa.array([facts["location"]], pa.string())
+    assert View(facts["view"])
+    assert Split(facts["split"])
+    for lat, lon in [(tag["lat"], tag["lon"])] if tag else []:
+        pa.array([lat, lon], pa.float64())
+        assert abs(lat) <= 90
+        assert abs(lon) <= 180
+
+
+@given(
+    st.data(), st.one_of(twisted(FACTS), values, twisted({"location": "a", "lat": 1.0, "lon": 2, "geotag": {"lat": 1}}))
+)
+@examples(150)
+def test_the_json_of_a_sample(folder: Path, data: st.DataObject, said: Any) -> None:
+    told = json.dumps(said).encode()
+    told = data.draw(damaged(told)) if data.draw(st.booleans()) else told
+    label = data.draw(st.binary(max_size=9))
+    name = data.draw(st.sampled_from(["0", "a/0", "\udcff/0", "é"]))
+    (folder / "query-drone-000000.tar").write_bytes(packed([member(f"{name}.jpg", b"x"), member(f"{name}.json", told), member(f"{name}.cls", label)], tarfile.GNU_FORMAT))  # fmt: skip
+    for split, view in ((Split.QUERY, View.DRONE), (None, None)):
+        with bounded(InputError):
+            for sample in read_shard(str(folder), "query-drone-000000", split, view):
+                usable(sample.facts)
+                pa.array([sample.key], pa.string())
+    with bounded(InputError):
+        for location in read_locations(str(folder), "query-drone-000000"):
+            assert isinstance(location, str)
+    with bounded(InputError):
+        assert check_shard(
+            str(folder),
+            Shard(name="query-drone-000000", split=Split.QUERY, view=View.DRONE, samples=1, bytes=1, sha256=""),
+        )
+    with bounded(InputError):
+        open_manifest(str(folder), Split.QUERY, View.DRONE)
