@@ -95,7 +95,7 @@ def read_findings(folder: str) -> Findings:
             results = pq.read_table(stream)
         metrics = storage.read_json(storage.join(folder, "metrics.json"))
         strange = [row for row in metrics if not _is_measured(row)]
-        if strange or not isinstance(metrics, list) or not RESULTS <= set(results.column_names):
+        if strange or not isinstance(metrics, list) or not set(results.column_names) >= RESULTS:
             raise ValueError("rows or columns that jobs/evaluate.py does not write")
         besides = read_besides(folder)
     except (ValueError, TypeError, OSError, pa.ArrowException) as error:

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fuzz.bounds import bounded, examples
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fuzz.bounds import bounded, examples
 from jobs import cli
 
 NUMBERS = ["0", "-1", "1", "nan", "inf", "-inf", "1e309", "1e-320", str(10**12), str(2**63), str(10**30), "1.5", "", " ", "x", "1_0", "0x1", "None", "١", "--", "true"]  # fmt: skip
