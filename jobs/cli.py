@@ -1,15 +1,24 @@
 """How every job starts and ends: a command line derived from its settings, one sentence and exit code 2 on bad input."""
 
+import os
+import signal
 import sys
+import threading
+import time
 from collections.abc import Callable
+from types import FrameType
 from typing import Any
 
 import tyro
 from ray.exceptions import RayError, RayTaskError
 
+from jobs import STOPPED
 from model.checkpoint import CheckpointError
 from pipeline.progress import console
 from pipeline.records import InputError, Unfinished
+
+SECONDS_TO_END = 15.0
+"From Ctrl-C until a job is gone, whatever its libraries still wait for."
 
 
 def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lambda arguments: arguments) -> None:
@@ -23,6 +32,15 @@ def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lamb
         tyro.conf.CascadeSubcommandArgs,  # flags may stand before or after a recipe's name
         tyro.conf.EnumChoicesFromValues,  # `--view drone`
     )  # fmt: skip
+    received: list[int] = []  # Ray makes a plain KeyboardInterrupt of whatever a handler raises while it waits
+
+    def terminate(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        # It ends a job as Ctrl-C does: what is done stays, Ray's processes go with it.
+        signal.signal(signal.SIGTERM, terminate)
     try:
         tyro.cli(job, args=reword(sys.argv[1:]), config=config)
     except (InputError, CheckpointError) as error:
@@ -30,9 +48,8 @@ def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lamb
         sys.exit(2)
     except OSError as error:  # the system's word: no right to, no room for, a folder for a file
         where = f"{error.filename}: " if error.filename else ""
-        _say(
-            f"{where}{error.strerror or error}; check the path, its rights and the room on its disk, and run the same command again to go on"
-        )
+        asked = "check the path, its rights and the room on its disk, and run the same command again to go on"
+        _say(f"{where}{error.strerror or error}; {asked}")
         sys.exit(1)
     except Unfinished as error:
         _say(str(error))
@@ -43,8 +60,16 @@ def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lamb
         _say(f"lost Ray's cluster or a worker ({type(error).__name__}); run the same command again to go on")
         sys.exit(1)
     except KeyboardInterrupt:
-        console.print("stopped; run the same command again to go on")
-        sys.exit(130)
+        console.print(STOPPED)
+        code = 128 + (received or [signal.SIGINT])[0]  # as shells count
+        # Ray, interrupted while it starts workers, may wait for them for ever; its processes end with this one.
+        threading.Thread(target=_end, args=(code,), daemon=True).start()
+        sys.exit(code)
+
+
+def _end(code: int) -> None:
+    time.sleep(SECONDS_TO_END)
+    os._exit(code)
 
 
 def _say(sentence: str) -> None:

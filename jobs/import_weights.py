@@ -4,6 +4,8 @@ Takes a torchvision ResNet's state dict, or that of a three_view_net of the publ
 per ring are read off the file. jobs/embed_gallery.py takes what comes out.
 """
 
+import jobs  # noqa: F401, I001  # before torch: Ctrl-C is heeded from here on
+
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass

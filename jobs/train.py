@@ -4,6 +4,8 @@ Writes RUN/last.pt (weights, config, and all that going on needs), RUN/metrics.j
 RUN/tensorboard. Killed, it goes on from the last checkpoint when run again; where a Ray worker dies, by itself.
 """
 
+import jobs  # noqa: F401, I001  # before torch: Ctrl-C is heeded from here on
+
 import threading
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
@@ -156,7 +158,7 @@ def train_group(this: Run, scaling: ScalingConfig, cpus: int, meter: Meter) -> N
     told, refused = Queue(actor_options={"num_cpus": 0}), list[Exception]()
     listener = threading.Thread(target=listen, args=(told, meter, refused), daemon=True)
     listener.start()
-    trainer = TorchTrainer(
+    trainer = _Trainer(
         ray_worker,
         train_loop_config={"run": this, "told": told, "cpus": cpus},
         scaling_config=scaling,
@@ -181,6 +183,13 @@ def hang_up(told: Queue, listener: threading.Thread) -> None:
     with suppress(RayActorError):
         told.put(None)
     listener.join()
+
+
+class _Trainer(TorchTrainer):
+    """Ray Train's, without its handler of Ctrl-C: that one ends the process with code 1 from within a call, and stays."""
+
+    def _register_sigint_handler(self, controller: Any) -> None:
+        pass
 
 
 def ray_worker(config: dict[str, Any]) -> None:

@@ -2,8 +2,12 @@
 
 import logging
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from itertools import islice
+from types import FrameType
 from typing import Any, TypeVar
 
 import ray
@@ -29,13 +33,47 @@ def connect() -> None:
     # A token for a local cluster is what we want, and no news.
     logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
     try:
-        ray.init(log_to_driver=False, logging_level=logging.WARNING)
+        with _undisturbed():
+            ray.init(log_to_driver=False, logging_level=logging.WARNING)
     except Exception as error:  # Ray raises ConnectionError, RuntimeError, ValueError and plain Exception here
         asked = f"at {address}" if (address := os.environ.get("RAY_ADDRESS")) else "on this machine"
         raise Unfinished(
             f"found no Ray cluster {asked}, and none could be started ({str(error).strip().splitlines()[0]}); expected one "
             "that answers; see to it, or unset RAY_ADDRESS so that one is started here, and run the same command again"
         ) from error
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Keep Ctrl-C until Ray has started, as half of it cannot be stopped: it crashes. Said twice it is heeded at once.
+
+    And keep the handler of SIGTERM: Ray's own would end this process by an abort, with a stack of its C++ on the terminal, or
+    while it starts by a bare exit.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+
+    def keep(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+        if len(came) > 1:
+            raise KeyboardInterrupt
+
+    interrupt = signal.signal(signal.SIGINT, keep)
+    terminate = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    except SystemExit:
+        if not callable(terminate):
+            raise
+        terminate(signal.SIGTERM, None)
+    finally:
+        signal.signal(signal.SIGINT, interrupt)
+        if callable(terminate):
+            signal.signal(signal.SIGTERM, terminate)
+    if came and callable(interrupt):
+        interrupt(signal.SIGINT, None)
 
 
 def cpus() -> int:

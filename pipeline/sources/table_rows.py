@@ -148,7 +148,17 @@ def _is_plain(kind: Any) -> bool:
     of = pa.types
     if of.is_dictionary(kind):
         return _is_plain(kind.value_type)
-    tests = (of.is_string, of.is_large_string, of.is_integer, of.is_floating, of.is_boolean, of.is_decimal, of.is_null, of.is_date, of.is_timestamp)  # fmt: skip
+    tests = (
+        of.is_string,
+        of.is_large_string,
+        of.is_integer,
+        of.is_floating,
+        of.is_boolean,
+        of.is_decimal,
+        of.is_null,
+        of.is_date,
+        of.is_timestamp,
+    )
     return any(test(kind) for test in tests)
 
 

@@ -22,7 +22,7 @@ from processes import cluster, daemons, strike, working
 from stages import Content, Stage
 
 PATIENCE = 180.0
-"Seconds after which a run counts as hung."
+"Seconds, and ten times as long as an undisturbed run, after which a run counts as hung."
 TRIES = 6
 "Runs after the faults in which the stage has to come to its end."
 PASSED_OVER = ("tensorboard", "ray", "job.log", ".parts")
@@ -106,13 +106,17 @@ class Ground:
         return self._launcher.start(stage.job, stage.command(self.here, spread, guarded), RAY_ADDRESS=address)
 
     def run(self, stage: Stage, spread: bool, guarded: bool = False) -> Ended:
-        return self.start(stage, spread, guarded=guarded).end(PATIENCE)
+        return self.start(stage, spread, guarded=guarded).end(self.patience(stage))
+
+    def patience(self, stage: Stage) -> float:
+        known = self._known.get(stage.name)
+        return PATIENCE + (0 if known is None else 10 * max(known.seconds.values()))
 
     def check(self, stage: Stage) -> Ended:
         """The stage's own check of every byte that it wrote."""
         assert stage.verify
         words = stage.verify.format(here=self.here).split()
-        return self._launcher.start(stage.job, words, RAY_ADDRESS=self._address).end(PATIENCE)
+        return self._launcher.start(stage.job, words, RAY_ADDRESS=self._address).end(self.patience(stage))
 
     def victims(self, job: Job, kind: str) -> list[int]:
         """Who may be killed."""
@@ -217,7 +221,7 @@ def _kill(ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, ve
         while not (victims := ground.victims(job, case.kind)) and not job.wait(job.seconds + 0.02):
             pass
         verdict.faults += bool(victims) and strike(rng.choice(victims), KILLS[case.kind])
-    _judge_run(verdict, job.end(PATIENCE))
+    _judge_run(verdict, job.end(ground.patience(case.stage)))
 
 
 def _spoil_operation(ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, verdict: Verdict) -> None:
@@ -240,7 +244,7 @@ def _damage(ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, 
         if job is not None:
             job.wait(rng.uniform(0, usual.seconds[False]))
         spoilt = damage(folder, case.kind, rng, PASSED_OVER)
-        ended = job.end(PATIENCE) if job is not None else ground.run(stage, spread=False)
+        ended = job.end(ground.patience(case.stage)) if job is not None else ground.run(stage, spread=False)
         _judge_run(verdict, ended)
         verdict.found = "by default" if ended.code else ""
     else:
@@ -248,7 +252,7 @@ def _damage(ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, 
             job = ground.start(stage, spread=False)
             job.wait(rng.uniform(0.5, 1.0) * usual.seconds[False])
             strike(job.pid, signal.SIGKILL)
-            _judge_run(verdict, job.end(PATIENCE))
+            _judge_run(verdict, job.end(ground.patience(case.stage)))
         spoilt = damage(ground.here / stage.writes, case.kind, rng, PASSED_OVER)
     verdict.faults += spoilt is not None
     return [spoilt] if spoilt is not None else []

@@ -51,9 +51,9 @@ def bounded(*refusals: type[Exception], seconds: float = SECONDS, megabytes: flo
     try:
         yield
     except refusals as error:
-        assert str(error).strip(), f"{type(error).__name__} without a word"
+        assert str(error).strip(), f"{type(error).__name__} without a word"  # noqa: PT017  # any of several
         if isinstance(error, InputError):  # others become a Rejection, which cuts them
-            assert len(str(error)) <= LONGEST_SENTENCE, f"a sentence of {len(str(error))} characters"
+            assert len(str(error)) <= LONGEST_SENTENCE, f"a sentence of {len(str(error))} characters"  # noqa: PT017
     finally:
         resource.setrlimit(resource.RLIMIT_AS, held)
         signal.setitimer(signal.ITIMER_REAL, 0)

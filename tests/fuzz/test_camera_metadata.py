@@ -28,7 +28,8 @@ KML = """{head}<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark>
 </coordinates></{kind}><LookAt><latitude>{1}</latitude><longitude>{0}</longitude></LookAt></Placemark></Document></kml>"""
 HEADS = [
     "", "\ufeff", '<?xml version="1.0"?>', *(f'<?xml version="1.0" encoding="{name}"?>' for name in (
-        "utf-8", "latin-1", "utf-16", "utf-7", "gb2312", "shift_jis", "big5", "cp037", "idna", "rot13", "hex", "zip", "x", "undefined",
+        "utf-8", "latin-1", "utf-16", "utf-7", "gb2312", "shift_jis", "big5", "cp037", "idna", "rot13", "hex", "zip",
+        "x", "undefined",
     )), LAUGHS, OUTSIDE,
 ]  # fmt: skip
 ENCODINGS = ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-32", "latin-1", "cp037"]

@@ -16,22 +16,91 @@ from hypothesis import strategies as st
 from fuzz.bounds import bounded, examples
 from jobs import cli
 
-NUMBERS = ["0", "-1", "1", "nan", "inf", "-inf", "1e309", "1e-320", str(10**12), str(2**63), str(10**30), "1.5", "", " ", "x", "1_0", "0x1", "None", "١", "--", "true"]  # fmt: skip
-TEXTS = ["", " ", "None", "a\nb", "[/]", "é", "%s", "{0}", "*", "x" * 5000, "--help", "-1", "IVF1000000000,Flat", "IVF0,PQ0", "10 bananas", "-4GB", "1e30GB", "EPSG:1"]  # fmt: skip
-PATHS = ["missing", "file", "empty", "junk", "file/below", "", ".", "~nobody/x", "a\nb", "\udcff", "x" * 300, "foo://x", "memory://x", "memory://", "http://127.0.0.1:9/x", "s3://x/y", "file:///", "::", "a::b://c", "link", "fifo"]  # fmt: skip
+NUMBERS = [
+    "0",
+    "-1",
+    "1",
+    "nan",
+    "inf",
+    "-inf",
+    "1e309",
+    "1e-320",
+    str(10**12),
+    str(2**63),
+    str(10**30),
+    "1.5",
+    "",
+    " ",
+    "x",
+    "1_0",
+    "0x1",
+    "None",
+    "١",
+    "--",
+    "true",
+]
+TEXTS = [
+    "",
+    " ",
+    "None",
+    "a\nb",
+    "[/]",
+    "é",
+    "%s",
+    "{0}",
+    "*",
+    "x" * 5000,
+    "--help",
+    "-1",
+    "IVF1000000000,Flat",
+    "IVF0,PQ0",
+    "10 bananas",
+    "-4GB",
+    "1e30GB",
+    "EPSG:1",
+]
+PATHS = [
+    "missing",
+    "file",
+    "empty",
+    "junk",
+    "file/below",
+    "",
+    ".",
+    "~nobody/x",
+    "a\nb",
+    "\udcff",
+    "x" * 300,
+    "foo://x",
+    "memory://x",
+    "memory://",
+    "http://127.0.0.1:9/x",
+    "s3://x/y",
+    "file:///",
+    "::",
+    "a::b://c",
+    "link",
+    "fifo",
+]
 INSIDE = ["empty", "junk", "file", "new", "new/deep", "file/below", "", "foo://x", "link", "x" * 300, "loop"]
 "Where output may go: never to a place that would survive the test, nor to the storage of another process."
 
 JOBS: dict[str, tuple[list[str], list[str], list[str], list[str]]] = {  # inputs, outputs, numbers, texts
-    "simulate": (["textures"], ["out"], ["train-locations", "test-locations", "distractors", "views", "size", "seed", "texture-metres-per-pixel"], []),
+    "simulate": (["textures"], ["out"], ["train-locations", "test-locations", "distractors", "views", "size", "seed",
+    "texture-metres-per-pixel"], []),
     "make_shards": (["root"], ["out"], ["samples-per-shard", "megabytes-per-shard", "max-bad-fraction", "workers"], ["check"]),
-    "train": (["shards", "weights"], ["out"], ["workers", "keep", "checkpoint-minutes", "probe-epochs", "gpus-per-worker", "max-failures"], []),
-    "embed_gallery": (["shards", "checkpoint"], ["out"], ["batch-size", "workers", "cpus-per-worker", "gpus-per-worker", "patience"], ["split", "view", "dtype"]),
+    "train": (["shards", "weights"], ["out"], ["workers", "keep", "checkpoint-minutes", "probe-epochs",
+    "gpus-per-worker", "max-failures"], []),
+    "embed_gallery": (["shards", "checkpoint"], ["out"], ["batch-size", "workers", "cpus-per-worker",
+    "gpus-per-worker", "patience"], ["split", "view", "dtype"]),
     "build_index": (["table"], ["out"], ["target-recall", "parts", "workers"], ["memory-budget", "factory", "split"]),
     "calibrate": (["checkpoint", "shards", "index"], ["out"], ["tolerance", "outside", "photos"], ["view"]),
-    "locate": (["checkpoint", "index", "times", "calibration", "shards"], ["out", "csv", "page"], ["top", "max-speed", "elsewhere", "interval"], []),
-    "serve": (["checkpoint", "index", "token-file"], [], ["port", "max-megabytes", "max-megapixels", "batch", "waiting", "timeout-s", "replicas", "threads"], ["host"]),
-    "evaluate": (["table", "shards", "run", "beside"], ["out"], ["panels", "workers"], ["protocol", "query-view", "title", "by"]),
+    "locate": (["checkpoint", "index", "times", "calibration", "shards"], ["out", "csv", "page"], ["top",
+    "max-speed", "elsewhere", "interval"], []),
+    "serve": (["checkpoint", "index", "token-file"], [], ["port", "max-megabytes", "max-megapixels", "batch",
+    "waiting", "timeout-s", "replicas", "threads"], ["host"]),
+    "evaluate": (["table", "shards", "run", "beside"], ["out"], ["panels", "workers"], ["protocol", "query-view",
+    "title", "by"]),
     "compare": ([], ["out"], [], []),
     "import_features": (["mat"], ["out"], [], ["query-view"]),
     "import_weights": (["torchvision", "lpn"], ["out"], ["image-size"], []),
@@ -39,11 +108,27 @@ JOBS: dict[str, tuple[list[str], list[str], list[str], list[str]]] = {  # inputs
 SOURCES = {
     "university1652": ["kml", "views"], "sues200": ["heights"], "denseuav": [], "gta-uav": ["division", "pairs"],
     "visloc": ["tile-pixels", "overlap", "train-flights"], "photos": ["view", "split", "location", "geotags"],
-    "geotiff": ["tile-m", "tile-pixels", "overlap", "output-pixels", "max-nodata", "crs", "resampling"], "xyz": ["zoom", "view"], "table": ["view", "split"],
+    "geotiff": ["tile-m", "tile-pixels", "overlap", "output-pixels", "max-nodata", "crs", "resampling"],
+    "xyz": ["zoom", "view"], "table": ["view", "split"],
     "nothing": [], "": [],
 }  # fmt: skip
 RECIPES = ["smoke", "paper", "lpn", "nothing", "", "--help", "-x"]
-OVERRIDES = ["batch-size", "seed", "image-size", "depth", "width", "parts", "part-dim", "epochs", "hold-out", "dropout", "threads", "shuffle-buffer", "learning-rate", "pad"]  # fmt: skip
+OVERRIDES = [
+    "batch-size",
+    "seed",
+    "image-size",
+    "depth",
+    "width",
+    "parts",
+    "part-dim",
+    "epochs",
+    "hold-out",
+    "dropout",
+    "threads",
+    "shuffle-buffer",
+    "learning-rate",
+    "pad",
+]
 
 
 def job_of(name: str) -> tuple[Callable[..., Any], Callable[[list[str]], list[str]]]:
@@ -75,7 +160,21 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (inner / "empty").mkdir(parents=True)
     (inner / "junk").mkdir()
     (inner / "file").write_bytes(b"junk" * 100)
-    for junk in ("manifest.json", "index.json", "part.parquet", "last.pt", "evaluation.json", "metrics.json", "queries.parquet", "calibration.json", "locations.csv", "a.jpg", "a.tif", "x.tar", "simulation.json"):  # fmt: skip
+    for junk in (
+        "manifest.json",
+        "index.json",
+        "part.parquet",
+        "last.pt",
+        "evaluation.json",
+        "metrics.json",
+        "queries.parquet",
+        "calibration.json",
+        "locations.csv",
+        "a.jpg",
+        "a.tif",
+        "x.tar",
+        "simulation.json",
+    ):
         (inner / "junk" / junk).write_bytes(b"[]" if junk.endswith("json") else b"junk")
     (inner / "link").symlink_to("junk")
     (inner / "loop").symlink_to("loop")
@@ -129,7 +228,7 @@ def line(draw: st.DrawFn) -> tuple[str, list[str]]:
 def test_a_command_of_any_words(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    above = {path for path in folder.parent.iterdir()}
+    above = set(folder.parent.iterdir())
 
     @given(line())
     @examples(120)
@@ -139,7 +238,7 @@ def test_a_command_of_any_words(
         assert "Traceback" not in said, said
         if code:
             assert said.strip(), command
-        assert {path for path in folder.parent.iterdir()} == above, command
+        assert set(folder.parent.iterdir()) == above, command
         assert (folder / "file").read_bytes() == b"junk" * 100
         assert os.path.islink(folder / "link")
 

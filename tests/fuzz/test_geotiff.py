@@ -24,10 +24,12 @@ from pipeline.transforms import DecodeError
 KINDS: dict[str, dict[str, Any]] = {
     "grey": {"count": 1, "dtype": "uint8"}, "rgb": {"count": 3, "dtype": "uint8"}, "rgba": {"count": 4, "dtype": "uint8"},
     "float with nodata": {"count": 1, "dtype": "float32", "nodata": -1}, "16 bits": {"count": 1, "dtype": "uint16"},
-    "complex": {"count": 1, "dtype": "complex64"}, "double": {"count": 3, "dtype": "float64"}, "int8": {"count": 1, "dtype": "int8"},
+    "complex": {"count": 1, "dtype": "complex64"}, "double": {"count": 3, "dtype": "float64"}, "int8": {"count": 1,
+    "dtype": "int8"},
     "complex of whole numbers": {"count": 1, "dtype": "complex_int16"},
     "tiled": {"count": 3, "dtype": "uint8", "tiled": True, "blockxsize": 16, "blockysize": 16, "compress": "deflate"},
-    "jpeg": {"count": 3, "dtype": "uint8", "compress": "jpeg", "photometric": "ycbcr"}, "lzw": {"count": 1, "dtype": "uint8", "compress": "lzw"},
+    "jpeg": {"count": 3, "dtype": "uint8", "compress": "jpeg", "photometric": "ycbcr"}, "lzw": {"count": 1,
+    "dtype": "uint8", "compress": "lzw"},
     "palette": {"count": 1, "dtype": "uint8", "photometric": "palette"},
 }  # fmt: skip
 WGS84 = Affine(1e-5, 0, 8.5, 0, -1e-5, 47.5)
@@ -75,7 +77,12 @@ def tiles(path: Path, source: GeoTiff, most: int = 3) -> list[ImageRecord | Reje
     return found
 
 
-SOURCES = [{"tile_pixels": 16}, {"tile_m": 20.0, "output_pixels": 16}, {"tile_pixels": 20, "overlap": 0.5, "max_nodata": 0.0}, {"tile_pixels": 48, "crs": "EPSG:3857"}]  # fmt: skip
+SOURCES = [
+    {"tile_pixels": 16},
+    {"tile_m": 20.0, "output_pixels": 16},
+    {"tile_pixels": 20, "overlap": 0.5, "max_nodata": 0.0},
+    {"tile_pixels": 48, "crs": "EPSG:3857"},
+]
 
 
 @given(st.data(), st.sampled_from(list(KINDS)), st.sampled_from(SOURCES))
@@ -91,13 +98,59 @@ def test_a_damaged_mosaic(folder: Path, data: st.DataObject, kind: str, source: 
 word = st.sampled_from([0, 1, 2, 3, 4, 8, 16, 255, 256, 65535, 65536, 100_000, 2**31 - 1, 2**31, 2**32 - 1])
 
 
-@given(st.dictionaries(st.sampled_from([256, 257, 258, 259, 262, 273, 277, 278, 279, 284, 317, 320, 322, 323, 324, 325, 330, 338, 339, 33550, 33922, 34264, 34735, 42112, 42113]), st.tuples(st.integers(1, 12), word, word), max_size=12), st.data())  # fmt: skip
+@given(
+    st.dictionaries(
+        st.sampled_from(
+            [
+                256,
+                257,
+                258,
+                259,
+                262,
+                273,
+                277,
+                278,
+                279,
+                284,
+                317,
+                320,
+                322,
+                323,
+                324,
+                325,
+                330,
+                338,
+                339,
+                33550,
+                33922,
+                34264,
+                34735,
+                42112,
+                42113,
+            ]
+        ),
+        st.tuples(st.integers(1, 12), word, word),
+        max_size=12,
+    ),
+    st.data(),
+)
 @examples(120)
 def test_a_header_written_entry_by_entry(
     folder: Path, entries: dict[int, tuple[int, int, int]], data: st.DataObject
 ) -> None:
-    """Tags of a mosaic with any type, count and value: gigantic sides, strips beyond the file, directories that lead in circles."""
-    base = {256: (4, 1, 64), 257: (4, 1, 64), 258: (3, 1, 8), 259: (3, 1, 1), 262: (3, 1, 1), 273: (4, 1, 8), 277: (3, 1, 1), 278: (4, 1, 64), 279: (4, 1, 4096)}  # fmt: skip
+    """Tags of a mosaic with any type, count and value: gigantic sides, strips beyond the file,
+    directories that lead in circles."""
+    base = {
+        256: (4, 1, 64),
+        257: (4, 1, 64),
+        258: (3, 1, 8),
+        259: (3, 1, 1),
+        262: (3, 1, 1),
+        273: (4, 1, 8),
+        277: (3, 1, 1),
+        278: (4, 1, 64),
+        279: (4, 1, 4096),
+    }
     told = base | entries
     scale = {33550: (12, 3, 1000), 33922: (12, 6, 1024)}
     told = scale | told if data.draw(st.booleans()) else told
@@ -114,7 +167,13 @@ def test_a_header_written_entry_by_entry(
 NUMBERS = [0.0, 1e-300, -1e-300, 1e-9, 1.0, -1.0, 1e9, 1e300, float("inf"), float("nan")]
 
 
-@given(st.lists(st.sampled_from(NUMBERS), min_size=6, max_size=6), st.sampled_from(["EPSG:4326", "EPSG:32632", "EPSG:3857", "EPSG:4978", "EPSG:5703", None, "LOCAL_CS[\"x\"]", "EPSG:2180"]), st.sampled_from(SOURCES))  # fmt: skip
+@given(
+    st.lists(st.sampled_from(NUMBERS), min_size=6, max_size=6),
+    st.sampled_from(
+        ["EPSG:4326", "EPSG:32632", "EPSG:3857", "EPSG:4978", "EPSG:5703", None, 'LOCAL_CS["x"]', "EPSG:2180"]
+    ),
+    st.sampled_from(SOURCES),
+)
 @examples(80)
 def test_a_mosaic_that_lies_anywhere(folder: Path, six: list[float], crs: str | None, source: dict[str, Any]) -> None:
     path = folder / "anywhere.tif"
@@ -130,7 +189,22 @@ def test_a_mosaic_that_lies_anywhere(folder: Path, six: list[float], crs: str | 
 def sparse(path: Path, side: int) -> None:
     mosaic(path, count=1, dtype="uint8", side=64, tiled=True, blockxsize=16, blockysize=16)
     path.unlink()
-    with rasterio.open(path, "w", driver="GTiff", width=side, height=side, count=3, dtype="uint8", transform=WGS84, crs="EPSG:4326", sparse_ok=True, tiled=True, blockxsize=4096, blockysize=4096, bigtiff="yes"):  # fmt: skip
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        width=side,
+        height=side,
+        count=3,
+        dtype="uint8",
+        transform=WGS84,
+        crs="EPSG:4326",
+        sparse_ok=True,
+        tiled=True,
+        blockxsize=4096,
+        blockysize=4096,
+        bigtiff="yes",
+    ):
         pass
 
 
@@ -149,7 +223,24 @@ def test_an_empty_mosaic_of_a_continent_is_refused_at_once(
     assert refused.reason == reason
 
 
-@pytest.mark.parametrize("flags", [{"tile_m": float("inf")}, {"tile_m": 1e-300}, {"tile_m": 1e300}, {"overlap": float("nan")}, {"stretch": (float("nan"), 1.0)}, {"stretch": (0.0, float("inf"))}, {"output_pixels": 10**9}, {"tile_pixels": 10**30}, {"max_nodata": float("nan")}, {"crs": "\0"}, {"crs": "x" * 2000}, {"crs": "/etc/passwd"}, {"crs": "http://127.0.0.1:1/x"}])  # fmt: skip
+@pytest.mark.parametrize(
+    "flags",
+    [
+        {"tile_m": float("inf")},
+        {"tile_m": 1e-300},
+        {"tile_m": 1e300},
+        {"overlap": float("nan")},
+        {"stretch": (float("nan"), 1.0)},
+        {"stretch": (0.0, float("inf"))},
+        {"output_pixels": 10**9},
+        {"tile_pixels": 10**30},
+        {"max_nodata": float("nan")},
+        {"crs": "\0"},
+        {"crs": "x" * 2000},
+        {"crs": "/etc/passwd"},
+        {"crs": "http://127.0.0.1:1/x"},
+    ],
+)
 def test_a_setting_that_makes_no_sense(folder: Path, flags: dict[str, Any]) -> None:
     (folder / "made.tif").write_bytes(valid("rgb", folder))
     with bounded(InputError):

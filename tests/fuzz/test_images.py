@@ -96,12 +96,14 @@ def bombs() -> dict[str, bytes]:
     bmp = bytearray(picture("BMP", "RGB"))
     bmp[18:26] = struct.pack("<ii", 2**31 - 1, -(2**31))
     return {
-        "png of pixels": png(30_000, 30_000, data=zeros), "png just below the limit": png(13_000, 13_000, colour=0, data=zeros[:100]),
+        "png of pixels": png(30_000, 30_000, data=zeros), "png just below the limit": png(13_000, 13_000, colour=0,
+        data=zeros[:100]),
         "png of text": png(16, 16, more=chunk, data=zlib.compress(bytes(16 * 49))),
         "png of xmp": png(16, 16, more=itxt, data=zlib.compress(bytes(16 * 49))),
         "png that is cut": png(16, 16)[:40], "jpeg": bytes(jpeg), "gif": bytes(gif), "bmp": bytes(bmp),
         "ppm": b"P6 99999 99999 255\n", "ppm of digits": b"P3 " + b"9" * 100_000 + b" 1 255\n",
-        "jpeg behind a png": picture("PNG", "RGB") + picture("JPEG", "RGB"), "zip behind a jpeg": picture("JPEG", "RGB") + b"PK\3\4" + bytes(99),
+        "jpeg behind a png": picture("PNG", "RGB") + picture("JPEG", "RGB"), "zip behind a jpeg": picture("JPEG",
+        "RGB") + b"PK\3\4" + bytes(99),
         "script behind a gif": b"GIF89a=1;alert(1)//" + bytes(30), "svg": b"<svg xmlns='http://www.w3.org/2000/svg'><image href='file:///etc/passwd'/></svg>",
     }  # fmt: skip
 

@@ -37,8 +37,10 @@ RING = [[[8.0, 47.0], [8.1, 47.0], [8.1, 47.1], [8.0, 47.1], [8.0, 47.0]]]
 GEOJSON = {
     "type": "FeatureCollection", "crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}},
     "features": [
-        {"type": "Feature", "geometry": {"type": "Point", "coordinates": [8.5, 47.5]}, "properties": dict(zip(COLUMNS, ROW, strict=True))},
-        {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": RING}, "properties": {"path": "b.jpg", "heading_deg": 10}},
+        {"type": "Feature", "geometry": {"type": "Point", "coordinates": [8.5, 47.5]},
+        "properties": dict(zip(COLUMNS, ROW, strict=True))},
+        {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": RING}, "properties": {"path": "b.jpg",
+        "heading_deg": 10}},
     ],
 }  # fmt: skip
 
@@ -53,8 +55,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def scanned(table: Path) -> list[ImageRecord | Rejection]:
     found: list[ImageRecord | Rejection] = []
     with bounded(InputError):
-        for item in Table().scan(str(table)):
-            found.append(item)
+        found.extend(Table().scan(str(table)))
     for item in found:
         if isinstance(item, ImageRecord) and item.geotag is not None:
             assert abs(item.geotag.lat) <= 90
@@ -98,7 +99,8 @@ def test_a_geojson_deeper_than_any_reader(folder: Path) -> None:
 
 ARROW = [
     pa.string(), pa.large_string(), pa.binary(), pa.int8(), pa.uint64(), pa.float16(), pa.float64(), pa.bool_(), pa.null(),
-    pa.timestamp("ns"), pa.timestamp("s"), pa.timestamp("us", "Europe/Zurich"), pa.timestamp("us", "No/Where"), pa.date32(), pa.date64(),
+    pa.timestamp("ns"), pa.timestamp("s"), pa.timestamp("us", "Europe/Zurich"), pa.timestamp("us", "No/Where"),
+    pa.date32(), pa.date64(),
     pa.time64("ns"), pa.duration("ns"), pa.decimal128(38, 10), pa.list_(pa.string()), pa.struct([("path", pa.string())]),
     pa.dictionary(pa.int32(), pa.string()), pa.map_(pa.string(), pa.string()), pa.binary_view(), pa.month_day_nano_interval(),
 ]  # fmt: skip
@@ -110,7 +112,8 @@ ARROW = [
 )
 @examples(60)
 def test_a_parquet_of_any_types(folder: Path, columns: dict[str, tuple[Any, bytes]], data: st.DataObject) -> None:
-    """Columns of types that nobody would choose, with whatever these bytes mean as one: dates of the year 30,000, text in no encoding."""
+    """Columns of types that nobody would choose, with whatever these bytes mean as one: dates of the year 30,000,
+    text in no encoding."""
     arrays: dict[str, Any] = {"path": pa.array(["a.jpg", "b.jpg"])}
     for name, (kind, raw) in columns.items():
         buffer = pa.py_buffer(raw)
@@ -246,7 +249,8 @@ def read_tiles(path: Path, seconds: float = 10) -> None:
 
 
 @pytest.mark.parametrize("view", [
-    "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT 3 AS zoom_level, x AS tile_column, 1 AS tile_row, x'89' AS tile_data FROM n",
+    "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT 3 AS zoom_level, x AS "
+    "tile_column, 1 AS tile_row, x'89' AS tile_data FROM n",
     "SELECT 3 AS zoom_level, 1 AS tile_column, 1 AS tile_row, zeroblob(900000000) AS tile_data",
     "SELECT 3 AS zoom_level, a.x AS tile_column, 1 AS tile_row, x'89' AS tile_data FROM t a, t b, t c, t d, t e, t f",
 ])  # fmt: skip

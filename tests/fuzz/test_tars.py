@@ -23,11 +23,41 @@ from pipeline.verification import check_shard
 
 FACTS = {
     "key": "query-drone-0001-0", "location": "0001", "view": "drone", "split": "query", "variant": "", "source": "photos",
-    "geotag": {"lat": 47.5, "lon": 8.5, "altitude_m": 100.0, "heading_deg": 1.0, "pitch_deg": -90.0, "footprint": [[1, 2], [3, 4]]},
+    "geotag": {"lat": 47.5, "lon": 8.5, "altitude_m": 100.0, "heading_deg": 1.0, "pitch_deg": -90.0,
+    "footprint": [[1, 2], [3, 4]]},
     "taken_at": None, "sha256": "0" * 64, "width": 16, "height": 16,
 }  # fmt: skip
-KINDS = [tarfile.REGTYPE, tarfile.AREGTYPE, tarfile.LNKTYPE, tarfile.SYMTYPE, tarfile.CHRTYPE, tarfile.BLKTYPE, tarfile.DIRTYPE, tarfile.FIFOTYPE, tarfile.CONTTYPE, tarfile.GNUTYPE_SPARSE, b"Z"]  # fmt: skip
-PAX = ["size", "path", "linkpath", "mtime", "uid", "GNU.sparse.map", "GNU.sparse.major", "GNU.sparse.minor", "GNU.sparse.size", "GNU.sparse.realsize", "GNU.sparse.name", "GNU.sparse.offset", "GNU.sparse.numbytes", "GNU.sparse.numblocks", "hdrcharset", "comment"]  # fmt: skip
+KINDS = [
+    tarfile.REGTYPE,
+    tarfile.AREGTYPE,
+    tarfile.LNKTYPE,
+    tarfile.SYMTYPE,
+    tarfile.CHRTYPE,
+    tarfile.BLKTYPE,
+    tarfile.DIRTYPE,
+    tarfile.FIFOTYPE,
+    tarfile.CONTTYPE,
+    tarfile.GNUTYPE_SPARSE,
+    b"Z",
+]
+PAX = [
+    "size",
+    "path",
+    "linkpath",
+    "mtime",
+    "uid",
+    "GNU.sparse.map",
+    "GNU.sparse.major",
+    "GNU.sparse.minor",
+    "GNU.sparse.size",
+    "GNU.sparse.realsize",
+    "GNU.sparse.name",
+    "GNU.sparse.offset",
+    "GNU.sparse.numbytes",
+    "GNU.sparse.numblocks",
+    "hdrcharset",
+    "comment",
+]
 NUMBERS = [
     "0",
     "1",
@@ -93,13 +123,30 @@ def test_a_damaged_tar(data: st.DataObject, form: int) -> None:
     read(data.draw(damaged(plain(form), head=2048)))
 
 
-@given(st.lists(st.tuples(names | st.just("0.jpg"), st.binary(max_size=600), st.sampled_from(KINDS), st.dictionaries(st.sampled_from(PAX), st.sampled_from(NUMBERS) | names, max_size=4)), max_size=5), st.data())  # fmt: skip
+@given(
+    st.lists(
+        st.tuples(
+            names | st.just("0.jpg"),
+            st.binary(max_size=600),
+            st.sampled_from(KINDS),
+            st.dictionaries(st.sampled_from(PAX), st.sampled_from(NUMBERS) | names, max_size=4),
+        ),
+        max_size=5,
+    ),
+    st.data(),
+)
 @examples(150)
 def test_members_of_any_name_and_kind(
     told: list[tuple[str, bytes, bytes, dict[str, str]]], data: st.DataObject
 ) -> None:
     form = data.draw(st.sampled_from([tarfile.USTAR_FORMAT, tarfile.GNU_FORMAT, tarfile.PAX_FORMAT]))
-    whole = packed([member(f"{name}.jpg" if data.draw(st.booleans()) else name, *rest) for name, *rest in told], form)
+    whole = packed(
+        [
+            member(f"{name}.jpg" if data.draw(st.booleans()) else name, body, kind, pax)
+            for name, body, kind, pax in told
+        ],
+        form,
+    )
     read(whole)
     read(data.draw(damaged(whole)))
 
@@ -119,7 +166,20 @@ def header(kind: bytes, size: int, name: bytes = b"0.jpg", sparse: bytes = b"") 
     return bytes(block)
 
 
-@pytest.mark.parametrize("kind", [tarfile.REGTYPE, tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE, tarfile.DIRTYPE, tarfile.GNUTYPE_SPARSE, tarfile.SYMTYPE])  # fmt: skip
+@pytest.mark.parametrize(
+    "kind",
+    [
+        tarfile.REGTYPE,
+        tarfile.GNUTYPE_LONGNAME,
+        tarfile.GNUTYPE_LONGLINK,
+        tarfile.XHDTYPE,
+        tarfile.XGLTYPE,
+        tarfile.SOLARIS_XHDTYPE,
+        tarfile.DIRTYPE,
+        tarfile.GNUTYPE_SPARSE,
+        tarfile.SYMTYPE,
+    ],
+)
 @pytest.mark.parametrize("size", [2**40, 2**62, 2**80, -1, -512, -(2**40), 3 << 20])
 def test_a_header_that_says_another_size(kind: bytes, size: int) -> None:
     read(header(kind, size) + bytes(4096))
@@ -130,7 +190,10 @@ def test_a_file_that_is_mostly_a_hole_is_refused() -> None:
     """GNU's sparse file of old: a terabyte of nothing in a kilobyte."""
     sparse = b"%011o\0%011o\0" % (0, 0) + bytes(72) + b"\0" + (b"\x80" + (2**40).to_bytes(11, "big"))
     read(header(tarfile.GNUTYPE_SPARSE, 0, sparse=sparse) + bytes(1024))
-    for pax in ({"GNU.sparse.size": str(2**40), "GNU.sparse.map": "0,0"}, {"GNU.sparse.major": "0", "GNU.sparse.minor": "1", "GNU.sparse.realsize": str(2**40), "GNU.sparse.map": "0,1"}):  # fmt: skip
+    for pax in (
+        {"GNU.sparse.size": str(2**40), "GNU.sparse.map": "0,0"},
+        {"GNU.sparse.major": "0", "GNU.sparse.minor": "1", "GNU.sparse.realsize": str(2**40), "GNU.sparse.map": "0,1"},
+    ):
         read(packed([member("0.jpg", b"x", pax=pax)], tarfile.PAX_FORMAT))
     with pytest.raises(InputError, match="sparse"):
         list(
@@ -183,7 +246,12 @@ def test_the_json_of_a_sample(folder: Path, data: st.DataObject, said: Any) -> N
     told = data.draw(damaged(told)) if data.draw(st.booleans()) else told
     label = data.draw(st.binary(max_size=9))
     name = data.draw(st.sampled_from(["0", "a/0", "\udcff/0", "é"]))
-    (folder / "query-drone-000000.tar").write_bytes(packed([member(f"{name}.jpg", b"x"), member(f"{name}.json", told), member(f"{name}.cls", label)], tarfile.GNU_FORMAT))  # fmt: skip
+    (folder / "query-drone-000000.tar").write_bytes(
+        packed(
+            [member(f"{name}.jpg", b"x"), member(f"{name}.json", told), member(f"{name}.cls", label)],
+            tarfile.GNU_FORMAT,
+        )
+    )
     for split, view in ((Split.QUERY, View.DRONE), (None, None)):
         with bounded(InputError):
             for sample in read_shard(str(folder), "query-drone-000000", split, view):
