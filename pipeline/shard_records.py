@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from pipeline import storage
 from pipeline.records import ImageRecord, InputError, Rejection, Split, View
 from pipeline.shards import Manifest, Shard
+from pipeline.told import as_told
 
 FOLDER = "records"
 SCHEMA = pa.schema(
@@ -57,13 +58,8 @@ def read_packed(out: str, name: str) -> Packed | None:
     try:
         with storage.open_read(_path(out, name)) as stream:
             said = json.loads(pq.read_schema(stream).metadata[FOOTER])
-        shard = said["shard"]
-        return Packed(
-            shard=Shard(**shard | {"split": Split(shard["split"]), "view": View(shard["view"])}),
-            plan=said["plan"],
-            rejected=tuple(Rejection(**rejection) for rejection in said["rejected"]),
-        )
-    except (OSError, pa.ArrowInvalid, KeyError, TypeError, ValueError):
+        return as_told(Packed, said)
+    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError, RecursionError):
         return None
 
 
@@ -76,7 +72,7 @@ def read_part(out: str, name: str, columns: list[str] | None = None) -> pa.Table
     try:
         with storage.open_read(path) as stream:
             return pq.read_table(stream, columns=columns)
-    except (OSError, pa.ArrowInvalid) as error:
+    except (OSError, pa.ArrowException) as error:
         raise InputError(
             f"{path} cannot be read ({error}); expected the record table that packing wrote beside the tars; run "
             "jobs/make_shards.py again as it was run first, which makes what is missing"
