@@ -16,6 +16,7 @@ from pipeline.logistic import Logistic
 from pipeline.metrics import Doubles
 from pipeline.records import InputError
 from pipeline.reliability import Bin
+from pipeline.told import as_told
 
 SCHEMA_VERSION = 1
 FILE = "calibration.json"
@@ -88,12 +89,17 @@ def read_confidence(path: str, facts: dict[str, Any]) -> Confidence:
         said = sealed.read(path)
         if said.pop("schema_version") != SCHEMA_VERSION or tuple(said.pop("features")) != FEATURES:
             raise ValueError("another version")
-        model: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in said["model"].items()
-        }
-        bins = tuple(Bin(**one) for one in said["bins"])
-        confidence = Confidence(**(said | {"model": Logistic(**model), "bins": bins}))
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        confidence = as_told(Confidence, said)
+        model = confidence.model
+        if any(len(each) != len(FEATURES) for each in (model.mean_F, model.scale_F, model.coefficient_F)):
+            raise ValueError("another number of features")
+        if not np.isfinite(
+            [*model.mean_F, *model.scale_F, *model.coefficient_F, model.intercept, confidence.threshold]
+        ).all():
+            raise ValueError("numbers that are none")
+        if not all(model.scale_F):
+            raise ValueError("a scale of 0")
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise InputError(
             f"{path} is not a calibration of schema {SCHEMA_VERSION} ({error!r}); expected what "
             "jobs/calibrate.py writes; delete it and calibrate again"

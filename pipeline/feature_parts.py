@@ -160,8 +160,15 @@ def header_of(parquet: pq.ParquetFile, path: str) -> PartHeader:
         fingerprint, shard = said[b"pvda.fingerprint"].decode(), said[b"pvda.shard_sha256"].decode()
         rejected = tuple(Rejection(path=p, reason=r, found=f) for p, r, f in json.loads(said[b"pvda.rejected"]))
         embedding = schema.field("embedding").type
+        plain = pa.types.is_fixed_size_list(embedding) and pa.types.is_floating(embedding.value_type)
     except KeyError as missing:
         raise InputError(f"{path} has no {missing} in its footer; expected a part written by embed_gallery") from None
+    except (ValueError, TypeError, RecursionError) as error:
+        raise InputError(f"{path} has a damaged footer ({error}); delete it and embed its shard again") from None
+    if not plain or not embedding.list_size:
+        raise InputError(
+            f"{path} has embeddings of {embedding}; expected lists of one length of floats; embed its shard again"
+        )
     if version != SCHEMA_VERSION or stated != rows:
         raise InputError(
             f"{path} says version {version} and {stated} rows and holds {rows}; expected version {SCHEMA_VERSION} and "

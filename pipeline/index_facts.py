@@ -10,7 +10,8 @@ from typing import Any
 
 from pipeline import sealed, storage
 from pipeline.index_plan import Refine
-from pipeline.records import InputError
+from pipeline.records import InputError, excerpt
+from pipeline.told import as_told, is_file_name
 
 SCHEMA_VERSION = 2
 FACTS = "index.json"
@@ -117,9 +118,19 @@ def read_facts(folder: str) -> IndexFacts:
         if said["schema_version"] != SCHEMA_VERSION:
             raise InputError(f"{path} is of version {said['schema_version']}, expected {SCHEMA_VERSION}; {AGAIN}")
         own = {name: said.pop(name) for name in IndexFacts.__dataclass_fields__ if name != "measured"}
-        parts = tuple(PartFacts(**{**part, "removed": tuple(part["removed"])}) for part in own.pop("parts"))
-        return IndexFacts(**{**own, "effort": Effort(**own["effort"])}, parts=parts, measured=said)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        facts = as_told(IndexFacts, {**own, "measured": said})
+        held = (name for part in facts.parts for name in (*part.files, *part.table_parts, part.faiss, part.ids))
+        named = [*facts.trained, *held]
+        if strange := next((name for name in named if not is_file_name(name)), None):
+            raise ValueError(f"a file called {excerpt(strange)}")
+        effort = facts.effort
+        if min(facts.rows, facts.dimension, effort.breadth, effort.candidates, facts.unit_rows, facts.part_rows) < 1:
+            raise ValueError("a count below 1")
+        files = [file for held in (facts.trained, *(part.files for part in facts.parts)) for file in held.values()]
+        if not all({"bytes", "sha256"} <= file.keys() for file in files):
+            raise ValueError("a file without size or hash")
+        return facts
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"{path} is damaged ({error!r}), expected what build_index writes; {AGAIN}") from None
 
 

@@ -13,8 +13,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline import parquet_files, storage
-from pipeline.records import ImageRecord, InputError, Rejection, Split, View
+from pipeline.records import ImageRecord, InputError, Rejection
 from pipeline.shards import Manifest, Shard, mending
+from pipeline.told import as_told
 
 FOLDER = "records"
 SCHEMA = pa.schema(
@@ -55,13 +56,8 @@ def read_packed(out: str, name: str) -> Packed | None:
     try:
         with parquet_files.opened(_path(out, name)) as parquet:
             said = json.loads(parquet.schema_arrow.metadata[FOOTER])
-        shard = said["shard"]
-        return Packed(
-            shard=Shard(**shard | {"split": Split(shard["split"]), "view": View(shard["view"])}),
-            plan=said["plan"],
-            rejected=tuple(Rejection(**rejection) for rejection in said["rejected"]),
-        )
-    except (*parquet_files.DAMAGE, KeyError, TypeError):
+        return as_told(Packed, said)
+    except (*parquet_files.DAMAGE, KeyError, TypeError, RecursionError):
         return None
 
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline import sealed, storage
-from pipeline.records import InputError, Split, View
+from pipeline.records import InputError, Split, View, excerpt
+from pipeline.told import as_told, is_file_name
 
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
@@ -62,13 +63,14 @@ def read_manifest(shards: str) -> Manifest:
             raise InputError(
                 f"{path} has schema version {said['schema_version']}, expected {SCHEMA_VERSION}; pack again"
             )
-        shard_list = tuple(
-            Shard(**shard | {"split": Split(shard["split"]), "view": View(shard["view"])}) for shard in said["shards"]
-        )
-        return Manifest(
-            **said | {"shards": shard_list, "classes": tuple(said["classes"]), "added": tuple(said.get("added", ()))}
-        )
-    except (KeyError, TypeError, ValueError) as error:
+        manifest = as_told(Manifest, said)
+        for shard in manifest.shards:  # its name becomes that of files, of the set and of what is made of it
+            if not is_file_name(shard.name) or not 0 <= shard.samples <= shard.bytes:
+                raise ValueError(f"shard {excerpt(shard.name)} with {shard.samples} samples in {shard.bytes} bytes")
+        if len({shard.name for shard in manifest.shards}) < len(manifest.shards):
+            raise ValueError("a shard that is listed twice")
+        return manifest
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(
             f"{path} is damaged ({error}), expected what packing writes last; put it back from a copy, or delete it and run "
             "jobs/make_shards.py again as it was run, and after it each --extend"
