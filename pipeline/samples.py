@@ -46,7 +46,7 @@ def read_shard(
         said = _json(members.get("json"))
         if said.keys() >= OURS:
             if wrong := next(_faults(key, said), None):
-                raise InputError(f"the JSON of sample {key!r} in {path} has {wrong}; have the tar packed again")
+                raise InputError(f"the JSON of sample {key!r} in {path} has {wrong}; {mending(shards)}")
             yield Sample(key=key, data=data, facts=said)
             continue
         if split is None or view is None:

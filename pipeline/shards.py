@@ -65,7 +65,7 @@ def read_manifest(shards: str) -> Manifest:
             )
         manifest = as_told(Manifest, said)
         for shard in manifest.shards:  # its name becomes that of files, of the set and of what is made of it
-            if not is_file_name(shard.name) or not 0 <= shard.samples <= shard.bytes:
+            if not is_file_name(shard.name) or min(shard.samples, shard.bytes) < 0:
                 raise ValueError(f"shard {excerpt(shard.name)} with {shard.samples} samples in {shard.bytes} bytes")
         if len({shard.name for shard in manifest.shards}) < len(manifest.shards):
             raise ValueError("a shard that is listed twice")
