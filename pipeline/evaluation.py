@@ -15,7 +15,7 @@ import pyarrow as pa
 from pipeline import parquet_files, sealed, storage, stream
 from pipeline.chosen_rows import vectors_by_key
 from pipeline.evaluation_files import Besides, Export, write_besides
-from pipeline.evaluation_folder import INPUTS, METRICS, RESULTS, read_inputs, read_rows, write_inputs
+from pipeline.evaluation_folder import INPUTS, METRICS, RESULTS, is_whole, read_inputs, read_rows, write_inputs
 from pipeline.exclusive import one_at_a_time
 from pipeline.features import FeatureTable, Floats, open_table, verify
 from pipeline.progress import console, progress
@@ -125,6 +125,9 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
             f"{settings.out} holds an evaluation of something else (different {different}); expected the same or an "
             "empty folder; choose another --out"
         )
+    if earlier and not is_whole(settings.out, earlier):
+        console.print(f"{settings.out}: a file is missing or damaged; evaluating again", style="yellow")
+        earlier = None
     if earlier and earlier["shown"] == shown:
         console.print(f"{settings.out} is complete: the same features were evaluated before; nothing to do")
     elif earlier:

@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline import sealed, storage
+from pipeline import parquet_files, sealed, storage
 from pipeline.records import InputError
 
 METRICS, RESULTS, INPUTS = "metrics.json", "queries.parquet", "evaluation.json"
@@ -34,6 +34,15 @@ def read_inputs(folder: str) -> dict[str, Any] | None:
         return sealed.read(path) if storage.exists(path) else None
     except ValueError as error:
         raise _damaged(folder, INPUTS, str(error)) from None
+
+
+def is_whole(folder: str, inputs: Mapping[str, Any]) -> bool:
+    """Whether every list and the queries' rows of a finished evaluation are what was written."""
+    try:
+        parquet_files.refuse_damaged(storage.join(folder, RESULTS))
+    except parquet_files.DAMAGE:
+        return False
+    return all((data := _bytes(folder, name)) and _hash(data) == said for name, said in inputs.get(FILES, {}).items())
 
 
 def read_rows(folder: str, name: str) -> list[dict[str, Any]]:
