@@ -93,7 +93,9 @@ def read_confidence(path: str, facts: dict[str, Any]) -> Confidence:
         model = confidence.model
         if any(len(each) != len(FEATURES) for each in (model.mean_F, model.scale_F, model.coefficient_F)):
             raise ValueError("another number of features")
-        if not np.isfinite([*model.mean_F, *model.scale_F, *model.coefficient_F, model.intercept, confidence.threshold]).all():
+        if not np.isfinite(
+            [*model.mean_F, *model.scale_F, *model.coefficient_F, model.intercept, confidence.threshold]
+        ).all():
             raise ValueError("numbers that are none")
         if not all(model.scale_F):
             raise ValueError("a scale of 0")

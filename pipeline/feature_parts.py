@@ -151,7 +151,9 @@ def header_of(parquet: pq.ParquetFile, path: str) -> PartHeader:
     except (ValueError, TypeError, RecursionError) as error:
         raise InputError(f"{path} has a damaged footer ({error}); delete it and embed its shard again") from None
     if not plain or not embedding.list_size:
-        raise InputError(f"{path} has embeddings of {embedding}; expected lists of one length of floats; embed its shard again")
+        raise InputError(
+            f"{path} has embeddings of {embedding}; expected lists of one length of floats; embed its shard again"
+        )
     if version != SCHEMA_VERSION or stated != rows:
         raise InputError(
             f"{path} says version {version} and {stated} rows and holds {rows}; expected version {SCHEMA_VERSION} and "

@@ -119,10 +119,23 @@ def read_facts(folder: str) -> IndexFacts:
             raise InputError(f"{path} is of version {said['schema_version']}, expected {SCHEMA_VERSION}; {AGAIN}")
         own = {name: said.pop(name) for name in IndexFacts.__dataclass_fields__ if name != "measured"}
         facts = as_told(IndexFacts, {**own, "measured": said})
-        named = [*facts.trained, *(name for part in facts.parts for name in (*part.files, *part.table_parts, part.faiss, part.ids))]
+        named = [
+            *facts.trained,
+            *(name for part in facts.parts for name in (*part.files, *part.table_parts, part.faiss, part.ids)),
+        ]
         if strange := next((name for name in named if not is_file_name(name)), None):
             raise ValueError(f"a file called {excerpt(strange)}")
-        if min(facts.rows, facts.dimension, facts.effort.breadth, facts.effort.candidates, facts.unit_rows, facts.part_rows) < 1:
+        if (
+            min(
+                facts.rows,
+                facts.dimension,
+                facts.effort.breadth,
+                facts.effort.candidates,
+                facts.unit_rows,
+                facts.part_rows,
+            )
+            < 1
+        ):
             raise ValueError("a count below 1")
         files = [file for held in (facts.trained, *(part.files for part in facts.parts)) for file in held.values()]
         if not all({"bytes", "sha256"} <= file.keys() for file in files):

@@ -40,7 +40,9 @@ def _value(kind: Any, said: object, name: str) -> object:
     if origin is tuple and isinstance(said, list):
         kinds = [inner[0]] * len(said) if inner[-1] is Ellipsis else list(inner)
         if len(kinds) == len(said):
-            return tuple(_value(one, value, f"{name}[{at}]") for at, (one, value) in enumerate(zip(kinds, said, strict=True)))
+            return tuple(
+                _value(one, value, f"{name}[{at}]") for at, (one, value) in enumerate(zip(kinds, said, strict=True))
+            )
     if origin is dict and isinstance(said, dict):
         return {key: _value(inner[1], value, f"{name}[{key!r}]") for key, value in said.items()}
     if isinstance(kind, type) and issubclass(kind, StrEnum) and isinstance(said, str) and said in list(kind):
