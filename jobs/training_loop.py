@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from jobs.probes import look
 from jobs.run_folder import CHECKPOINT, Keeper, Run, find_checkpoint
 from jobs.tally import DAMAGED, NotFinite, Tally
-from model.checkpoint import Checkpoint, dumps
+from model.checkpoint import Checkpoint, CheckpointError, dumps
 from model.schedule import phase
 from model.training import Training
 from model.weights import load_backbone, read_state_dict
@@ -83,8 +83,15 @@ class Worker:
         "The rows of the epochs that are over."
         self.tally = Tally()
         if self.found is not None:
-            held = self.found[1]
-            self.training.load_state(held.state)
+            name, held = self.found
+            try:
+                self.training.load_state(held.state)
+            # torch's, over another's state
+            except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+                raise CheckpointError(
+                    f"{name} of {run.out} is not of this training ({type(error).__name__}); expected one that jobs/train.py "
+                    "wrote on these shards; choose another --out, or take it away to go on from the one before"
+                ) from error
             self.history, self.tally = list(held.history), Tally(held.step, held.running)
             if place.rank > 0:  # the checkpoint's count is rank 0's
                 self.tally.damaged = 0

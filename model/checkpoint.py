@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from model import torch_files
 from model.pvda import FeatureEncoder, PVDAConfig
 
 FORMAT = 1
@@ -74,12 +75,14 @@ def loads(data: bytes, name: str = "the checkpoint") -> Checkpoint:
     """
     refuse_damaged(data, name)
     try:
-        plain = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        plain = torch_files.read(data)
         if plain.pop("format") != FORMAT:
             raise ValueError("another format")
         network = PVDAConfig(**json.loads(plain.pop("network")))
         recipe, history = json.loads(plain.pop("recipe")), json.loads(plain.pop("history"))
-        return Checkpoint(network=network, recipe=recipe, history=history, **plain)
+        held = Checkpoint(network=network, recipe=recipe, history=history, **plain)
+        _refuse_strange(held)
+        return held
     except Exception as error:  # torch raises many kinds over a damaged file, struct.error and IndexError among them
         raise CheckpointError(
             f"{name} is not a checkpoint of format {FORMAT} ({type(error).__name__}); expected a last.pt written by "
@@ -113,10 +116,36 @@ def refuse_damaged(data: bytes, name: str) -> None:
 def _zip_is_whole(data: bytes) -> tuple[bool, str]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as held:
+            if any(member.compress_type != zipfile.ZIP_STORED for member in held.infolist()):
+                return False, "it is compressed, and torch compresses nothing"
             bad = held.testzip()
     except Exception as error:  # zipfile raises many kinds over a damaged directory
         return False, f"{type(error).__name__}"
     return bad is None, f"the checksum of {bad} in it is another"
+
+
+def _refuse_strange(held: Checkpoint) -> None:
+    """Raise ValueError where a field is of another type, or the weights are of another network than is said.
+
+    The network is laid out without memory: one that says to be a million times as wide is not built to find out.
+    """
+    plain = (
+        isinstance(held.recipe, dict)
+        and isinstance(held.history, list)
+        and all(isinstance(row, dict) for row in held.history)
+        and isinstance(held.locations, list)
+        and all(isinstance(location, str) for location in held.locations)
+        and all(type(count) is int and count >= 0 for count in (held.epoch, held.step))
+        and isinstance(held.running, dict)
+        and all(isinstance(value, torch.Tensor) for value in held.running.values())
+        and all(isinstance(module, dict) for module in held.state["modules"].values())
+    )
+    if not plain:
+        raise ValueError("a field of another type")
+    with torch.device("meta"):
+        wanted = {name: tensor.shape for name, tensor in FeatureEncoder(held.network).state_dict().items()}
+    if {name: tensor.shape for name, tensor in held.encoder_weights.items()} != wanted:
+        raise ValueError("weights of another network")
 
 
 def build_encoder(checkpoint: Checkpoint) -> FeatureEncoder:

@@ -14,6 +14,8 @@ from model.rings import Divisor, ring_average
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 "Of red, green and blue in 0..1: what torchvision's weights were trained with."
+LARGEST_IMAGE, MOST_CHANNELS = 16_384, 65_536
+"Beyond any use; a checkpoint from elsewhere may say anything."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +47,17 @@ class PVDAConfig:
                 f"width is {self.width}, which gives layer1 of a ResNet-{self.depth} "
                 f"{layer1_channels(self.depth, self.width)} channels; expected at least {LEAST_CHANNELS} (thinner ones crash "
                 "oneDNN); use a larger width"
+            )
+        for name, most in (
+            ("image_size", LARGEST_IMAGE),
+            ("part_dim", MOST_CHANNELS),
+            ("discriminator_channels", MOST_CHANNELS),
+        ):
+            if not 1 <= getattr(self, name) <= most:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected 1 to {most}")
+        if layer1_channels(self.depth, self.width) > MOST_CHANNELS or self.parts < 1:
+            raise ValueError(
+                f"width is {self.width} and parts {self.parts}, expected a network that some machine can hold"
             )
         least = max(2 * self.parts, 4) * STRIDE  # the discriminator halves the maps twice
         if self.image_size < least:

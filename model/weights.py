@@ -1,14 +1,13 @@
 """Foreign weights -> ours: a torchvision ResNet's state dict loads into the backbone by name."""
 
-import io
 import re
 from collections.abc import Callable
 from pathlib import Path
 
 import safetensors.torch
-import torch
 from torch import Tensor, nn
 
+from model import torch_files
 from model.backbone import BLOCKS, Depth
 from model.checkpoint import CheckpointError, refuse_damaged
 
@@ -42,12 +41,14 @@ def parse_state_dict(data: bytes, name: str) -> dict[str, Tensor]:
     try:
         if name.endswith(".safetensors"):
             return safetensors.torch.load(data)
-        state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        state = torch_files.read(data)
     except Exception as error:  # torch and safetensors raise many kinds over a damaged file
         raise CheckpointError(
             f"{name} is no state dict ({type(error).__name__}); expected .pth or .safetensors"
         ) from error
-    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+    if not isinstance(state, dict) or not all(
+        isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in state.items()
+    ):
         raise CheckpointError(
             f"{name} holds something else than tensors by name; expected a state dict; save model.state_dict() alone"
         )

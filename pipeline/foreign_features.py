@@ -5,16 +5,15 @@ gallery_path, query_path where they are kept). Out: a table of the queries and o
 """
 
 import hashlib
-import io
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import scipy.io
 
 from pipeline import storage
 from pipeline.exclusive import one_at_a_time
 from pipeline.features import Floats, PartFooter, PartRows, write_part
+from pipeline.mat_file import NUMBERS, IsHdf5, Unreadable, read_mat
 from pipeline.records import InputError, Split, View, make_key
 
 PART_ROWS = 8_192
@@ -62,7 +61,10 @@ def import_features(settings: ImportSettings) -> dict[str, tuple[str, int]]:
             f"{settings.mat} has queries of {widths['query']} and a gallery of {widths['gallery']} dimensions; expected one "
             "network's features; save both with the same one"
         )
-    by_path = all(len(side.paths) == len(side.labels) for side in sides.values())
+    by_path = all(
+        len(side.paths) == len(side.labels) and all("/" in path.replace("\\", "/") for path in side.paths)
+        for side in sides.values()
+    )
     fingerprint = hashlib.sha256(data).hexdigest()
     written = {}
     for name, split, view in (
@@ -76,31 +78,32 @@ def import_features(settings: ImportSettings) -> dict[str, tuple[str, int]]:
 
 def _load(path: str, data: bytes) -> dict[str, Any]:
     try:
-        said: dict[str, Any] = scipy.io.loadmat(io.BytesIO(data))
-    except NotImplementedError:
+        said, held = read_mat(data)
+    except IsHdf5:
         raise InputError(
             f"{path} is a MATLAB 7.3 file (HDF5); expected MATLAB 5; save it again with scipy.io.savemat, or with -v7 in MATLAB"
         ) from None
-    except Exception as error:  # the reader raises whatever the damage leads it to
+    except Unreadable as error:
         raise InputError(
             f"{path} cannot be read as a .mat file ({error}); expected one that scipy.io.savemat wrote"
         ) from None
-    missing = [name for name in ("gallery_f", "gallery_label", "query_f", "query_label") if name not in said]
+    missing = [name for name in NUMBERS if name not in said]
     if missing:
-        held = ", ".join(name for name in said if not name.startswith("__"))
         raise InputError(
-            f"{path} holds {held or 'nothing'}; expected {', '.join(missing)} too, as University-1652's test.py saves them; "
-            "save them under these names"
+            f"{path} holds {', '.join(held)[:300] or 'nothing'}; expected {', '.join(missing)} too, as University-1652's "
+            "test.py saves them; save them under these names"
         )
     return said
 
 
 def _side(path: str, said: dict[str, Any], name: str) -> _Side:
-    features_ND = np.asarray(said[f"{name}_f"], np.float32)
-    labels = [int(label) for label in np.ravel(said[f"{name}_label"])]
-    listed = np.ravel(said.get(f"{name}_path", []))
-    # MATLAB has no lists of text: a matrix of padded characters, or cells with one array each.
-    paths = [str(each.item() if isinstance(each, np.ndarray) else each).strip() for each in listed]
+    with np.errstate(over="ignore"):  # an infinite length is refused below
+        features_ND = np.asarray(said[f"{name}_f"], np.float32)
+    label_N = np.ravel(said[f"{name}_label"])
+    if not np.isfinite(label_N).all() or (np.abs(label_N) >= 2**63).any():
+        raise InputError(f"{path} has {name}_label that are no whole numbers; expected one per image; save them again")
+    labels = [int(label) for label in label_N]
+    paths: list[str] = said.get(f"{name}_path", np.array([], np.str_)).tolist()
     if features_ND.ndim != 2 or len(features_ND) != len(labels) or (paths and len(paths) != len(labels)):
         raise InputError(
             f"{path} has {name}_f of shape {features_ND.shape}, {len(labels)} labels and {len(paths)} paths; expected one row, "
