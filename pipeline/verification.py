@@ -12,6 +12,7 @@ from typing import IO, cast
 import ray
 
 from pipeline import cluster, storage
+from pipeline.mending import whole_part
 from pipeline.progress import progress
 from pipeline.records import InputError
 from pipeline.shard_records import read_part
@@ -86,6 +87,8 @@ def check_shard(root: str, shard: Shard) -> list[str]:
         part = read_part(root, shard.name, ["key", "sha256"])
         if list(zip(part["key"].to_pylist(), part["sha256"].to_pylist(), strict=True)) != keys:
             wrong.append(f"the record table of {path} lists other images than it holds")
+        if not whole_part(root, shard.name):
+            wrong.append(f"the record table of {path} has a byte that packing did not write")
     except InputError as error:
         wrong.append(str(error))
     return wrong

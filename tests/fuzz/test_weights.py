@@ -204,7 +204,7 @@ def test_a_damaged_file_of_weights(tmp_path_factory: pytest.TempPathFactory, dat
                     image_size=data.draw(st.sampled_from([64, 0, -1, 10**12])),
                     **{flag: str(path)},
                 )
-            )  # type: ignore[arg-type]
+            )
     assert {each.name for each in folder.iterdir()} <= {path.name, "out.pt"}
 
 
