@@ -240,7 +240,14 @@ def _earlier(out: str) -> dict[str, Any] | None:
         raise InputError(
             f"{out} holds a {METRICS} without {INPUTS}; expected an evaluation's folder; choose another --out"
         )
-    said: dict[str, Any] = storage.read_json(storage.join(out, INPUTS))
+    try:
+        said: dict[str, Any] = storage.read_json(storage.join(out, INPUTS))
+        if not isinstance(said, dict):
+            raise ValueError("no settings in it")
+    except ValueError as error:
+        raise InputError(
+            f"{storage.join(out, INPUTS)} cannot be read ({error}); choose another --out, or delete it"
+        ) from None
     return said
 
 

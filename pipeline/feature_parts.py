@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from pipeline import rejects, storage
 from pipeline.ahead import ahead
-from pipeline.records import InputError, Rejection
+from pipeline.records import InputError, Rejection, Split, View, excerpt
 
 SCHEMA_VERSION = "1"
 REJECTED = f"_rejected/{rejects.FILE}"
@@ -121,10 +121,26 @@ def open_part(path: str) -> Iterator[pq.ParquetFile]:
         with storage.open_read(path) as stream:
             # With a buffer, a row group is read as it is decoded and not fetched whole before.
             yield pq.ParquetFile(stream, buffer_size=1 << 20)
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, UnicodeError) as error:  # the last: of a footer's names
         raise InputError(
             f"{path} is not a readable Parquet file ({error}); delete it and embed its shard again"
         ) from None
+
+
+def sound(found: pa.Table) -> pa.Table:
+    """The rows, every value looked at: text that is no UTF-8 would else come to light far from its part. Raises ArrowInvalid."""
+    found.validate(full=True)
+    return found
+
+
+def kind_of(path: str, split: str | None, view: str | None) -> tuple[Split, View]:
+    """Split and view of rows. Raises InputError where they are none of ours."""
+    if split not in list(Split) or view not in list(View):
+        raise InputError(
+            f"{path} has rows of split {excerpt(split)} and view {excerpt(view)}; expected splits {', '.join(Split)} and views "
+            f"{', '.join(View)}; delete it and embed its shard again"
+        )
+    return Split(split), View(view)
 
 
 def read_header(path: str) -> PartHeader:
@@ -150,6 +166,17 @@ def header_of(parquet: pq.ParquetFile, path: str) -> PartHeader:
         raise InputError(f"{path} has no {missing} in its footer; expected a part written by embed_gallery") from None
     except (ValueError, TypeError, RecursionError) as error:
         raise InputError(f"{path} has a damaged footer ({error}); delete it and embed its shard again") from None
+    columns = {field.name: field.type for field in part_schema(1)}
+    missing = [name for name in columns if name not in schema.names]
+    strange = (
+        [name for name in ("key", "location", "lat", "lon") if schema.field(name).type != columns[name]]
+        if not missing
+        else missing
+    )
+    if strange:
+        raise InputError(
+            f"{path} has no column {strange[0]} as embed_gallery writes it; delete it and embed its shard again"
+        )
     if not plain or not embedding.list_size:
         raise InputError(
             f"{path} has embeddings of {embedding}; expected lists of one length of floats; embed its shard again"
@@ -209,5 +236,13 @@ def read_rejected(table: str) -> pa.Table:
     path = storage.join(table, REJECTED)
     if not storage.exists(path):
         return REJECTED_SCHEMA.empty_table()
-    with storage.open_read(path) as stream:
-        return pq.read_table(stream)
+    try:
+        with storage.open_read(path) as stream:
+            found = pq.read_table(stream)
+        if found.schema.names != REJECTED_SCHEMA.names:
+            raise ValueError(f"columns {', '.join(found.schema.names)[:200]}")
+        return found
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise InputError(
+            f"{path} cannot be read ({error}); expected the list that jobs/embed_gallery.py writes; delete it and embed again"
+        ) from None

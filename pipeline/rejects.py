@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline import storage
-from pipeline.records import Rejection
+from pipeline.records import InputError, Rejection
 
 FILE = "rejected.parquet"
 SCHEMA = pa.schema([("path", pa.string()), ("reason", pa.string()), ("found", pa.string())])
@@ -21,8 +21,15 @@ def write(folder: str, rejected: Iterable[Rejection], keep: bool) -> int:
     path = storage.join(folder, FILE)
     listed = {(rejection.path, rejection.reason, rejection.found) for rejection in rejected}
     if keep and storage.exists(path):
-        with storage.open_read(path) as stream:
-            listed.update(zip(*pq.read_table(stream).to_pydict().values(), strict=True))
+        try:
+            with storage.open_read(path) as stream:
+                listed.update(
+                    zip(*pq.read_table(stream, columns=SCHEMA.names).cast(SCHEMA).to_pydict().values(), strict=True)
+                )
+        except (pa.ArrowException, OSError, ValueError) as error:
+            raise InputError(
+                f"{path} cannot be read ({error}); expected the list of refused images; delete it"
+            ) from None
     table = pa.Table.from_pylist([dict(zip(SCHEMA.names, row, strict=True)) for row in sorted(listed)], SCHEMA)
     with storage.atomic(path) as stream:
         pq.write_table(table, stream)

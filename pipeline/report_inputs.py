@@ -121,10 +121,17 @@ def _is_measured(row: Any) -> bool:
 def read_besides(folder: str) -> dict[str, tuple[dict[str, Any], ...]]:
     """What an evaluation holds besides its measures, by the names of Findings' fields; empty where it was not taken."""
     paths = {name: storage.join(folder, file) for name, file in BESIDES.items()}
-    found = {name: tuple(storage.read_json(path)) if storage.exists(path) else () for name, path in paths.items()}
-    for name, rows in found.items():
-        if not all(isinstance(row, dict) for row in rows):
-            raise ValueError(f"{paths[name]} holds something else than rows")
+    found: dict[str, tuple[dict[str, Any], ...]] = {}
+    for name, path in paths.items():
+        try:
+            rows = storage.read_json(path) if storage.exists(path) else []
+            if not (isinstance(rows, list) and all(isinstance(row, dict) for row in rows)):
+                raise ValueError("something else than rows")
+        except ValueError as error:
+            raise InputError(
+                f"{path} cannot be read ({error}); expected what jobs/evaluate.py writes; evaluate again"
+            ) from None
+        found[name] = tuple(rows)
     return found
 
 
@@ -165,13 +172,13 @@ def read_training(run: str) -> list[dict[str, Any]]:
     path = storage.join(run, "metrics.jsonl")
     if not storage.exists(path):
         raise InputError(f"no training curves at {run}: found no metrics.jsonl; expected the --out of jobs/train.py")
-    lines = storage.read_bytes(path).decode().splitlines()
+    lines = storage.read_bytes(path).decode(errors="replace").splitlines()
     by_epoch: dict[int, dict[str, Any]] = {}
     for number, line in enumerate(lines, 1):
         try:
             row = json.loads(line)
             by_epoch[int(row["epoch"])] = row
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             if number == len(lines):
                 break  # a run that is still writing, or was killed while it wrote
             raise InputError(

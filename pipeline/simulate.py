@@ -170,7 +170,14 @@ def _is_complete(root: Path, described: dict[str, Any]) -> bool:
                 f"{root} holds files that no simulation wrote; expected a new or empty folder; choose another --out"
             )
         return False
-    found = storage.read_json(str(there))
+    try:
+        found = storage.read_json(str(there))
+        if not isinstance(found, dict):
+            raise ValueError("no settings in it")
+    except ValueError as error:
+        raise InputError(
+            f"{there} cannot be read ({error}); expected what a simulation wrote; choose another --out or remove the folder"
+        ) from None
     other = [f"{name} {found.get(name)!r} instead of {described.get(name)!r}"
              for name in sorted({*found, *described}) if found.get(name) != described.get(name)]  # fmt: skip
     if other:
