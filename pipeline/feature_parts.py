@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from pipeline import parquet_files, rejects, storage
 from pipeline.ahead import ahead
-from pipeline.records import InputError, Rejection
+from pipeline.records import InputError, Rejection, Split, View, excerpt
 
 SCHEMA_VERSION = "1"
 REJECTED = f"_rejected/{rejects.FILE}"
@@ -142,6 +142,22 @@ def _unreadable(path: str, error: Exception) -> InputError:
     return InputError(f"{path} is not a readable Parquet file ({error}); delete it and embed its shard again")
 
 
+def sound(found: pa.Table) -> pa.Table:
+    """The rows, every value looked at: text that is no UTF-8 would else come to light far from its part. Raises ArrowInvalid."""
+    found.validate(full=True)
+    return found
+
+
+def kind_of(path: str, split: str | None, view: str | None) -> tuple[Split, View]:
+    """Split and view of rows. Raises InputError where they are none of ours."""
+    if split not in list(Split) or view not in list(View):
+        raise InputError(
+            f"{path} has rows of split {excerpt(split)} and view {excerpt(view)}; expected splits {', '.join(Split)} and views "
+            f"{', '.join(View)}; delete it and embed its shard again"
+        )
+    return Split(split), View(view)
+
+
 def read_header(path: str) -> PartHeader:
     """What a part says of itself.
 
@@ -165,6 +181,17 @@ def header_of(parquet: pq.ParquetFile, path: str) -> PartHeader:
         raise InputError(f"{path} has no {missing} in its footer; expected a part written by embed_gallery") from None
     except (ValueError, TypeError, RecursionError) as error:
         raise InputError(f"{path} has a damaged footer ({error}); delete it and embed its shard again") from None
+    columns = {field.name: field.type for field in part_schema(1)}
+    missing = [name for name in columns if name not in schema.names]
+    strange = (
+        [name for name in ("key", "location", "lat", "lon") if schema.field(name).type != columns[name]]
+        if not missing
+        else missing
+    )
+    if strange:
+        raise InputError(
+            f"{path} has no column {strange[0]} as embed_gallery writes it; delete it and embed its shard again"
+        )
     if not plain or not embedding.list_size:
         raise InputError(
             f"{path} has embeddings of {embedding}; expected lists of one length of floats; embed its shard again"

@@ -27,6 +27,7 @@ from pipeline.feature_parts import (
     PartHeader,
     PartRows,
     header_of,
+    kind_of,
     open_part,
     part_names,
     part_schema,
@@ -147,7 +148,7 @@ class FeatureTable:
         tests = set().union(*(meant.columns for meant in self.selections))
         for part in self.parts:
             with open_part(storage.join(self.path, part)) as parquet:
-                found = parquet.read(columns=sorted({*columns, *tests}))
+                found = sound(parquet.read(columns=sorted({*columns, *tests})))
             found = found.append_column("part_row", pa.array(np.arange(len(found), dtype=np.int32)))
             for meant in self.selections:
                 found = found.filter(meant.mask(found))
@@ -203,7 +204,7 @@ class FeatureTable:
                     if all(meant.may_hold(parquet, group) for meant in self.selections)
                 ]
                 for batch in parquet.iter_batches(rows, groups, columns=sorted({*columns, *tests})):
-                    found = pa.Table.from_batches([batch])
+                    found = sound(pa.Table.from_batches([batch]))
                     for meant in self.selections:
                         found = found.filter(meant.mask(found))
                     if len(found):
@@ -261,7 +262,7 @@ def _open_one(path: str) -> tuple[PartHeader, Counts]:
         header = header_of(parquet, path)
         table = parquet.read(columns=["split", "view"]).unify_dictionaries()
     for row in table.group_by(["split", "view"]).aggregate([([], "count_all")]).to_pylist():
-        counts[Split(row["split"]), View(row["view"])] += row["count_all"]
+        counts[kind_of(path, row["split"], row["view"])] += row["count_all"]
     return header, counts
 
 

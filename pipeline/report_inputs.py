@@ -167,13 +167,13 @@ def read_training(run: str) -> list[dict[str, Any]]:
     path = storage.join(run, "metrics.jsonl")
     if not storage.exists(path):
         raise InputError(f"no training curves at {run}: found no metrics.jsonl; expected the --out of jobs/train.py")
-    lines = storage.read_bytes(path).decode().splitlines()
+    lines = storage.read_bytes(path).decode(errors="replace").splitlines()
     by_epoch: dict[int, dict[str, Any]] = {}
     for number, line in enumerate(lines, 1):
         try:
             row = json.loads(line)
             by_epoch[int(row["epoch"])] = row
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             if number == len(lines):
                 break  # a run that is still writing, or was killed while it wrote
             raise InputError(
