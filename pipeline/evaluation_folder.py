@@ -54,8 +54,10 @@ def read_rows(folder: str, name: str) -> list[dict[str, Any]]:
     if said is not None and (data is None or _hash(data) != said):
         raise _damaged(folder, name, f"it has not the hash that {INPUTS} says" if data else "it is not there")
     try:
-        rows: list[dict[str, Any]] = [] if data is None else json.loads(data)
-    except ValueError as error:
+        rows = [] if data is None else json.loads(data)
+        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+            raise ValueError("something else than rows")
+    except (ValueError, RecursionError) as error:
         raise _damaged(folder, name, str(error)) from None
     return rows
 

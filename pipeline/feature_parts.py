@@ -143,7 +143,10 @@ def _unreadable(path: str, error: Exception) -> InputError:
 
 
 def sound(found: pa.Table) -> pa.Table:
-    """The rows, every value looked at: text that is no UTF-8 would else come to light far from its part. Raises ArrowInvalid."""
+    """The rows, every value looked at: text that is no UTF-8 would else come to light far from its part.
+
+    Raises ArrowInvalid.
+    """
     found.validate(full=True)
     return found
 
@@ -177,17 +180,14 @@ def header_of(parquet: pq.ParquetFile, path: str) -> PartHeader:
         rejected = tuple(Rejection(path=p, reason=r, found=f) for p, r, f in json.loads(said[b"pvda.rejected"]))
         embedding = schema.field("embedding").type
         plain = pa.types.is_fixed_size_list(embedding) and pa.types.is_floating(embedding.value_type)
-    except KeyError as missing:
-        raise InputError(f"{path} has no {missing} in its footer; expected a part written by embed_gallery") from None
+    except KeyError as name:
+        raise InputError(f"{path} has no {name} in its footer; expected a part written by embed_gallery") from None
     except (ValueError, TypeError, RecursionError) as error:
         raise InputError(f"{path} has a damaged footer ({error}); delete it and embed its shard again") from None
     columns = {field.name: field.type for field in part_schema(1)}
-    missing = [name for name in columns if name not in schema.names]
-    strange = (
-        [name for name in ("key", "location", "lat", "lon") if schema.field(name).type != columns[name]]
-        if not missing
-        else missing
-    )
+    strange = [name for name in columns if name not in schema.names] or [
+        name for name in ("key", "location", "lat", "lon") if schema.field(name).type != columns[name]
+    ]
     if strange:
         raise InputError(
             f"{path} has no column {strange[0]} as embed_gallery writes it; delete it and embed its shard again"

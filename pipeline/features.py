@@ -33,6 +33,7 @@ from pipeline.feature_parts import (
     part_schema,
     read_footer,
     refuse_mixed,
+    sound,
     verify_part,
     write_part,
 )
@@ -260,7 +261,7 @@ def _open_one(path: str) -> tuple[PartHeader, Counts]:
     counts: Counts = Counter()
     with open_part(path) as parquet:
         header = header_of(parquet, path)
-        table = parquet.read(columns=["split", "view"]).unify_dictionaries()
+        table = sound(parquet.read(columns=["split", "view"])).unify_dictionaries()
     for row in table.group_by(["split", "view"]).aggregate([([], "count_all")]).to_pylist():
         counts[kind_of(path, row["split"], row["view"])] += row["count_all"]
     return header, counts

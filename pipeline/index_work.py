@@ -25,14 +25,6 @@ from pipeline.progress import progress
 BUILDING, PLAN, TRAINED = "_building", "plan.json", "trained.faiss"
 
 
-def _plan_at(path: str) -> object:
-    """What unfinished work is of; None where there is none, or nobody can tell."""
-    try:
-        return storage.read_json(path) if storage.exists(path) else None
-    except ValueError:
-        return None
-
-
 class Workshop:
     """Where one index is built or grown."""
 

@@ -1,4 +1,5 @@
-"""Our own files, damaged or written by somebody else: opened, or refused in a sentence; nothing outside of their folder is named."""
+"""Our own files, damaged or written by somebody else: opened,
+or refused in a sentence; nothing outside of their folder is named."""
 
 import dataclasses
 import io
@@ -10,11 +11,11 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from fuzz.bounds import bounded, examples
-from fuzz.hostile import damaged, twisted
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fuzz.bounds import bounded, examples
+from fuzz.hostile import damaged, twisted
 from pipeline import storage
 from pipeline.confidence import FEATURES, Confidence, read_confidence, write_confidence
 from pipeline.feature_parts import PartFooter, PartRows, read_rejected, write_part
@@ -33,20 +34,29 @@ from pipeline.simulate import SimulationSettings, simulate
 from pipeline.told import is_file_name
 
 SHARD = Shard(name="query-drone-000000", split=Split.QUERY, view=View.DRONE, samples=2, bytes=10240, sha256="0" * 64)
-MANIFEST = Manifest(shards=(SHARD, dataclasses.replace(SHARD, name="query-drone-000001")), classes=("0001",), packing={"source": "photos"}, rejected=0)  # fmt: skip
+MANIFEST = Manifest(
+    shards=(SHARD, dataclasses.replace(SHARD, name="query-drone-000001")),
+    classes=("0001",),
+    packing={"source": "photos"},
+    rejected=0,
+)
 FILE = {"bytes": 10, "sha256": "0" * 64}
 FACTS = IndexFacts(
-    factory="Flat", metric="inner product", rows=2, dimension=4, fingerprint="0" * 64, table="/nowhere", asked={"split": None}, why="small",
+    factory="Flat", metric="inner product", rows=2, dimension=4, fingerprint="0" * 64, table="/nowhere",
+    asked={"split": None}, why="small",
     refine="none", on_disk=False, effort=Effort(breadth=1), target_recall=0.95, unit_rows=2, part_rows=2, training_sample=0,
     build_seconds=0.1, bytes_per_vector=16.0, expected_bytes=None, measured={"recall_at_1": 1.0},
-    parts=(PartFacts(faiss="index.faiss", ids="ids.arrow", first_row=0, rows=2, table_parts={"query-drone-000000.parquet": "0" * 64}, files={"index.faiss": FILE, "ids.arrow": FILE}),),
+    parts=(PartFacts(faiss="index.faiss", ids="ids.arrow", first_row=0, rows=2,
+    table_parts={"query-drone-000000.parquet": "0" * 64}, files={"index.faiss": FILE, "ids.arrow": FILE}),),
     trained={"trained.faiss": FILE},
 )  # fmt: skip
 NUMBERS = (0.1,) * len(FEATURES)
 CONFIDENCE = Confidence(
     fingerprint="0" * 64, gallery=2, asked="photos", spacing_m=20.0, within_m=50.0, tolerance_m=25.0, outside=0.5,
-    model=Logistic(mean_F=NUMBERS, scale_F=NUMBERS, coefficient_F=NUMBERS, intercept=0.0), threshold=0.5, sharpness=1.0, elsewhere=0.0,
-    photos=10, locations=5, right=0.5, right_kept=0.5, outside_unknown=0.5, calibration_error=0.1, bins=(Bin(said=0.5, seen=0.5, share=1.0),),
+    model=Logistic(mean_F=NUMBERS, scale_F=NUMBERS, coefficient_F=NUMBERS, intercept=0.0), threshold=0.5,
+    sharpness=1.0, elsewhere=0.0,
+    photos=10, locations=5, right=0.5, right_kept=0.5, outside_unknown=0.5, calibration_error=0.1,
+    bins=(Bin(said=0.5, seen=0.5, share=1.0),),
 )  # fmt: skip
 
 
@@ -125,10 +135,9 @@ def part() -> bytes:
 
 @cache
 def records() -> bytes:
-    row = {
-        name: "x"
-        for name in ("key", "location", "view", "split", "variant", "shard", "source", "path", "part", "sha256")
-    }
+    row = dict.fromkeys(
+        ("key", "location", "view", "split", "variant", "shard", "source", "path", "part", "sha256"), "x"
+    )
     write_records(
         "memory://fuzz", Packed(shard=SHARD, plan="0", rejected=()), [row | {"bytes": 1, "width": 1, "height": 1}] * 20
     )
@@ -184,7 +193,20 @@ def test_a_simulation_that_was_begun(folder: Path, data: st.DataObject) -> None:
         simulate(settings)
 
 
-METRICS = [{"task": "drone->satellite", "protocol": "full", "multi_query": False, "queries": 2, "gallery": 2, "r1": 1.0, "r5": 1.0, "r10": 1.0, "r1p": 1.0, "ap": 1.0}]  # fmt: skip
+METRICS = [
+    {
+        "task": "drone->satellite",
+        "protocol": "full",
+        "multi_query": False,
+        "queries": 2,
+        "gallery": 2,
+        "r1": 1.0,
+        "r5": 1.0,
+        "r10": 1.0,
+        "r1p": 1.0,
+        "ap": 1.0,
+    }
+]
 
 
 @given(st.data())
