@@ -149,10 +149,11 @@ def finished(settings: PackingSettings, said: dict[str, Any]) -> Manifest | None
         raise InputError(
             f"{out} holds shards packed with another {changed}; choose another --out, delete it, or add to it with --extend"
         )
-    damaged = damaged_shards(out, manifest)
-    if not damaged or settings.extend or manifest.added:
+    damaged, listed = damaged_shards(out, manifest), rejects.is_whole(out, manifest.rejected)
+    if (not damaged and listed) or settings.extend or manifest.added:
         return manifest
-    console.print(f"{out}: {len(damaged)} shards are missing or damaged; they are packed again")
+    wrong = f"{len(damaged)} shards are" if damaged else f"{rejects.FILE} is"
+    console.print(f"{out}: {wrong} missing or damaged; what is not whole is packed again")
     return None
 
 

@@ -29,6 +29,16 @@ def write(folder: str, rejected: Iterable[Rejection], keep: bool) -> int:
     return len(table)
 
 
+def is_whole(folder: str, count: int) -> bool:
+    """Whether the list is there, every byte as it was written, with so many images."""
+    path = storage.join(folder, FILE)
+    try:
+        parquet_files.refuse_damaged(path)
+        return len(_read(path)) == count
+    except (*parquet_files.DAMAGE, InputError):
+        return False
+
+
 def paths(folder: str) -> frozenset[str]:
     """The images that are listed; none where there is no list. Raises InputError where it cannot be read."""
     path = storage.join(folder, FILE)
