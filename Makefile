@@ -16,7 +16,7 @@ check: .venv/installed
 	$(BIN)/mypy
 
 bench: .venv/installed
-	for name in simulate shards streaming evaluate index train_step; do $(BIN)/python benchmarks/$$name.py || exit 1; done
+	for name in simulate shards streaming evaluate index train_step damage chaos; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 # benchmarks/ablation.py (hours) and benchmarks/locate.py (minutes) take a folder of imagery, benchmarks/serve.py a trained
 # network and its index: they are called by hand
 
