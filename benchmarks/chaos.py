@@ -18,7 +18,8 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "chaos"))
 
-from campaign import Verdict, cases, ground, trial
+from campaign import Verdict, cases, trial
+from grounds import ground
 from stages import STAGES
 
 

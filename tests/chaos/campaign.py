@@ -5,24 +5,18 @@ refuses, what its sentence asks for is done: a damaged input is put back (the st
 output that it names is deleted.
 """
 
-import json
-import os
 import random
 import re
 import shutil
 import signal
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from faults import DAMAGE, KILLS, PLACES, STORAGE, Damaged, damage
-from launcher import PATH, Ended, Job, Launcher
-from processes import cluster, daemons, strike, working
-from stages import Content, Stage
+from grounds import Ground, Undisturbed
+from launcher import Ended
+from processes import strike
+from stages import Stage
 
-PATIENCE = 180.0
-"Seconds, and ten times as long as an undisturbed run, after which a run counts as hung."
 TRIES = 6
 "Runs after the faults in which the stage has to come to its end."
 PASSED_OVER = ("tensorboard", "ray", "job.log", ".parts")
@@ -69,116 +63,6 @@ class Verdict:
         return bool(self.lost or self.doubled or self.hangs or self.unclear)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Undisturbed:
-    """A stage's run without faults."""
-
-    content: Content
-    seconds: Mapping[bool, float]
-    "By whether Ray's workers did it."
-    operations: Mapping[str, int]
-    "On files, by kind."
-
-
-class Ground:
-    """Where the stages run: the folders as they should be, and the one that is spoilt."""
-
-    def __init__(self, scratch: Path, environment: Mapping[str, str], head: int, address: str) -> None:
-        self.here, self._pristine = scratch / "here", scratch / "pristine"
-        self._spec, self._counter = scratch / "fault.json", scratch / "operations"
-        self._launcher = Launcher(scratch, {**environment, "CHAOS": str(self._spec)})
-        self._head, self._address = head, address
-        self._known: dict[str, Undisturbed] = {}
-
-    def close(self) -> None:
-        self._launcher.close()
-
-    def prepare(self, stage: Stage, without: bool = True) -> None:
-        """Lay out what a stage reads, and nothing else."""
-        shutil.rmtree(self.here, ignore_errors=True)
-        self.here.mkdir(parents=True)
-        self._spec.unlink(missing_ok=True)
-        for name in (*stage.reads, *([] if without else [stage.writes])):
-            shutil.copytree(self._pristine / name, self.here / name)
-
-    def start(self, stage: Stage, spread: bool, own_cluster: bool = False, guarded: bool = False) -> Job:
-        address = "local" if own_cluster else self._address
-        return self._launcher.start(stage.job, stage.command(self.here, spread, guarded), RAY_ADDRESS=address)
-
-    def run(self, stage: Stage, spread: bool, guarded: bool = False) -> Ended:
-        return self.start(stage, spread, guarded=guarded).end(self.patience(stage))
-
-    def patience(self, stage: Stage) -> float:
-        known = self._known.get(stage.name)
-        return PATIENCE + (0 if known is None else 10 * max(known.seconds.values()))
-
-    def check(self, stage: Stage) -> Ended:
-        """The stage's own check of every byte that it wrote."""
-        assert stage.verify
-        words = stage.verify.format(here=self.here).split()
-        return self._launcher.start(stage.job, words, RAY_ADDRESS=self._address).end(self.patience(stage))
-
-    def victims(self, job: Job, kind: str) -> list[int]:
-        """Who may be killed."""
-        if kind.startswith("driver"):
-            return [job.pid]
-        return daemons(job.pid) if kind.startswith("cluster") else working(self._head) + working(job.pid)
-
-    def arm(self, kind: str, at: int) -> None:
-        """The operation on files with this number meets a fault."""
-        self._counter.unlink(missing_ok=True)
-        said = {
-            "kind": kind,
-            "at": at,
-            "under": str(self.here),
-            "counter": str(self._counter),
-            "counts": [STORAGE[kind]],
-        }
-        self._spec.write_text(json.dumps(said))
-
-    def disarm(self) -> int:
-        """No more faults; how many operations there were."""
-        self._spec.unlink(missing_ok=True)
-        return self._counter.stat().st_size if self._counter.exists() else 0
-
-    def undisturbed(self, stage: Stage) -> Undisturbed:
-        """How the stage runs without faults, and its content, which the stages after it read."""
-        if stage.name not in self._known:
-            seconds, operations = dict[bool, float](), dict[str, int]()
-            for spread, kind in ((True, "disk full"), (False, "read fails")):
-                self.prepare(stage)
-                self.arm(kind, -1)
-                ended = self.run(stage, spread)
-                if ended.code != 0:
-                    raise RuntimeError(f"{stage.name} does not run undisturbed: {ended.said[-2000:]}")
-                seconds[spread], operations[STORAGE[kind]] = ended.seconds, self.disarm()
-            content = stage.held(self.here)
-            shutil.copytree(self.here / stage.writes, self._pristine / stage.writes)
-            self._known[stage.name] = Undisturbed(content=content, seconds=seconds, operations=operations)
-        return self._known[stage.name]
-
-
-ENVIRONMENT = {
-    "RAY_AUTH_MODE": "disabled", "RAY_USAGE_STATS_ENABLED": "0", "OMP_WAIT_POLICY": "PASSIVE",
-    "RAY_gcs_rpc_server_reconnect_timeout_s": "5",  # a lost cluster is given up after a minute otherwise
-}  # fmt: skip
-
-
-@contextmanager
-def ground(scratch: Path) -> Iterator[Ground]:
-    """A ground in a folder, with a Ray cluster of its own."""
-    shutil.rmtree(scratch, ignore_errors=True)
-    scratch.mkdir(parents=True)
-    scratch = scratch.resolve()
-    hook = {"CHAOS": str(scratch / "fault.json"), "PYTHONPATH": os.pathsep.join(PATH)}
-    with cluster(2, ENVIRONMENT | hook) as (head, address):
-        made = Ground(scratch, ENVIRONMENT, head, address)
-        try:
-            yield made
-        finally:
-            made.close()
-
-
 def cases(stage: Stage, seed: int) -> list[Case]:
     """One trial of every fault that the stage can meet."""
     kills = [Case(stage=stage, kind=kind, seed=seed) for kind in KILLS]
@@ -199,22 +83,27 @@ def trial(ground: Ground, case: Case) -> Verdict:
     damaged: list[Damaged] = []
     if case.kind in KILLS:
         ground.prepare(stage)
-        _kill(ground, case, rng, usual, verdict)
+        _kill(ground, case, rng, verdict)
     elif case.kind in STORAGE:
         ground.prepare(stage)
         _spoil_operation(ground, case, rng, usual, verdict)
     else:
-        damaged = _damage(ground, case, rng, usual, verdict)
+        damaged = _damage(ground, case, rng, verdict)
     _bring_to_its_end(ground, case, usual, verdict, damaged)
     return verdict
 
 
-def _kill(ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, verdict: Verdict) -> None:
+def _spread(ground: Ground, case: Case, rng: random.Random) -> bool:
+    """Whether Ray's workers do it where one process could."""
+    return not case.stage.alone or (rng.random() < 0.5 and not ground.quick)
+
+
+def _kill(ground: Ground, case: Case, rng: random.Random, verdict: Verdict) -> None:
     """Up to three kills at random moments, of workers; one of the driver or of the cluster."""
-    spread = not case.kind.startswith("driver") or rng.random() < 0.5 or not case.stage.alone
+    spread = not case.kind.startswith("driver") or _spread(ground, case, rng)
     own = case.kind.startswith("cluster")
+    extent = ground.seconds(case.stage, spread) + (6.0 if own else 0.0)
     job = ground.start(case.stage, spread, own_cluster=own)
-    extent = usual.seconds[spread] + (6.0 if own else 0.0)
     for moment in sorted(rng.uniform(0, extent) for _ in range(3 if case.kind.startswith("worker") else 1)):
         if job.wait(moment):
             break
@@ -228,12 +117,12 @@ def _spoil_operation(ground: Ground, case: Case, rng: random.Random, usual: Undi
     count = max(1, usual.operations[STORAGE[case.kind]])
     at = rng.randrange(count)
     ground.arm(case.kind, at)
-    ended = ground.run(case.stage, spread=rng.random() < 0.5 or not case.stage.alone)
-    verdict.faults += ground.disarm() > at
+    ended = ground.run(case.stage, spread=_spread(ground, case, rng))
+    verdict.faults += ground.disarm()[STORAGE[case.kind]] > at
     _judge_run(verdict, ended)
 
 
-def _damage(ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, verdict: Verdict) -> list[Damaged]:
+def _damage(ground: Ground, case: Case, rng: random.Random, verdict: Verdict) -> list[Damaged]:
     """Spoil a file: of the input, before a run or during it; of the finished output; of what a killed run left."""
     stage = case.stage
     ground.prepare(stage, without=case.place != "output")
@@ -242,7 +131,7 @@ def _damage(ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, 
         folder = ground.here / rng.choice(stage.reads)
         job = ground.start(stage, spread=False) if during else None
         if job is not None:
-            job.wait(rng.uniform(0, usual.seconds[False]))
+            job.wait(rng.uniform(0, ground.seconds(stage, False)))
         spoilt = damage(folder, case.kind, rng, PASSED_OVER)
         ended = job.end(ground.patience(case.stage)) if job is not None else ground.run(stage, spread=False)
         _judge_run(verdict, ended)
@@ -250,7 +139,7 @@ def _damage(ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, 
     else:
         if case.place == "unfinished output":
             job = ground.start(stage, spread=False)
-            job.wait(rng.uniform(0.5, 1.0) * usual.seconds[False])
+            job.wait(rng.uniform(0.5, 1.0) * ground.seconds(stage, False))
             strike(job.pid, signal.SIGKILL)
             _judge_run(verdict, job.end(ground.patience(case.stage)))
         spoilt = damage(ground.here / stage.writes, case.kind, rng, PASSED_OVER)
@@ -268,7 +157,7 @@ def _bring_to_its_end(ground: Ground, case: Case, usual: Undisturbed, verdict: V
             verdict.found = verdict.found or "by default"
             _mend(ground, case, ended, damaged)
             continue
-        verdict.restart_seconds = max(0.0, ended.seconds - usual.seconds[False])
+        verdict.restart_seconds = max(0.0, ended.seconds - ground.seconds(stage, False))
         wrong = _differences(ground, stage, usual)
         if not any(wrong):
             verdict.found = verdict.found or ("no difference" if damaged else "")

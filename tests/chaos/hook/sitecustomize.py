@@ -1,7 +1,8 @@
 """Faults of the storage, in every Python process that has this folder on its path and CHAOS in its environment.
 
-CHAOS names a file, as JSON `kind, at, under, counter`: of the operations on files below the folder `under`, counted over all
-processes in the file `counter`, the one with number `at` meets the fault `kind`. Where no such file is, nothing happens.
+CHAOS names a file, as JSON `kind, operation, at, under, counter`: of the operations ("read" or "write") on files below
+the folder `under`, counted over all processes in files beside `counter`, the one with number `at` meets the fault `kind`.
+Where no such file is, nothing happens.
 """
 
 import errno
@@ -23,14 +24,14 @@ def met(operation: str, path: str) -> str | None:
             said = json.load(stream)
     except (OSError, ValueError):
         return None
-    if operation not in said["counts"] or not os.path.abspath(path).startswith(said["under"]):
+    if not os.path.abspath(path).startswith(said["under"]):
         return None
-    with open(said["counter"], "a+") as counter:
+    with open(f"{said['counter']}.{operation}", "a+") as counter:
         fcntl.flock(counter, fcntl.LOCK_EX)
         counter.write(".")
         counter.flush()
         number = counter.tell() - 1
-    return str(said["kind"]) if number == said["at"] else None
+    return str(said["kind"]) if (operation, number) == (said["operation"], said["at"]) else None
 
 
 class Stream:
