@@ -22,6 +22,7 @@ from jobs.run_folder import Checkpoints, Conduct, Run, find_checkpoint, older_na
 from jobs.tally import NotFinite, Tally
 from jobs.train import Settings, train
 from model.checkpoint import Checkpoint, CheckpointError, loads
+from model.pvda import FeatureEncoder
 from model.training import Training
 from pipeline import storage
 from pipeline.records import InputError, Unfinished
@@ -187,7 +188,8 @@ def made(epoch: int, step: int = 0) -> Checkpoint:
     recipe = tiny()
     return Checkpoint(
         network=recipe.network, recipe=json.loads(json.dumps(asdict(recipe))), locations=[], epoch=epoch, step=step,
-        history=[], state={"modules": {}}, running={"x": torch.tensor(0.1)},
+        history=[], state={"modules": {"encoder": FeatureEncoder(recipe.network).state_dict()}},
+        running={"x": torch.tensor(0.1)},
     )  # fmt: skip
 
 

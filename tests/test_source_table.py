@@ -113,7 +113,9 @@ def test_no_position_is_fine_and_neither_is_zero_zero_one(tmp_path: Path) -> Non
 
 def test_paths_may_be_absolute_or_uris_and_remote_ones_are_not_asked_for(tmp_path: Path) -> None:
     images(tmp_path, "1.jpg")
-    text = f"path\n{tmp_path}/1.jpg\nfile://{tmp_path}/1.jpg\ns3://bucket/2.jpg\nfile://{tmp_path}/3.jpg\nnul\0.jpg\n"
+    text = (
+        f"path\n{tmp_path}/1.jpg\nfile://{tmp_path}/1.jpg\nmemory://bucket/2.jpg\nfile://{tmp_path}/3.jpg\nnul\0.jpg\n"
+    )
     (tmp_path / "sub").mkdir()
     found = scan(tmp_path / "sub/t.csv", text)
     assert [f.bytes if isinstance(f, ImageRecord) else f.reason for f in found] == [
