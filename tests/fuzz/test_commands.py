@@ -76,7 +76,7 @@ PATHS = [
     "memory://",
     "http://127.0.0.1:9/x",
     "s3://x/y",
-    "file:///",
+    "file:///nowhere",
     "::",
     "a::b://c",
     "link",
