@@ -10,7 +10,6 @@ from types import FrameType
 from typing import Any
 
 import tyro
-from ray.exceptions import RayError, RayTaskError
 
 from jobs import STOPPED
 from model.checkpoint import CheckpointError
@@ -54,8 +53,8 @@ def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lamb
     except Unfinished as error:
         _say(str(error))
         sys.exit(1)
-    except RayError as error:
-        if isinstance(error, RayTaskError):
+    except Exception as error:
+        if not _is_loss(error):
             raise
         _say(f"lost Ray's cluster or a worker ({type(error).__name__}); run the same command again to go on")
         sys.exit(1)
@@ -65,6 +64,15 @@ def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lamb
         # Ray, interrupted while it starts workers, may wait for them for ever; its processes end with this one.
         threading.Thread(target=_end, args=(code,), daemon=True).start()
         sys.exit(code)
+
+
+def _is_loss(error: Exception) -> bool:
+    """Whether Ray has lost what worked, and not what worked has failed. Of jobs without Ray nothing is imported for it."""
+    if "ray" not in sys.modules:
+        return False
+    from ray.exceptions import RayError, RayTaskError
+
+    return isinstance(error, RayError) and not isinstance(error, RayTaskError)
 
 
 def _end(code: int) -> None:

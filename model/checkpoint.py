@@ -116,8 +116,7 @@ def refuse_damaged(data: bytes, name: str) -> None:
 def _zip_is_whole(data: bytes) -> tuple[bool, str]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as held:
-            if any(member.compress_type != zipfile.ZIP_STORED for member in held.infolist()):
-                return False, "it is compressed, and torch compresses nothing"
+            torch_files.refuse_packed(held, len(data))
             bad = held.testzip()
     except Exception as error:  # zipfile raises many kinds over a damaged directory
         return False, f"{type(error).__name__}"

@@ -15,13 +15,20 @@ def read(data: bytes) -> Any:
     """What `torch.save` wrote. Raises ValueError, and whatever torch does."""
     if zipfile.is_zipfile(io.BytesIO(data)):
         with zipfile.ZipFile(io.BytesIO(data)) as parts:
-            held = parts.infolist()
-        # torch writes them as they are: a record that inflates may be of any size, and so may many that overlap.
-        if any(part.compress_type != zipfile.ZIP_STORED for part in held) or sum(p.file_size for p in held) > len(data):
-            raise ValueError("it is packed in another way than torch does")
+            refuse_packed(parts, len(data))
     found = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     refuse_hollow(found)
     return found
+
+
+def refuse_packed(parts: zipfile.ZipFile, size: int) -> None:
+    """Raise ValueError where a zip of `size` bytes holds more than these.
+
+    torch writes records as they are: one that inflates may be of any size, and so may many that overlap.
+    """
+    held = parts.infolist()
+    if any(part.compress_type != zipfile.ZIP_STORED for part in held) or sum(part.file_size for part in held) > size:
+        raise ValueError("it is packed in another way than torch does")
 
 
 def refuse_hollow(value: Any) -> None:

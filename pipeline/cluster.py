@@ -37,8 +37,9 @@ def connect() -> None:
             ray.init(log_to_driver=False, logging_level=logging.WARNING)
     except Exception as error:  # Ray raises ConnectionError, RuntimeError, ValueError and plain Exception here
         asked = f"at {address}" if (address := os.environ.get("RAY_ADDRESS")) else "on this machine"
+        why = str(error).strip().partition("\n")[0] or type(error).__name__
         raise Unfinished(
-            f"found no Ray cluster {asked}, and none could be started ({str(error).strip().splitlines()[0]}); expected one "
+            f"found no Ray cluster {asked}, and none could be started ({why}); expected one "
             "that answers; see to it, or unset RAY_ADDRESS so that one is started here, and run the same command again"
         ) from error
 

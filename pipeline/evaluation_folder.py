@@ -38,11 +38,10 @@ def read_inputs(folder: str) -> dict[str, Any] | None:
 
 def is_whole(folder: str, inputs: Mapping[str, Any]) -> bool:
     """Whether every list and the queries' rows of a finished evaluation are what was written."""
-    try:
-        parquet_files.refuse_damaged(storage.join(folder, RESULTS))
-    except parquet_files.DAMAGE:
-        return False
-    return all((data := _bytes(folder, name)) and _hash(data) == said for name, said in inputs.get(FILES, {}).items())
+    lists = inputs.get(FILES, {}).items()
+    return parquet_files.is_whole(storage.join(folder, RESULTS)) and all(
+        (data := _bytes(folder, name)) and _hash(data) == said for name, said in lists
+    )
 
 
 def read_rows(folder: str, name: str) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ from typing import IO, Any, cast
 
 from pipeline import storage
 from pipeline.progress import console, progress
-from pipeline.records import InputError, Split, View, is_place, make_key
+from pipeline.records import InputError, Split, View, as_text, is_place, make_key
 from pipeline.shards import MANIFEST, Manifest, Shard, read_manifest
 from pipeline.tars import IMAGES, HashedStream, read_members
 
@@ -81,9 +81,7 @@ def facts_of(key: str, said: Mapping[str, Any], label: bytes | None, split: Spli
         (str(said[name]) for name in LOCATIONS if isinstance(said.get(name), str | int) and said[name] != ""), ""
     )
     location = named or (label or b"").decode(errors="replace").strip() or folder.rpartition("/")[2] or key
-    location = location.encode(
-        "utf-8", "backslashreplace"
-    ).decode()  # JSON and names of files may hold half a character
+    location = as_text(location)  # JSON and names of files may hold half a character
     return {
         "key": make_key(split, view, location, key), "location": location, "view": view, "split": split,
         "geotag": _position(said) or (_position(said["geotag"]) if isinstance(said.get("geotag"), dict) else None),

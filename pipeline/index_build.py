@@ -176,25 +176,24 @@ def finish(out: str, facts: IndexFacts, held: Held, workshop: Workshop, start: f
 
 
 def _finished(out: str, table: FeatureTable, asked: dict[str, Any], whole: bool) -> IndexFacts | None:
-    """A finished index of the same rows and settings; None where it was one and is to be built again. `whole`: every byte is
-    looked at.
+    """A finished index of the same rows and settings; None where it was one, is damaged, and is to be built again.
 
-    Raises InputError where it is another's.
+    `whole`: every byte is looked at. Raises InputError where it is another's.
     """
     told = read_facts(out)
     held = told.table_parts
     missing = rows_by_part(table.only([name for name in table.parts if name not in held]))
     if told.asked == asked and told.fingerprint == table.fingerprint and held.items() <= table.shards.items():
-        if not missing and _is_whole(out, told, whole):
+        if missing:
+            raise InputError(
+                f"{out} holds an index of {len(held)} parts of the table, which has {len(missing)} more by now; say --extend "
+                "to add them, or choose another --out"
+            )
+        if _is_whole(out, told, whole):
             console.print(f"{out} is complete: {told.rows} rows, {told.factory}; nothing to do")
             return told
-        if not missing:
-            storage.remove(storage.join(out, FACTS))
-            return None
-        raise InputError(
-            f"{out} holds an index of {len(held)} parts of the table, which has {len(missing)} more by now; say --extend to "
-            "add them, or choose another --out"
-        )
+        storage.remove(storage.join(out, FACTS))
+        return None
     raise InputError(f"{out} holds an index of other rows or settings; choose another --out or delete it")
 
 
@@ -204,13 +203,11 @@ def _is_whole(out: str, told: IndexFacts, whole: bool) -> bool:
     Raises InputError where not, and building again would not give the same index.
     """
     try:
-        for files in (told.trained, *(part.files for part in told.parts)):
+        for files in told.files:
             check_files(out, files, whole)
     except InputError as error:
-        if any(part.removed for part in told.parts):
-            raise InputError(
-                f"{error}, and remove the {sum(len(part.removed) for part in told.parts)} locations again"
-            ) from None
+        if removed := sum(len(part.removed) for part in told.parts):
+            raise InputError(f"{error}, and remove the {removed} locations again") from None
         console.print(f"{out}: a file is missing or not what was written; the index is built again", style="yellow")
         return False
     return True

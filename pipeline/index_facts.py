@@ -89,6 +89,11 @@ class IndexFacts:
     schema_version: int = field(default=SCHEMA_VERSION)
 
     @property
+    def files(self) -> tuple[dict[str, dict[str, Any]], ...]:
+        """The files of the trained index, and of each part."""
+        return self.trained, *(part.files for part in self.parts)
+
+    @property
     def table_parts(self) -> dict[str, str]:
         """All parts of the table that it holds, in the order of its rows, each with its shard's hash."""
         return {name: shard for part in self.parts for name, shard in part.table_parts.items()}
@@ -119,15 +124,14 @@ def read_facts(folder: str) -> IndexFacts:
             raise InputError(f"{path} is of version {said['schema_version']}, expected {SCHEMA_VERSION}; {AGAIN}")
         own = {name: said.pop(name) for name in IndexFacts.__dataclass_fields__ if name != "measured"}
         facts = as_told(IndexFacts, {**own, "measured": said})
-        held = (name for part in facts.parts for name in (*part.files, *part.table_parts, part.faiss, part.ids))
-        named = [*facts.trained, *held]
+        listed = (name for files in facts.files for name in files)
+        named = [*listed, *facts.table_parts, *(name for part in facts.parts for name in (part.faiss, part.ids))]
         if strange := next((name for name in named if not is_file_name(name)), None):
             raise ValueError(f"a file called {excerpt(strange)}")
         effort = facts.effort
         if min(facts.rows, facts.dimension, effort.breadth, effort.candidates, facts.unit_rows, facts.part_rows) < 1:
             raise ValueError("a count below 1")
-        files = [file for held in (facts.trained, *(part.files for part in facts.parts)) for file in held.values()]
-        if not all({"bytes", "sha256"} <= file.keys() for file in files):
+        if not all({"bytes", "sha256"} <= file.keys() for files in facts.files for file in files.values()):
             raise ValueError("a file without size or hash")
         return facts
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:

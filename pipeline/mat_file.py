@@ -54,7 +54,7 @@ def main() -> int:
         plain |= {name: _texts(said[name]) for name in PATHS if name in said}
         names = np.array([name for name in said if not name.startswith("__")], np.str_)
         np.savez(sys.stdout.buffer, **{NAMES: names}, **plain)  # type: ignore[arg-type]
-    except NotImplementedError:
+    except NotImplementedError:  # scipy's word for MATLAB 7.3
         return HDF5
     except Exception as error:  # the reader raises whatever the damage leads it to
         print(" ".join(str(error).split()) or type(error).__name__, file=sys.stderr)

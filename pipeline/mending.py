@@ -27,12 +27,13 @@ def damaged_shards(out: str, manifest: Manifest) -> list[Shard]:
     return [shard for shard in manifest.shards if shard.name in wrong or f"{shard.name}.parquet" not in parts]
 
 
-def mend(source: Source, out: str, manifest: Manifest, records: Iterable[ImageRecord]) -> int:
-    """Make the damaged shards anew whose images are among the records; returns how many. The others' note stays.
+def mend(
+    source: Source, out: str, manifest: Manifest, damaged: Sequence[Shard], records: Iterable[ImageRecord]
+) -> None:
+    """Make the damaged shards anew whose images are among the records. The others' note stays.
 
     Raises InputError where some are left, with the commands that packed the set.
     """
-    damaged = damaged_shards(out, manifest)
     left: list[Shard] = []
     for plan, shard in _plans(out, manifest, damaged, records):
         if plan is None or not _write(source, out, shard, plan):
@@ -45,7 +46,6 @@ def mend(source: Source, out: str, manifest: Manifest, records: Iterable[ImageRe
             f"packed from; expected that of {commands(manifest)}; run these again as they were run, or put the tars and their "
             "record parts back from a copy"
         )
-    return len(damaged)
 
 
 def commands(manifest: Manifest) -> str:
@@ -106,8 +106,4 @@ def _write(source: Source, out: str, shard: Shard, plan: ShardPlan) -> bool:
 
 def whole_part(out: str, name: str) -> bool:
     """Whether every byte of a record part is what was written."""
-    try:
-        parquet_files.refuse_damaged(storage.join(out, FOLDER, f"{name}.parquet"))
-    except parquet_files.DAMAGE:
-        return False
-    return True
+    return parquet_files.is_whole(storage.join(out, FOLDER, f"{name}.parquet"))

@@ -18,11 +18,11 @@ from pipeline.exclusive import one_at_a_time
 from pipeline.extension import new_records, next_numbers
 from pipeline.mending import damaged_shards, mend, whole_part
 from pipeline.progress import console, progress
-from pipeline.records import ImageRecord, InputError, Rejection, Split, Unfinished, is_text
+from pipeline.records import ImageRecord, InputError, Rejection, Split, Unfinished, as_text, is_text
 from pipeline.shard_plan import ShardPlan, ShardSize, plan_shards
 from pipeline.shard_records import FOLDER, Packed, read_packed, read_part
 from pipeline.shard_writing import UNREADABLE, Check, write_shard
-from pipeline.shards import MANIFEST, Manifest, note_damaged, noted_damaged, read_manifest
+from pipeline.shards import MANIFEST, Manifest, Shard, note_damaged, noted_damaged, read_manifest
 from pipeline.sources import name_of
 from pipeline.sources.source import Source
 
@@ -82,14 +82,14 @@ def pack(source: Source, settings: PackingSettings) -> Manifest:
     Raises InputError on unusable input, TooManyRejected when more than `max_bad_fraction` of the images are refused.
     """
     began, out, said = time.monotonic(), storage.absolute(settings.out), describe(source, settings)
-    before = finished(settings, said)
-    damaged = [] if before is None else damaged_shards(out, before)
+    before, damaged = finished(settings, said)
     if before is not None and not settings.extend and not damaged:
         console.print(f"{settings.out} is complete: {len(before.shards)} shards; nothing to do")
         return before
     haul = gather(source, storage.absolute(settings.root))  # workers may stand in another folder
     if before is not None and damaged:
-        console.print(f"{settings.out}: {mend(source, out, before, haul.records)} damaged shards were made anew")
+        mend(source, out, before, damaged, haul.records)
+        console.print(f"{settings.out}: {len(damaged)} damaged shards were made anew")
         if not settings.extend:
             return before
     if before is not None:
@@ -131,8 +131,8 @@ def describe(source: Source, settings: PackingSettings) -> dict[str, Any]:
     return {"source": name_of(source), **flags, "root": storage.absolute(settings.root), **packing}
 
 
-def finished(settings: PackingSettings, said: dict[str, Any]) -> Manifest | None:
-    """The manifest of the set in `out`, where there is a whole one; with damaged shards, where it is to be mended.
+def finished(settings: PackingSettings, said: dict[str, Any]) -> tuple[Manifest | None, list[Shard]]:
+    """The manifest of the set in `out`, where there is one to be left, extended or mended, and its damaged shards.
 
     Raises InputError when it is another set than the settings ask for, or when there is nothing that could be extended.
     """
@@ -142,19 +142,19 @@ def finished(settings: PackingSettings, said: dict[str, Any]) -> Manifest | None
             raise InputError(
                 f"{out} holds no finished set of shards; expected one to extend; pack it without --extend first"
             )
-        return None
+        return None, []
     manifest = read_manifest(out)
     if not settings.extend and manifest.packing != said:
         changed = ", ".join(name for name in said if manifest.packing.get(name) != said[name])
         raise InputError(
             f"{out} holds shards packed with another {changed}; choose another --out, delete it, or add to it with --extend"
         )
-    damaged, listed = damaged_shards(out, manifest), rejects.is_whole(out, manifest.rejected)
-    if (not damaged and listed) or settings.extend or manifest.added:
-        return manifest
+    damaged = damaged_shards(out, manifest)
+    if settings.extend or manifest.added or (not damaged and rejects.is_whole(out, manifest.rejected)):
+        return manifest, damaged
     wrong = f"{len(damaged)} shards are" if damaged else f"{rejects.FILE} is"
     console.print(f"{out}: {wrong} missing or damaged; what is not whole is packed again")
-    return None
+    return None, []
 
 
 def gather(source: Source, root: str) -> Haul:
@@ -164,7 +164,7 @@ def gather(source: Source, root: str) -> Haul:
     for found in source.scan(root):
         name = found.path if isinstance(found, Rejection) else f"{found.name}{found.location}"
         if not is_text(name):
-            told = found.path.encode("utf-8", "backslashreplace").decode()
+            told = as_text(found.path)
             rejected.append(Rejection(path=told, reason="name is not UTF-8", found=told.rsplit("/", 1)[-1]))
         elif isinstance(found, Rejection):
             rejected.append(found)

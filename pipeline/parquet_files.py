@@ -100,6 +100,15 @@ def refuse_damaged(path: str) -> bool:
     return True
 
 
+def is_whole(path: str) -> bool:
+    """Whether `refuse_damaged` has nothing against a file."""
+    try:
+        refuse_damaged(path)
+    except DAMAGE:
+        return False
+    return True
+
+
 def _seal(stream: IO[bytes]) -> None:
     begin, footer = _footer(stream)
     body = _hash(stream, begin)

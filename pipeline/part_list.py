@@ -14,7 +14,9 @@ LIST = "_parts.json"
 
 def promise(table: str, names: Iterable[str]) -> None:
     """These parts, besides those that were promised before, are the table's."""
-    _write(table, {*_read(table, mending=True), *names})
+    known = set(_read(table, mending=True))
+    if not known.issuperset(promised := set(names)):
+        _write(table, known | promised)
 
 
 def give_up(table: str, names: Iterable[str]) -> None:
@@ -50,5 +52,4 @@ def _read(table: str, mending: bool = False) -> list[str]:
 
 
 def _write(table: str, names: set[str]) -> None:
-    if names != set(_read(table, mending=True)):
-        sealed.write(storage.join(table, LIST), {"parts": sorted(names)})
+    sealed.write(storage.join(table, LIST), {"parts": sorted(names)})

@@ -85,8 +85,10 @@ class ImageRecord:
 
 LONGEST_KEY = 90
 "A tar header of the oldest kind holds names of 100 characters, ending included."
-
-
+LONGEST_EXCERPT = 200
+"Characters of a damaged value that are shown."
+LONGEST_FOUND = 600
+"Characters of what was found that are written down."
 KEY = re.compile(rf"[a-z0-9_-]{{1,{LONGEST_KEY}}}")
 "What a key looks like."
 
@@ -98,6 +100,11 @@ def is_text(name: str) -> bool:
     except UnicodeEncodeError:
         return False
     return True
+
+
+def as_text(name: str) -> str:
+    """The name with what cannot be written down spelled out."""
+    return name.encode("utf-8", "backslashreplace").decode()
 
 
 def is_place(lat: object, lon: object) -> bool:
@@ -130,12 +137,6 @@ def key_names(key: str, split: Split, view: View, location: str) -> bool:
     return key.startswith(begin[: LONGEST_KEY - 9])
 
 
-LONGEST_EXCERPT = 200
-"Characters of a damaged value that are shown."
-LONGEST_FOUND = 600
-"Characters of what was found that are written down."
-
-
 @dataclass(frozen=True, kw_only=True)
 class Rejection:
     """An image that was refused, and why."""
@@ -147,7 +148,7 @@ class Rejection:
     "What this file held, for the person who mends it; cut where it is longer than LONGEST_FOUND."
 
     def __post_init__(self) -> None:
-        found = self.found if is_text(self.found) else self.found.encode("utf-8", "backslashreplace").decode()
+        found = as_text(self.found)
         if len(found) > LONGEST_FOUND:  # a damaged file may hold a megabyte where a number was expected
             found = f"{found[: LONGEST_FOUND - 3]}..."
         object.__setattr__(self, "found", found)

@@ -33,9 +33,8 @@ def is_whole(folder: str, count: int) -> bool:
     """Whether the list is there, every byte as it was written, with so many images."""
     path = storage.join(folder, FILE)
     try:
-        parquet_files.refuse_damaged(path)
-        return len(_read(path)) == count
-    except (*parquet_files.DAMAGE, InputError):
+        return parquet_files.is_whole(path) and len(_read(path)) == count
+    except InputError:  # of one without a seal
         return False
 
 

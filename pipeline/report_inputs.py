@@ -97,25 +97,21 @@ def read_findings(folder: str) -> Findings:
             f"{path} cannot be read ({error}), expected the rows of a finished evaluation; delete {folder} and evaluate again "
             "with jobs/evaluate.py"
         ) from None
-    metrics, besides = read_rows(folder, METRICS), read_besides(folder)
-    rows = [row for held in besides.values() for row in held]
-    if (
-        not set(results.column_names) >= COLUMNS
-        or not all(_is_measured(row) for row in metrics)
-        or not all(isinstance(row, dict) for row in rows)
-    ):
+    metrics = read_rows(folder, METRICS)
+    if not set(results.column_names) >= COLUMNS or not all(_is_measured(row) for row in metrics):
         raise InputError(
             f"the evaluation at {folder} holds rows or columns that jobs/evaluate.py does not write; delete {folder} and "
             "evaluate again with jobs/evaluate.py"
         )
-    return Findings(name=folder.rstrip("/").rsplit("/", 1)[-1], metrics=metrics, results=results, **besides)
+    return Findings(
+        name=folder.rstrip("/").rsplit("/", 1)[-1], metrics=metrics, results=results, **read_besides(folder)
+    )
 
 
-def _is_measured(row: Any) -> bool:
+def _is_measured(row: dict[str, Any]) -> bool:
     """Whether this is a row of metrics.json as whoever compares and shows them needs it."""
     return (
-        isinstance(row, dict)
-        and all(isinstance(row.get(name), str) for name in ("task", "protocol"))
+        all(isinstance(row.get(name), str) for name in ("task", "protocol"))
         and all(type(row.get(name)) is int for name in ("queries", "gallery"))
         and all(type(row.get(name)) in (int, float) for name in ("r1", "r5", "r10", "r1p", "ap"))
         and isinstance(row.get("multi_query"), bool)

@@ -55,12 +55,8 @@ def read_members(stream: IO[bytes], path: str, endings: tuple[str, ...]) -> Iter
                 file = tar.extractfile(member)
                 assert file is not None  # of a regular file there is one
                 held[ending.lower()] = file.read()
-    except (
-        tarfile.TarError,
-        EOFError,
-        ValueError,
-        RecursionError,
-    ) as error:  # the last two: of headers that make no sense
+    # The last two are of headers that make no sense.
+    except (tarfile.TarError, EOFError, ValueError, RecursionError) as error:
         raise InputError(
             f"{path} is cut off or damaged after {samples} samples ({error}), expected a whole tar; copy it again from where "
             "it came from, or pack again with jobs/make_shards.py"

@@ -1,6 +1,7 @@
 """Every job as a stranger calls it: help, the whole road by command lines, again on finished output, and wrong calls."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +20,9 @@ JOBS = [
 
 def call(job: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(ROOT / "jobs" / f"{job}.py"), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    # An environment of its own: without one the new process is given the C library's, which others of our threads may be
+    # writing, and once in thousands of calls could not be started (EFAULT).
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=dict(os.environ))
 
 
 @pytest.fixture(scope="module")

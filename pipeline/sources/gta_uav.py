@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from pipeline import storage
-from pipeline.records import ImageRecord, InputError, Rejection, Split, View
+from pipeline.records import LONGEST_EXCERPT, ImageRecord, InputError, Rejection, Split, View
 from pipeline.sources.folders import checked, wrong_folder
 from pipeline.sources.source import Source, is_image, not_an_image
-from pipeline.sources.tables import LONGEST_EXCERPT, Unreadable, number
+from pipeline.sources.tables import Unreadable, number
 
 LAYOUT = "GTA-UAV's root, which holds drone/images/, satellite/ and <area>-area-drone2sate-{train,test}.json"
 DRONE, SATELLITE = "drone/images", "satellite"

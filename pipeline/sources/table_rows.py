@@ -127,9 +127,8 @@ def _parquet(path: str) -> Iterator[Row]:
                     yield dict(zip(columns, cells, strict=True))
         except InputError:
             raise
-        except (
-            Exception
-        ) as error:  # pyarrow raises whatever a damaged file, a date of no calendar or a time zone leads it to
+        # pyarrow's, of any kind: damage, a date of no calendar, a time zone that nobody knows.
+        except Exception as error:
             raise InputError(
                 f"{path} cannot be read as Parquet ({error}); expected a Parquet file; write it again"
             ) from None
@@ -149,16 +148,9 @@ def _is_plain(kind: Any) -> bool:
     if of.is_dictionary(kind):
         return _is_plain(kind.value_type)
     tests = (
-        of.is_string,
-        of.is_large_string,
-        of.is_integer,
-        of.is_floating,
-        of.is_boolean,
-        of.is_decimal,
-        of.is_null,
-        of.is_date,
+        of.is_string, of.is_large_string, of.is_integer, of.is_floating, of.is_boolean, of.is_decimal, of.is_null, of.is_date,
         of.is_timestamp,
-    )
+    )  # fmt: skip
     return any(test(kind) for test in tests)
 
 

@@ -11,12 +11,10 @@ import re
 from collections.abc import Iterable, Iterator
 
 from pipeline import storage
-from pipeline.records import InputError, Rejection
+from pipeline.records import LONGEST_EXCERPT, InputError, Rejection
 
 NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 "In one way only: what could be matched in two takes the square of a long cell's length to refuse."
-LONGEST_EXCERPT = 200
-"Characters of a damaged line that are shown."
 
 
 class Unreadable(ValueError):
