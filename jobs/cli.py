@@ -6,12 +6,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 import tyro
 
 from jobs import STOPPED
+from jobs.interrupts import interruptible
 from model.checkpoint import CheckpointError
 from pipeline.progress import console
 from pipeline.records import InputError, Unfinished
@@ -31,42 +31,37 @@ def run(job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lamb
         tyro.conf.CascadeSubcommandArgs,  # flags may stand before or after a recipe's name
         tyro.conf.EnumChoicesFromValues,  # `--view drone`
     )  # fmt: skip
-    received: list[int] = []  # Ray makes a plain KeyboardInterrupt of whatever a handler raises while it waits
-
-    def terminate(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-        raise KeyboardInterrupt
-
-    if threading.current_thread() is threading.main_thread():
-        # It ends a job as Ctrl-C does: what is done stays, Ray's processes go with it.
-        signal.signal(signal.SIGTERM, terminate)
-    try:
-        tyro.cli(job, args=reword(sys.argv[1:]), config=config)
-    except (InputError, CheckpointError) as error:
-        _say(str(error))
-        sys.exit(2)
-    except OSError as error:  # the system's word: no right to, no room for, a folder for a file
-        where = f"{error.filename}: " if error.filename else ""
-        asked = "check the path, its rights and the room on its disk, and run the same command again to go on"
-        _say(f"{where}{error.strerror or error}; {asked}")
-        sys.exit(1)
-    except Unfinished as error:
-        _say(str(error))
-        sys.exit(1)
-    except Exception as error:
-        if not _is_loss(error):
-            raise
-        _say(f"lost Ray's cluster or a worker ({type(error).__name__}); run the same command again to go on")
-        sys.exit(1)
-    except KeyboardInterrupt:
-        console.print(STOPPED)
-        code = 128 + (received or [signal.SIGINT])[0]  # as shells count
-        # Ray, interrupted while it starts workers, may wait for them for ever; its processes end with this one.
-        threading.Thread(target=_end, args=(code,), daemon=True).start()
-        sys.exit(code)
+    with interruptible() as received:
+        try:
+            tyro.cli(job, args=reword(sys.argv[1:]), config=config)
+        except (InputError, CheckpointError) as error:
+            _say(str(error))
+            sys.exit(2)
+        except OSError as error:  # the system's word: no right to, no room for, a folder for a file
+            where = f"{error.filename}: " if error.filename else ""
+            asked = "check the path, its rights and the room on its disk, and run the same command again to go on"
+            _say(f"{where}{error.strerror or error}; {asked}")
+            sys.exit(1)
+        except Unfinished as error:
+            _say(str(error))
+            sys.exit(1)
+        except (Exception, KeyboardInterrupt) as error:
+            if received or isinstance(error, KeyboardInterrupt):  # libraries make other errors of it
+                _stop(128 + (received or [signal.SIGINT])[0])  # as shells count
+            if not _is_loss(error):
+                raise
+            _say(f"lost Ray's cluster or a worker ({type(error).__name__}); run the same command again to go on")
+            sys.exit(1)
 
 
-def _is_loss(error: Exception) -> bool:
+def _stop(code: int) -> NoReturn:
+    console.print(STOPPED)
+    # Ray, interrupted while it starts workers, may wait for them for ever; its processes end with this one.
+    threading.Thread(target=_end, args=(code,), daemon=True).start()
+    sys.exit(code)
+
+
+def _is_loss(error: BaseException) -> bool:
     """Whether Ray has lost what worked, and not what worked has failed. Of jobs without Ray nothing is imported for it."""
     if "ray" not in sys.modules:
         return False

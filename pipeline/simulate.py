@@ -29,6 +29,9 @@ from pipeline.worlds.layout import Job, Role, make_location, part, write_tables
 from pipeline.worlds.location import Order
 from pipeline.worlds.texture import usable_textures
 
+MOST_LOCATIONS, MOST_VIEWS = 1_000_000, 10_000
+"Beyond any use: a slip of the keyboard would fill the memory with plans before it fills the disk."
+
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationSettings:
@@ -57,13 +60,19 @@ class SimulationSettings:
         for name in ("train_locations", "test_locations", "distractors", "seed"):
             if getattr(self, name) < 0:
                 raise InputError(f"--{name.replace('_', '-')} is {getattr(self, name)}; expected 0 or more")
-        if self.train_locations + self.test_locations + self.distractors == 0:
+        if (asked := self.train_locations + self.test_locations + self.distractors) > MOST_LOCATIONS:
+            raise InputError(
+                f"{asked} locations asked for; expected at most {MOST_LOCATIONS}; make several sets of them"
+            )
+        if asked == 0:
             raise InputError("no locations asked for; expected one or more; set --train-locations or --test-locations")
         if self.views < 1:
             raise InputError(f"--views is {self.views}; expected 1 or more; University-1652 has 54")
+        if self.views > MOST_VIEWS:
+            raise InputError(f"--views is {self.views}; expected at most {MOST_VIEWS}; University-1652 has 54")
         if not 32 <= self.size <= 1024:
             raise InputError(f"--size is {self.size}; expected 32 to 1024 pixels; University-1652 has 512")
-        if not self.texture_metres_per_pixel > 0:
+        if not 0 < self.texture_metres_per_pixel < float("inf"):
             raise InputError(f"--texture-metres-per-pixel is {self.texture_metres_per_pixel}; expected more than 0")
 
 
@@ -80,6 +89,7 @@ def simulate(settings: SimulationSettings) -> Path:
     textures, passed_over = usable_textures(storage.absolute(settings.textures)) if settings.textures else ([], 0)
     described = _describe(settings, textures)
     if _is_complete(root, described):
+        shutil.rmtree(root / ".parts", ignore_errors=True)  # of a run that was killed between its last two steps
         console.print(f"{root} is complete already; nothing to do")
         return root
     jobs = plan(settings, str(root), textures)

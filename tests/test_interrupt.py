@@ -39,7 +39,7 @@ JOBS = {  # the command; what there is, below the folder, once its work has begu
     ),
     "embed_gallery": ("--shards {packed} --checkpoint {net} --out {out}", "out/*.parquet"),
     "build_index": ("--table {table} --out {out} --factory IVF16,Flat", "out/_building/*"),
-    "evaluate": ("--table {table} --out {out}", "said:ranking"),
+    "evaluate": ("--table {both} --shards {shards} --out {out} --figures png pdf", "said:drone->satellite"),
     "locate": ("--checkpoint {net} --index {index} --out {out}/a.geojson {photos}", "said:not calibrated"),
 }  # fmt: skip
 NORMALLY = [("make_shards here", signal.SIGINT, True), ("train here", signal.SIGTERM, False)]
@@ -76,6 +76,7 @@ def prepared(things: dict[str, Path], wanted: str) -> Path:
         steps = {
             "packed": ("make_shards", "--source photos --root {photos} --out {packed} --samples-per-shard 5 --workers 0"),
             "table": ("embed_gallery", "--shards {packed} --checkpoint {net} --out {table}"),
+            "both": ("embed_gallery", "--shards {shards} --checkpoint {net} --out {both}"),
             "index": ("build_index", "--table {table} --out {index} --factory Flat"),
         }  # fmt: skip
         job, words = steps[wanted]
@@ -85,7 +86,7 @@ def prepared(things: dict[str, Path], wanted: str) -> Path:
 
 
 def told(words: str, things: dict[str, Path]) -> list[str]:
-    wanted = [name for name in ("packed", "table", "index") if f"{{{name}}}" in words]
+    wanted = [name for name in ("packed", "table", "both", "index") if f"{{{name}}}" in words]
     known = {name: str(path) for name, path in things.items()}
     known |= {
         name: str(things["folder"] / name) if f"--out {{{name}}}" in words else str(prepared(things, name))

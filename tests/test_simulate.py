@@ -154,6 +154,8 @@ def test_textures_are_dealt_out_one_each_and_too_few_are_refused(
     ("wrong", "said"),
     [
         ({"views": 0}, "--views is 0; expected 1 or more"),
+        ({"views": 54_000}, "--views is 54000; expected at most 10000"),
+        ({"distractors": 160_000_000}, "locations asked for; expected at most 1000000"),
         ({"size": 4000}, "--size is 4000; expected 32 to 1024 pixels"),
         ({"train_locations": -1}, "--train-locations is -1; expected 0 or more"),
         ({"train_locations": 0, "test_locations": 0, "distractors": 0}, "no locations asked for"),

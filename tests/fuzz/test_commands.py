@@ -217,11 +217,8 @@ def line(draw: st.DrawFn) -> tuple[str, list[str]]:
         told += ["--train-locations", "1", "--test-locations", "1", "--distractors", "1"] if draw(st.booleans()) else []
     if name in ("locate", "compare"):
         told += draw(st.lists(st.sampled_from(PATHS[:-1]), max_size=2))
-        told += (
-            ["--near", *draw(st.lists(st.sampled_from(NUMBERS), min_size=3, max_size=3))]
-            if not draw(st.integers(0, 4))
-            else []
-        )
+        if not draw(st.integers(0, 4)):
+            told += ["--near", *draw(st.lists(st.sampled_from(NUMBERS), min_size=3, max_size=3))]
     return name, told
 
 
