@@ -16,7 +16,7 @@ from statistics import median
 
 import tyro
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "chaos"))
+sys.path.extend(str(Path(__file__).parents[1] / "tests" / folder) for folder in ("", "chaos"))
 
 from campaign import Verdict, cases, trial
 from grounds import ground

@@ -9,7 +9,8 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ import torch
 from PIL import Image
 
 from jobs import STOPPED
+from jobs.interrupts import SECONDS_TO_REPEAT, interruptible
 from jobs.recipes import smoke
 from model.checkpoint import Checkpoint, dumps
 from model.pvda import FeatureEncoder
@@ -49,6 +51,34 @@ CASES = [
     for number, group in ((signal.SIGINT, True), (signal.SIGINT, False), (signal.SIGTERM, False))
 ]
 Caller = Callable[..., "subprocess.Popen[bytes]"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _hearing_ctrl_c() -> Iterator[None]:
+    """What runs in a shell's background has Ctrl-C ignored, and so has all that it starts."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_a_signal_that_a_library_drops_is_raised_again() -> None:
+    with interruptible() as received, pytest.raises(KeyboardInterrupt):  # noqa: PT012
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+        time.sleep(20)
+    assert received == [signal.SIGTERM]
+
+
+def test_what_tidies_up_after_a_signal_is_left_in_peace() -> None:
+    tidy = False
+    with interruptible(), pytest.raises(KeyboardInterrupt):  # noqa: PT012
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            with suppress(OSError):
+                time.sleep(3 * SECONDS_TO_REPEAT)
+            tidy = True
+    assert tidy
 
 
 @pytest.fixture(scope="module")

@@ -1,17 +1,18 @@
 """Every job as a stranger calls it: help, the whole road by command lines, again on finished output, and wrong calls."""
 
 import json
-import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator
 from pathlib import Path
 
 import faiss
 import pytest
+from launcher import Launcher
 
 ROOT = Path(__file__).parent.parent
+PATIENCE = 300.0
+"Seconds that a call may take."
 JOBS = [
     "simulate", "make_shards", "train", "embed_gallery", "build_index", "evaluate", "import_weights", "calibrate", "locate",
     "demo",
@@ -20,29 +21,22 @@ JOBS = [
 
 def call(job: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(ROOT / "jobs" / f"{job}.py"), *map(str, arguments)]
-    # An environment of its own: without one the new process is given the C library's, which others of our threads may be
-    # writing, and once in thousands of calls could not be started (EFAULT).
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=dict(os.environ))
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
 
 
 @pytest.fixture(scope="module")
-def both_cores() -> Iterator[ThreadPoolExecutor]:
-    """Calls that have nothing to do with each other are made by twos: most of each is Python's start."""
-    with ThreadPoolExecutor(2) as pool:
-        yield pool
-
-
-@pytest.fixture(scope="module")
-def helped(both_cores: ThreadPoolExecutor) -> Mapping[str, "Future[subprocess.CompletedProcess[str]]"]:
-    """Every job's answer to --help."""
-    return {job: both_cores.submit(call, job, "--help") for job in JOBS}
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Launcher]:
+    """Starts jobs whose libraries are imported already: most of a short call is that."""
+    launcher = Launcher(tmp_path_factory.mktemp("launcher"), {})
+    yield launcher
+    launcher.close()
 
 
 @pytest.mark.parametrize("job", JOBS)
-def test_every_job_has_help(helped: Mapping[str, "Future[subprocess.CompletedProcess[str]]"], job: str) -> None:
-    done = helped[job].result()
-    assert done.returncode == 0
-    assert "--out" in done.stdout
+def test_every_job_has_help(prepared: Launcher, job: str) -> None:
+    ended = prepared.start(job, ["--help"]).end(PATIENCE)
+    assert ended.code == 0
+    assert "--out" in ended.said
 
 
 def test_every_job_runs_as_a_module_too() -> None:
@@ -78,32 +72,19 @@ WRONG: list[tuple[str, list[str], str]] = [
 ]  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def refused(
-    both_cores: ThreadPoolExecutor, tmp_path_factory: pytest.TempPathFactory
-) -> Sequence[tuple[Path, "Future[subprocess.CompletedProcess[str]]"]]:
-    """The answers to the wrong calls, each with the folder that it was made in."""
-    folders = [tmp_path_factory.mktemp("wrong") for _ in WRONG]
-    return [
-        (folder, both_cores.submit(call, job, *(argument.format(folder) for argument in arguments)))
-        for folder, (job, arguments, _) in zip(folders, WRONG, strict=True)
-    ]
-
-
-@pytest.mark.parametrize("number", range(len(WRONG)), ids=[f"{job}: {said}" for job, _, said in WRONG])
+@pytest.mark.parametrize(("job", "arguments", "said"), WRONG, ids=[f"{job}: {said}" for job, _, said in WRONG])
 def test_a_wrong_call_gets_a_sentence_and_exit_code_2(
-    refused: Sequence[tuple[Path, "Future[subprocess.CompletedProcess[str]]"]], number: int
+    prepared: Launcher, tmp_path: Path, job: str, arguments: list[str], said: str
 ) -> None:
-    folder, answer = refused[number]
-    done = answer.result()
-    assert done.returncode == 2
-    assert WRONG[number][2] in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not (folder / "o").exists()
+    ended = prepared.start(job, [argument.format(tmp_path) for argument in arguments]).end(PATIENCE)
+    assert ended.code == 2
+    assert said in ended.said
+    assert "Traceback" not in ended.said
+    assert not (tmp_path / "o").exists()
 
 
 def test_the_road_by_command_lines_and_again(
-    tmp_path: Path, tiny_shards: str, tiny_world: Path, ray_address: str
+    prepared: Launcher, tmp_path: Path, tiny_shards: str, tiny_world: Path, ray_address: str
 ) -> None:
     """embed, index and evaluate after a training of two steps; then each again, which does nothing and says so."""
     run, table, index, out = (tmp_path / name for name in ("run", "table", "index", "evaluation"))
@@ -122,9 +103,9 @@ def test_the_road_by_command_lines_and_again(
         done = call(job, *arguments)
         assert done.returncode == 0, done.stderr
     for job, arguments in calls:
-        done = call(job, *arguments)
-        assert done.returncode == 0, done.stderr
-        assert "nothing to do" in done.stderr
+        ended = prepared.start(job, list(map(str, arguments)), RAY_ADDRESS=ray_address).end(PATIENCE)
+        assert ended.code == 0, ended.said
+        assert "nothing to do" in ended.said
     assert faiss.read_index(str(index / "index.faiss")).ntotal == 5
     metrics = json.loads((out / "metrics.json").read_text())
     assert [(row["task"], row["multi_query"]) for row in metrics] == [

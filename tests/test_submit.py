@@ -101,4 +101,3 @@ def test_every_job_runs_on_a_cluster_that_was_started_by_hand(
         said = submit(submit_environment, str(job), *arguments)
         assert "succeeded" in said
     assert (out / "report.html").exists()
-    assert "nothing to do" in submit(submit_environment, "embed_gallery", *road[3][1:])

@@ -3,6 +3,7 @@
 The server forks; each child is a session of its own and does what `python jobs/NAME.py ARGUMENTS` would do.
 """
 
+import atexit
 import importlib
 import json
 import os
@@ -11,16 +12,16 @@ import select
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
-ROOT = Path(__file__).parents[2]
-PATH = (str(Path(__file__).parent / "hook"), str(ROOT))
+ROOT = Path(__file__).parents[1]
+PATH = (str(Path(__file__).parent / "chaos" / "hook"), str(ROOT))
 "Of every Python process: where the faults of the storage are, and the project."
 LIBRARIES = ("torch", "ray", "ray.train.torch", "faiss", "pyarrow.parquet", "tensorboard", "PIL.Image", "simplejpeg")
 JOBS = ("simulate", "make_shards", "train", "embed_gallery", "build_index", "evaluate")
@@ -75,7 +76,7 @@ class Launcher:
             env=os.environ | environment | {"PYTHONPATH": os.pathsep.join(PATH)},
         )  # fmt: skip
         self._started: list[int] = []
-        self._reader = Thread(target=self._read, daemon=True)
+        self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
     def start(self, name: str, arguments: Sequence[str], **environment: str) -> Job:
@@ -139,7 +140,20 @@ def become(order: dict[str, Any]) -> None:
     os.environ.update(order["environment"])
     path = ROOT / "jobs" / f"{order['name']}.py"
     sys.argv = [str(path), *order["arguments"]]
-    runpy.run_path(str(path), run_name="__main__")
+    code: Any = 1
+    try:
+        runpy.run_path(str(path), run_name="__main__")
+        code = 0
+    except SystemExit as asked:
+        code = asked.code
+    except BaseException:
+        sys.excepthook(*sys.exc_info())
+    # As Python ends, but for taking every imported module apart, which costs seconds where all of its memory is shared.
+    threading._shutdown()  # type: ignore[attr-defined]
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code or 0)
 
 
 if __name__ == "__main__":
