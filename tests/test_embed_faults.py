@@ -204,7 +204,8 @@ def test_a_full_disk_ends_the_stage_with_a_sentence_and_it_goes_on_when_there_is
     with pytest.raises(Incomplete, match=r"cannot be written \(No space left on device\).*to go on"):
         embed_gallery(settings_of(tiny_shards, out, workers=1), network_of_colours(at_start=full_disk()))
     assert 2 <= len(part_names(str(out))) < len(undisturbed)
-    assert all(data == undisturbed[name] for name, data in held(out).items())
+    # A worker that was ended with the stage may leave a hidden half of a file.
+    assert all(data == undisturbed[name] for name, data in held(out).items() if not name.startswith("."))
     embed_gallery(settings_of(tiny_shards, out), network_of_colours())
     assert held(out) == undisturbed
 
