@@ -62,7 +62,8 @@ def line(verdict: Verdict) -> str:
     case = verdict.case
     wrong = [*(verdict.lost or verdict.doubled)[:2], *verdict.unclear[:1], *["hung"] * verdict.hangs]
     return (
-        f"{case.stage.name:9} seed {case.seed:2} {case.name:28} faults {verdict.faults} runs {verdict.runs} {verdict.found} "
+        f"{case.stage.name:9} seed {case.seed:2} {case.name:28} faults {verdict.faults} runs {verdict.runs} "
+        f"restart {verdict.restart_seconds:.1f} s {verdict.found} "
         + ("BAD " + "; ".join(map(str, wrong)) if verdict.bad else "")
     )
 

@@ -17,7 +17,7 @@ import tyro
 from ray.exceptions import RayActorError
 from ray.train import RunConfig, ScalingConfig, WorkerGroupError, get_context
 from ray.train.torch import TorchTrainer, get_device
-from ray.util.queue import Queue
+from ray.util.queue import Empty, Queue
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
@@ -44,6 +44,9 @@ else:  # the command line's subcommands: a recipe by name, each of its settings 
         {name: (make.__doc__ or "").splitlines()[0] for name, make in RECIPES.items()},
         prefix_names=False,
     )
+
+SECONDS_TO_LISTEN = 1.0
+"For which the queue of what workers tell is asked before it is asked again."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,12 +234,19 @@ def gather(damage: Damage) -> list[Damage]:
 
 def listen(told: Queue, meter: Meter, refused: list[Exception]) -> None:
     """Show what the workers tell until None comes, or the queue's actor is lost; keep why they cannot go on."""
-    with suppress(RayActorError):
-        while (facts := told.get()) is not None:
-            if "refused" in facts:
-                refused.append(facts["refused"])
-            else:
-                show(meter, facts)
+    facts: dict[str, Any] | None = {}
+    while facts is not None:
+        try:
+            # With an end: an actor that SIGTERM has told to go waits for what it was asked, and answers nobody meanwhile.
+            facts = told.get(timeout=SECONDS_TO_LISTEN)
+        except Empty:
+            continue
+        except RayActorError:
+            return
+        if facts and "refused" in facts:
+            refused.append(facts["refused"])
+        elif facts:
+            show(meter, facts)
 
 
 def show(meter: Meter, told: dict[str, Any]) -> None:

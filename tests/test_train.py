@@ -1,18 +1,27 @@
 """The training job: in this process and on Ray, to the end, on after a kill, and refused where it cannot run."""
 
 import json
+import os
+import signal
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+import ray
 import torch
+from ray.exceptions import RayActorError
+from ray.util.queue import Queue
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from jobs.recipes import Recipe, paper, smoke
 from jobs.run_folder import Run, read_checkpoint
-from jobs.train import Settings, known_recipe, train
+from jobs.train import Settings, known_recipe, listen, train
 from jobs.training_loop import Place, train_worker, untrained
 from model.checkpoint import CheckpointError, build_encoder, dumps, loads
+from pipeline.progress import progress
 from pipeline.records import InputError, Unfinished
 from pipeline.samples import read_shard
 from pipeline.transforms import DecodeError, Pixels, decode
@@ -224,3 +233,20 @@ def test_the_paper_recipe_is_the_papers() -> None:
     )
     assert (recipe.schedule.epochs, recipe.schedule.period, recipe.schedule.decay_epochs) == (560, 140, (60, 120))
     assert (recipe.batch_size, recipe.augmentation.pad, recipe.augmentation.rotation) == (8, 10, 90)
+
+
+def test_whoever_tells_a_queue_that_is_being_ended_hears_of_it(ray_cluster: None) -> None:
+    """SIGTERM lets an actor finish what it was asked; asked without an end, it neither went nor answered (seed 22)."""
+    told = Queue(actor_options={"num_cpus": 0})
+    actor: Any = told.actor
+    pid: int = ray.get(actor.__ray_call__.remote(lambda queue: os.getpid()))
+    with progress(None, "training", "steps") as meter:
+        listener = threading.Thread(target=listen, args=(told, meter, []), daemon=True)
+        listener.start()
+        time.sleep(0.5)  # it asks
+        os.kill(pid, signal.SIGTERM)
+        time.sleep(0.5)  # the actor has heard
+        with pytest.raises(RayActorError):
+            ray.get(actor.put.remote({"steps": 1}), timeout=20)
+        listener.join(20)
+    assert not listener.is_alive()
