@@ -3,6 +3,7 @@
 import logging
 import os
 import signal
+import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -11,9 +12,11 @@ from types import FrameType
 from typing import Any, TypeVar
 
 import ray
+from ray._private.utils import read_ray_address
 from ray.exceptions import RayTaskError
 
 from pipeline.placement import Node
+from pipeline.progress import console
 from pipeline.records import Unfinished
 
 Item = TypeVar("Item")
@@ -34,7 +37,7 @@ def connect() -> None:
     logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(logging.ERROR)
     try:
         with _undisturbed():
-            ray.init(log_to_driver=False, logging_level=logging.WARNING)
+            ray.init(_address(), log_to_driver=False, logging_level=logging.WARNING)
     except Exception as error:  # Ray raises ConnectionError, RuntimeError, ValueError and plain Exception here
         asked = f"at {address}" if (address := os.environ.get("RAY_ADDRESS")) else "on this machine"
         why = str(error).strip().partition("\n")[0] or type(error).__name__
@@ -42,6 +45,23 @@ def connect() -> None:
             f"found no Ray cluster {asked}, and none could be started ({why}); expected one "
             "that answers; see to it, or unset RAY_ADDRESS so that one is started here, and run the same command again"
         ) from error
+
+
+def _address() -> str | None:
+    """What to tell Ray: None, so that it looks for itself; "local" where it would find a cluster that is no more.
+
+    `ray start` notes its address in a file, which outlives a cluster that was killed, and Ray waits for that one for ever.
+    """
+    noted = None if os.environ.get("RAY_ADDRESS") else read_ray_address()
+    if not noted:
+        return None
+    host, _, port = noted.rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), timeout=5).close()
+    except (OSError, ValueError):  # the latter: no address
+        console.print(f"the Ray cluster at {noted} that `ray start` began is gone; one is started for this run")
+        return "local"
+    return None
 
 
 @contextmanager
