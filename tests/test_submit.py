@@ -74,10 +74,12 @@ def submit(environment: dict[str, str], job: str, *arguments: object) -> "subpro
     )  # fmt: skip
 
 
-def succeeds(submitted: "subprocess.Popen[str]") -> bool:
+def answer(submitted: "subprocess.Popen[str]") -> str:
+    """What a job said, which must have succeeded."""
     said, _ = submitted.communicate(timeout=300)
     assert submitted.returncode == 0, said[-5000:]
-    return "succeeded" in said
+    assert "succeeded" in said
+    return said
 
 
 def test_every_job_runs_on_a_cluster_that_was_started_by_hand(
@@ -92,16 +94,18 @@ def test_every_job_runs_on_a_cluster_that_was_started_by_hand(
     begin = partial(submit, submit_environment)
     simulating = begin("simulate", "--out", flights, *counts)
     training = begin("train", "smoke", "--shards", tiny_shards, "--out", run, *small)
-    assert succeeds(simulating)
+    answer(simulating)
     packing = begin("make_shards", "--source", "university1652", "--root", flights, "--out", shards)
-    assert succeeds(training)
-    embedding = begin("embed_gallery", "--shards", tiny_shards, "--checkpoint", run / "last.pt", "--out", table)
-    assert succeeds(packing)
-    assert succeeds(embedding)
+    answer(training)
+    embed = ("embed_gallery", "--shards", tiny_shards, "--checkpoint", run / "last.pt", "--out", table)
+    embedding = begin(*embed)
+    answer(packing)
+    answer(embedding)
     indexing = begin("build_index", "--table", table, "--out", index)
     evaluating = begin("evaluate", "--table", table, "--out", out)
-    assert succeeds(indexing)
-    assert succeeds(evaluating)
+    answer(indexing)
+    answer(evaluating)
+    assert "nothing to do" in answer(begin(*embed))
     assert (shards / "manifest.json").exists()
     assert (index / "index.json").exists()
     assert (out / "report.html").exists()
