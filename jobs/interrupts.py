@@ -26,7 +26,11 @@ def interruptible() -> Iterator[list[int]]:
         yield received
         return
 
+    over = False
+
     def stop(number: int, frame: FrameType | None) -> None:
+        if over:  # an alarm that was on its way when the timer was stopped: set again it would outlive this handler
+            return
         signal.setitimer(signal.ITIMER_REAL, SECONDS_TO_REPEAT)
         if number != signal.SIGALRM:
             received.append(number)
@@ -41,6 +45,7 @@ def interruptible() -> Iterator[list[int]]:
     try:
         yield received
     finally:
+        over = True
         signal.setitimer(signal.ITIMER_REAL, 0)
         for number, handler in before.items():
             signal.signal(number, handler)

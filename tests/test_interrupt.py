@@ -62,7 +62,7 @@ def _hearing_ctrl_c() -> Iterator[None]:
 
 
 def test_a_signal_that_a_library_drops_is_raised_again() -> None:
-    with interruptible() as received, pytest.raises(KeyboardInterrupt):  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), interruptible() as received:  # noqa: PT012
         with suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGTERM)
         time.sleep(20)
@@ -71,7 +71,7 @@ def test_a_signal_that_a_library_drops_is_raised_again() -> None:
 
 def test_what_tidies_up_after_a_signal_is_left_in_peace() -> None:
     tidy = False
-    with interruptible(), pytest.raises(KeyboardInterrupt):  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), interruptible():  # noqa: PT012
         try:
             signal.raise_signal(signal.SIGINT)
         finally:
@@ -79,6 +79,23 @@ def test_what_tidies_up_after_a_signal_is_left_in_peace() -> None:
                 time.sleep(3 * SECONDS_TO_REPEAT)
             tidy = True
     assert tidy
+
+
+def test_an_alarm_that_comes_as_the_timer_is_stopped_does_not_set_it_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    set_timer = signal.setitimer
+
+    def set_late(timer: int, seconds: float) -> None:
+        set_timer(timer, seconds)
+        if not seconds:
+            signal.raise_signal(signal.SIGALRM)
+
+    monkeypatch.setattr(signal, "setitimer", set_late)
+    before = signal.getsignal(signal.SIGALRM)
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        signal.raise_signal(signal.SIGTERM)
+    left = set_timer(signal.ITIMER_REAL, 0)  # else it would end the tests
+    assert left == (0, 0)
+    assert signal.getsignal(signal.SIGALRM) is before
 
 
 @pytest.fixture(scope="module")
