@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 import torch
+from processes import below, named, strike
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from jobs.recipes import Recipe, smoke
@@ -140,12 +141,10 @@ def test_a_ray_worker_killed_is_replaced_and_the_run_goes_on_from_the_last_check
     def murder() -> None:
         while not (out / "last.pt").exists():
             time.sleep(0.01)
-        for process in Path("/proc").glob("[0-9]*"):
-            if b"RayTrainWorker" in (process / "cmdline").read_bytes() and os.getpid() in ancestors(int(process.name)):
-                victims.append(int(process.name))
-                os.kill(victims[-1], signal.SIGKILL)
+        ours = below(os.getpid())  # another session's Ray may run on this machine
+        victims.extend(one for one in ours if "RayTrainWorker" in named(one) and strike(one, signal.SIGKILL))
 
-    killer = threading.Thread(target=murder)
+    killer = threading.Thread(target=murder, daemon=True)
     killer.start()
     train(settings(tiny_shards, out, recipe=recipe, workers=1))
     killer.join()
@@ -154,15 +153,6 @@ def test_a_ray_worker_killed_is_replaced_and_the_run_goes_on_from_the_last_check
     assert [row["epoch"] for row in rows(out)] == list(range(1, 13))
     train(settings(tiny_shards, tmp_path / "whole", recipe=recipe, workers=1))
     assert_same_run(out, tmp_path / "whole")
-
-
-def ancestors(process: int) -> list[int]:
-    """Whose child a process is, and so on: another session's Ray may run on this machine."""
-    found = []
-    while process > 1:
-        process = int(Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[1])
-        found.append(process)
-    return found
 
 
 def test_the_last_checkpoints_are_kept_and_a_damaged_one_gives_way_to_the_one_before(

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import below, named
 from test_photo_encoder import facts, photo
 
 from jobs.photo_encoder import PhotoEncoder
@@ -98,10 +99,7 @@ def wait_ready(address: str) -> dict[str, Any]:
 def replica_of(process: subprocess.Popen[str]) -> int:
     """The process number of the service's replica, by the name that Ray gives it."""
     name = f"ray::ServeReplica:pvda-{process.pid}:Replica"
-    for folder in Path("/proc").iterdir():
-        if folder.name.isdigit() and (folder / "cmdline").read_bytes().decode().startswith(name):
-            return int(folder.name)
-    raise AssertionError(f"no process is called {name}")
+    return next(one for one in below(os.getpid()) if named(one).startswith(name))
 
 
 def serve_actors() -> list[str]:
