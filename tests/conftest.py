@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from launcher import Launcher
 
 if TYPE_CHECKING:
     from model.pvda import FeatureEncoder
@@ -50,6 +51,14 @@ def tiny_shards(tmp_path_factory: pytest.TempPathFactory, tiny_world: Path) -> s
     out = str(tmp_path_factory.mktemp("shards"))
     pack(University1652(), PackingSettings(root=str(tiny_world), out=out, samples_per_shard=8))
     return out
+
+
+@pytest.fixture(scope="session")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Launcher]:
+    """Starts jobs whose libraries are imported already: most of a short call is that."""
+    launcher = Launcher(tmp_path_factory.mktemp("launcher"), {})
+    yield launcher
+    launcher.close()
 
 
 @pytest.fixture

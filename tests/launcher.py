@@ -24,6 +24,8 @@ ROOT = Path(__file__).parents[1]
 PATH = (str(Path(__file__).parent / "chaos" / "hook"), str(ROOT))
 "Of every Python process: where the faults of the storage are, and the project."
 LIBRARIES = ("torch", "ray", "ray.train.torch", "faiss", "pyarrow.parquet", "tensorboard", "PIL.Image", "simplejpeg")
+PATIENCE = 300.0
+"Seconds that a job may take on a busy machine."
 JOBS = ("simulate", "make_shards", "train", "embed_gallery", "build_index", "evaluate")
 
 
@@ -56,7 +58,7 @@ class Job:
             time.sleep(0.005)
         return self.code is not None
 
-    def end(self, patience: float) -> Ended:
+    def end(self, patience: float = PATIENCE) -> Ended:
         """Wait for its end, or stop it when it has run for `patience` seconds."""
         over, took = self.wait(patience), self.seconds
         with suppress(ProcessLookupError):  # what it has left running too

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from launcher import Launcher
 from PIL import Image
 
 from jobs import STOPPED
@@ -172,7 +173,7 @@ def wait_for(what: Callable[[], bool], seconds: float) -> bool:
 
 @pytest.mark.parametrize(("job", "number", "group"), CASES if ALL else NORMALLY)
 def test_a_job_that_is_stopped_says_so_leaves_nothing_running_and_goes_on(
-    job: str, number: signal.Signals, group: bool, things: dict[str, Path], tmp_path: Path
+    job: str, number: signal.Signals, group: bool, things: dict[str, Path], tmp_path: Path, prepared: Launcher
 ) -> None:
     words, begun = JOBS[job]
     things = things | {"out": tmp_path / "out"}
@@ -194,8 +195,8 @@ def test_a_job_that_is_stopped_says_so_leaves_nothing_running_and_goes_on(
     assert log.read_text().count(STOPPED) == 1
     assert "Traceback" not in log.read_text()
     assert wait_for(lambda: not running(mark), LINGERS), running(mark)
-    again, log = begin(job, arguments, tmp_path / "again")
-    assert again.wait(300) == 0, log.read_text()
+    ended = prepared.start(job.split()[0], arguments, RAY_ADDRESS="local").end()
+    assert ended.code == 0, ended.said
 
 
 def test_ctrl_c_while_the_libraries_are_imported_says_so_too(tmp_path: Path) -> None:

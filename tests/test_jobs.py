@@ -3,16 +3,13 @@
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import faiss
 import pytest
-from launcher import Launcher
+from launcher import PATIENCE, Ended, Launcher
 
 ROOT = Path(__file__).parent.parent
-PATIENCE = 300.0
-"Seconds that a call may take."
 JOBS = [
     "simulate", "make_shards", "train", "embed_gallery", "build_index", "evaluate", "import_weights", "calibrate", "locate",
     "demo",
@@ -24,17 +21,9 @@ def call(job: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
 
 
-@pytest.fixture(scope="module")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Launcher]:
-    """Starts jobs whose libraries are imported already: most of a short call is that."""
-    launcher = Launcher(tmp_path_factory.mktemp("launcher"), {})
-    yield launcher
-    launcher.close()
-
-
 @pytest.mark.parametrize("job", JOBS)
 def test_every_job_has_help(prepared: Launcher, job: str) -> None:
-    ended = prepared.start(job, ["--help"]).end(PATIENCE)
+    ended = prepared.start(job, ["--help"]).end()
     assert ended.code == 0
     assert "--out" in ended.said
 
@@ -66,6 +55,7 @@ WRONG: list[tuple[str, list[str], str]] = [
     ("locate", ["--checkpoint", "{}/c.pt", "--index", "{}", "--out", "{}/o", "{}/gone.jpg"], "no photo or folder at"),
     ("locate", ["--checkpoint", "{}/c.pt", "--index", "{}", "--out", "{}/o", "--near", "95", "0", "9", "{}"], "latitude 95"),
     ("calibrate", ["--checkpoint", "{}/c.pt", "--shards", "{}", "--index", "{}"], "no index at"),
+    ("serve", ["--checkpoint", "{}/c.pt", "--index", "{}", "--host", "0.0.0.0"], "there is no token; give --token-file"),
     ("simulate", ["--out", "{}/o", "--train-locations", "1", "--test-locations", "1", "--distractors", "0",
                   "--textures", "{}/nowhere"], "nowhere"),
     ("make_shards", ["--root", "{}", "--out", "{}/o", "--source", "university1652", "--no-such-flag"], "--no-such-flag"),
@@ -76,7 +66,7 @@ WRONG: list[tuple[str, list[str], str]] = [
 def test_a_wrong_call_gets_a_sentence_and_exit_code_2(
     prepared: Launcher, tmp_path: Path, job: str, arguments: list[str], said: str
 ) -> None:
-    ended = prepared.start(job, [argument.format(tmp_path) for argument in arguments]).end(PATIENCE)
+    ended = prepared.start(job, [argument.format(tmp_path) for argument in arguments]).end()
     assert ended.code == 2
     assert said in ended.said
     assert "Traceback" not in ended.said
@@ -87,6 +77,10 @@ def test_the_road_by_command_lines_and_again(
     prepared: Launcher, tmp_path: Path, tiny_shards: str, tiny_world: Path, ray_address: str
 ) -> None:
     """embed, index and evaluate after a training of two steps; then each again, which does nothing and says so."""
+
+    def again(job: str, *arguments: object) -> Ended:
+        return prepared.start(job, list(map(str, arguments)), RAY_ADDRESS=ray_address).end()
+
     run, table, index, out = (tmp_path / name for name in ("run", "table", "index", "evaluation"))
     small = ("--epochs", 1, "--batch-size", 3, "--part-dim", 16, "--workers", 0)
     calls: list[tuple[str, list[object]]] = [
@@ -103,7 +97,7 @@ def test_the_road_by_command_lines_and_again(
         done = call(job, *arguments)
         assert done.returncode == 0, done.stderr
     for job, arguments in calls:
-        ended = prepared.start(job, list(map(str, arguments)), RAY_ADDRESS=ray_address).end(PATIENCE)
+        ended = again(job, *arguments)
         assert ended.code == 0, ended.said
         assert "nothing to do" in ended.said
     assert faiss.read_index(str(index / "index.faiss")).ntotal == 5
@@ -116,14 +110,11 @@ def test_the_road_by_command_lines_and_again(
     photos = tiny_world / "test" / "query_drone"
     near = ("--near", -46.5, 8, 1e8)  # half-way round the earth, and a photo behind it
     given = ("--checkpoint", run / "last.pt", "--index", index, "--out", tmp_path / "o.geojson")
-    done = call("locate", *given, *near, photos)
-    assert done.returncode == 0, done.stderr
+    assert again("locate", *given, *near, photos).code == 0
     assert len(json.loads((tmp_path / "o.geojson").read_text())["features"]) == 9
     pair = ("--queries", table, "--gallery", table, "--query-view", "drone", "--gallery-view", "satellite")
-    done = call("evaluate", *pair, "--out", tmp_path / "pair", "--multi-query", "--protocol", "queried-only")
-    assert done.returncode == 0, done.stderr
-    other = call("train", "smoke", "--shards", tiny_shards, "--out", tmp_path / "run2", *small, "--seed", 5)
-    assert other.returncode == 0, other.stderr
-    mixed = call("embed_gallery", "--shards", tiny_shards, "--checkpoint", tmp_path / "run2/last.pt", "--out", table)
-    assert mixed.returncode == 2
-    assert "choose another --out" in mixed.stderr
+    assert again("evaluate", *pair, "--out", tmp_path / "pair", "--multi-query", "--protocol", "queried-only").code == 0
+    assert again("train", "smoke", "--shards", tiny_shards, "--out", tmp_path / "run2", *small, "--seed", 5).code == 0
+    mixed = again("embed_gallery", "--shards", tiny_shards, "--checkpoint", tmp_path / "run2/last.pt", "--out", table)
+    assert mixed.code == 2
+    assert "choose another --out" in mixed.said

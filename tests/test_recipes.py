@@ -3,13 +3,12 @@
 import io
 import math
 import shutil
-import subprocess
-import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
 import torch
+from launcher import Launcher
 from rich.console import Console
 
 from jobs.config_table import config_table, show_config
@@ -125,7 +124,9 @@ def test_the_table_goes_to_standard_error_and_keeps_to_the_screen(capsys: pytest
     assert max(map(len, said.err.splitlines())) <= 80
 
 
-def test_recipe_paper_trains_a_whole_resnet50_from_torchvisions_weights(tmp_path: Path, tiny_shards: str) -> None:
+def test_recipe_paper_trains_a_whole_resnet50_from_torchvisions_weights(
+    tmp_path: Path, tiny_shards: str, prepared: Launcher
+) -> None:
     """Two real steps by command line, on small images and a narrow D; the backbone has all its layers at full width."""
     torch.manual_seed(5)
     # As trained residual blocks do, each adds a little; at random they would add so much that one step throws conv1 far off.
@@ -135,12 +136,10 @@ def test_recipe_paper_trains_a_whole_resnet50_from_torchvisions_weights(tmp_path
     torch.save(given | {"fc.weight": torch.zeros(1000, 2048), "fc.bias": torch.zeros(1000)}, tmp_path / "resnet50.pth")
     small = ["--image-size", "128", "--batch-size", "3", "--epochs", "1", "--discriminator-channels", "64"]
     paths = ["--shards", tiny_shards, "--out", str(tmp_path / "run"), "--weights", str(tmp_path / "resnet50.pth")]
-    job = str(Path(__file__).parent.parent / "jobs" / "train.py")
-    command = [sys.executable, job, "paper", *paths, *small, "--workers", "0"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "recipe paper, 4 changed (*)" in done.stderr
-    assert "*image_size=128 (not 256)" in done.stderr
+    ended = prepared.start("train", ["paper", *paths, *small, "--workers", "0"]).end()
+    assert ended.code == 0, ended.said
+    assert "recipe paper, 4 changed (*)" in ended.said
+    assert "*image_size=128 (not 256)" in ended.said
     checkpoint = loads((tmp_path / "run" / "last.pt").read_bytes())
     shutil.rmtree(tmp_path / "run")  # hundreds of megabytes, which pytest would keep
     assert (checkpoint.network.depth, checkpoint.network.width, checkpoint.network.parts) == (50, 1.0, 4)

@@ -4,8 +4,6 @@ import json
 import os
 import random
 import signal
-import subprocess
-import sys
 import threading
 import time
 from dataclasses import asdict, replace
@@ -15,6 +13,7 @@ from typing import Any
 
 import pytest
 import torch
+from launcher import Job, Launcher
 from processes import below, named, strike
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -109,22 +108,19 @@ def test_a_run_that_was_killed_goes_on_to_the_same_bits(
 
 
 def test_a_process_killed_at_a_random_moment_and_run_again_ends_as_if_nothing_had_happened(
-    tiny_shards: str, tmp_path: Path
+    tiny_shards: str, tmp_path: Path, prepared: Launcher
 ) -> None:
-    def command(out: Path) -> list[str]:
+    def begin(out: Path) -> Job:
         flags = ("--shards", tiny_shards, "--out", out, "--workers", 0, "--checkpoint-minutes", 0, *FLAGS)
-        return [sys.executable, str(ROOT / "jobs" / "train.py"), "smoke", *map(str, flags)]
+        return prepared.start("train", ["smoke", *map(str, flags)])
 
-    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    subprocess.run(command(tmp_path / "whole"), check=True, **quiet)
-    process = subprocess.Popen(command(tmp_path / "killed"), start_new_session=True, **quiet)
+    assert begin(tmp_path / "whole").end().code == 0
+    job = begin(tmp_path / "killed")
     while not (tmp_path / "killed" / "last.pt").exists():
-        assert process.poll() is None
+        assert job.code is None
         time.sleep(0.01)
-    time.sleep(random.uniform(0, 1.5))
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    subprocess.run(command(tmp_path / "killed"), check=True, **quiet)
+    job.end(job.seconds + random.uniform(0, 1.5))
+    assert begin(tmp_path / "killed").end().code == 0
     assert_same_run(tmp_path / "killed", tmp_path / "whole")
     board = EventAccumulator(str(tmp_path / "killed" / "tensorboard"))
     board.Reload()

@@ -150,16 +150,6 @@ def test_what_is_not_there_is_told_before_anything_starts(tmp_path: Path) -> Non
         Settings(checkpoint="last.pt", index="index", replicas=0)
 
 
-def test_a_wrong_call_gets_a_sentence_and_exit_code_2() -> None:
-    done = subprocess.run(
-        command("--checkpoint", "last.pt", "--index", "index", "--host", "0.0.0.0"),
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert "there is no token; give --token-file" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
 def test_a_port_that_is_taken_is_told_before_anything_is_loaded(road: tuple[Path, Path], ray_cluster: None) -> None:
     checkpoint, index = road
     with socket.socket() as taken:
