@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import hypothesis
 import pytest
 from launcher import Launcher
 
@@ -15,6 +16,15 @@ os.environ.setdefault("RAY_AUTH_MODE", "disabled")  # the same for every Ray pro
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 # Threads that wait for each other give their core away: spinning, they take it from whoever they wait for on a busy machine.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+# The same examples each time, and no clock: a pause of the machine is no defect. PVDA_FUZZ_EXAMPLES tries others.
+hypothesis.settings.register_profile(
+    "house",
+    deadline=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+    derandomize="PVDA_FUZZ_EXAMPLES" not in os.environ,
+)
+hypothesis.settings.load_profile("house")
 
 
 @pytest.fixture(scope="session")

@@ -252,13 +252,13 @@ def segment(content: bytes) -> bytes:
 HEADERS = [b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b"RIFF\xff\0\0\0WEBP", b"II*\0", b"MM\0*", b""]
 
 
-@settings(max_examples=300, deadline=500)
+@settings(max_examples=300)
 @given(st.sampled_from(HEADERS), st.binary(max_size=600), st.booleans())
 def test_any_bytes_give_tags_or_the_one_error(header: bytes, data: bytes, whole: bool) -> None:
     judge(header + data, whole)
 
 
-@settings(max_examples=300, deadline=500)
+@settings(max_examples=300)
 @given(st.lists(st.tuples(st.integers(0, 1500), st.integers(0, 255)), min_size=1, max_size=8), st.integers(20, 1500))
 def test_a_damaged_photo_gives_tags_or_the_one_error(damage: list[tuple[int, int]], length: int) -> None:
     photo = {0x9003: "2024:05:01 12:34:56", 0x9011: "+02:00"}

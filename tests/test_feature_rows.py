@@ -32,7 +32,7 @@ def test_rows_are_what_pyarrow_reads(tmp_path: Path, dtype: str) -> None:
     rows=st.integers(1, 60), dimension=st.integers(1, 40), page=st.sampled_from([64, 100, 1000]), group=st.integers(1, 40),
     version=st.sampled_from(["1.0", "2.0"]), dtype=st.sampled_from(["float16", "float32"]),
 )  # fmt: skip
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_rows_are_found_whatever_the_pages(
     tmp_path_factory: pytest.TempPathFactory, rows: int, dimension: int, page: int, group: int, version: str, dtype: str
 ) -> None:

@@ -93,7 +93,7 @@ def test_half_an_image_is_refused_by_inspection_itself(data: bytes) -> None:
     assert caught.value.reason in ("truncated image", "damaged image")
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(data=st.sampled_from(list(WHOLE.values())), share=st.floats(0, 1, exclude_max=True))
 def test_a_cut_is_seen_by_inspection_or_by_decoding_or_leaves_a_whole_image(data: bytes, share: float) -> None:
     cut = data[: int(share * len(data))]
@@ -106,7 +106,7 @@ def test_a_cut_is_seen_by_inspection_or_by_decoding_or_leaves_a_whole_image(data
 
 
 @pytest.mark.filterwarnings("ignore")  # of Pillow, over metadata that makes no sense
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     data=st.sampled_from(list(WHOLE.values())),
     faults=st.lists(st.tuples(st.integers(0, 700), st.integers(0, 255)), max_size=4),

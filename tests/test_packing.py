@@ -331,7 +331,7 @@ def recorded(facts: dict[str, Any], row: dict[str, Any]) -> ImageRecord:
     return ImageRecord(path=row["path"], geotag=tag, bytes=row["bytes"], **kind)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.lists(st.tuples(st.sampled_from(Split), st.sampled_from(View), NAMES, tags()), min_size=1, max_size=8),
     st.integers(1, 4),

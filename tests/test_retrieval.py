@@ -60,7 +60,7 @@ FEW = (-1, math.inf)  # never and always the way that picks the few entries that
 
 
 @given(sides(), cuts, st.integers(1, 12), st.sampled_from(FEW))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_ranking_equals_the_brute_force_twin_however_the_work_is_cut(
     pair: tuple[Side, Side], cut: Blocks, top: int, few: float
 ) -> None:
@@ -131,7 +131,7 @@ def test_near_ties_are_settled_exactly_however_near(
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([2, 64, 2048]))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_float32_products_lie_within_the_bound_of_the_score(seed: int, dimension: int) -> None:
     rng = np.random.default_rng(seed)
     one, other = (on_grid(unit(np.abs(rng.standard_normal((8, dimension))).astype(np.float32))) for _ in range(2))

@@ -47,7 +47,7 @@ def test_the_rings_of_256_and_384_pixels_are_the_boxes_of_lpn(side: int, boxes: 
         seen_HW = box_HW
 
 
-@settings(max_examples=50, deadline=None)  # no deadline: the first call loads torch's kernels
+@settings(max_examples=50)
 @given(parts=PARTS, tall=BEYOND, wide=BEYOND)
 def test_each_cell_of_a_map_of_any_size_lies_in_exactly_one_ring_and_no_ring_is_empty(
     parts: int, tall: int, wide: int
@@ -58,7 +58,7 @@ def test_each_cell_of_a_map_of_any_size_lies_in_exactly_one_ring_and_no_ring_is_
     assert bool((masks_PHW.sum((1, 2)) > 0).all())
 
 
-@settings(max_examples=50, deadline=None)  # no deadline: the first call loads torch's kernels
+@settings(max_examples=50)
 @given(parts=PARTS, tall=BEYOND, wide=BEYOND)
 def test_the_rings_stay_centred_so_a_flipped_map_has_the_same_rings(parts: int, tall: int, wide: int) -> None:
     masks_PHW = ring_masks(2 * parts + tall, 2 * parts + wide, parts)
@@ -66,7 +66,7 @@ def test_the_rings_stay_centred_so_a_flipped_map_has_the_same_rings(parts: int, 
     assert torch.equal(masks_PHW, masks_PHW.flip(2))
 
 
-@settings(max_examples=50, deadline=None)  # no deadline: the first call loads torch's kernels
+@settings(max_examples=50)
 @given(parts=PARTS, tall=BEYOND)
 def test_a_map_on_its_side_has_its_rings_on_their_side(parts: int, tall: int) -> None:
     upright_PHW = ring_masks(2 * parts + tall, 2 * parts + 3, parts)

@@ -68,7 +68,7 @@ def test_warm_up_grows_from_zero_by_steps_and_then_leaves_the_shape_as_it_is() -
     assert phase(warm, 100) == phase(cold, 100)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     schedule=st.builds(
         Schedule,

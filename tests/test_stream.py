@@ -95,7 +95,7 @@ def planned(sizes: list[int], wanted: int, rank: int, world: int, seed: int) -> 
     return [(span.name, position) for span in spans for position in range(span.start, span.stop)]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(sizes=SIZES, wanted=st.integers(0, 30), world=st.integers(1, 5), seed=st.integers(0, 99))
 def test_each_rank_reads_as_many_samples_as_wanted_and_no_sample_comes_twice_before_all_came_once(
     sizes: list[int], wanted: int, world: int, seed: int
@@ -112,7 +112,7 @@ def test_each_rank_reads_as_many_samples_as_wanted_and_no_sample_comes_twice_bef
         assert len(seen) == (total if rounds else rest)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(sizes=SIZES, wanted=st.integers(0, 30), world=st.integers(1, 5), seed=st.integers(0, 99))
 def test_a_plan_is_decided_by_its_random_numbers_alone(sizes: list[int], wanted: int, world: int, seed: int) -> None:
     assert planned(sizes, wanted, world - 1, world, seed) == planned(sizes, wanted, world - 1, world, seed)

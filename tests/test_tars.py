@@ -67,7 +67,7 @@ END = WHOLE.rindex(b"a caption") + 512 - WHOLE.rindex(b"a caption") % 512
 "Where the end marker begins."
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(cut=st.integers(0, END + 511))
 def test_a_tar_that_is_cut_off_anywhere_is_seen_even_between_two_members(cut: int) -> None:
     with pytest.raises(InputError, match=r"it\.tar is cut off or damaged after \d samples .*; copy it again"):

@@ -189,7 +189,7 @@ def test_what_is_no_whole_image_is_refused_for_a_countable_reason(data: bytes, r
 
 
 @pytest.mark.filterwarnings("ignore")  # of Pillow, over metadata that makes no sense
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     data=st.sampled_from([FORMS["jpeg"], FORMS["png"], FORMS["tiff"], encoded(PHOTO, "JPEG", exif=exif(6))]),
     faults=st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), max_size=4),
@@ -210,7 +210,7 @@ def test_resizing_by_pillow_is_its_antialiased_bicubic(height: int, width: int) 
     assert np.array_equal(resize(image_HW3, 16, "pillow"), np.asarray(expected))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     height=st.integers(1, 200),
     width=st.integers(1, 200),
