@@ -78,16 +78,12 @@ def test_the_road_by_command_lines_and_again(
 ) -> None:
     """embed, index and evaluate after a training of two steps; then each again, which does nothing and says so."""
 
-    def again(job: str, *arguments: object) -> Ended:
+    def forked(job: str, *arguments: object) -> Ended:
         return prepared.start(job, list(map(str, arguments)), RAY_ADDRESS=ray_address).end()
 
     run, table, index, out = (tmp_path / name for name in ("run", "table", "index", "evaluation"))
     small = ("--epochs", 1, "--batch-size", 3, "--part-dim", 16, "--workers", 0)
     calls: list[tuple[str, list[object]]] = [
-        (
-            "make_shards",
-            ["--source", "university1652", "--root", tiny_world, "--out", tiny_shards, "--samples-per-shard", 8],
-        ),
         ("train", ["smoke", "--shards", tiny_shards, "--out", run, *small]),
         ("embed_gallery", ["--shards", tiny_shards, "--checkpoint", run / "last.pt", "--out", table]),
         ("build_index", ["--table", table, "--out", index, "--split", "gallery", "--view", "satellite"]),
@@ -96,8 +92,9 @@ def test_the_road_by_command_lines_and_again(
     for job, arguments in calls:
         done = call(job, *arguments)
         assert done.returncode == 0, done.stderr
-    for job, arguments in calls:
-        ended = again(job, *arguments)
+    packing = ["--source", "university1652", "--root", tiny_world, "--out", tiny_shards, "--samples-per-shard", 8]
+    for job, arguments in [("make_shards", packing), *calls]:
+        ended = forked(job, *arguments)
         assert ended.code == 0, ended.said
         assert "nothing to do" in ended.said
     assert faiss.read_index(str(index / "index.faiss")).ntotal == 5
@@ -110,11 +107,12 @@ def test_the_road_by_command_lines_and_again(
     photos = tiny_world / "test" / "query_drone"
     near = ("--near", -46.5, 8, 1e8)  # half-way round the earth, and a photo behind it
     given = ("--checkpoint", run / "last.pt", "--index", index, "--out", tmp_path / "o.geojson")
-    assert again("locate", *given, *near, photos).code == 0
+    assert forked("locate", *given, *near, photos).code == 0
     assert len(json.loads((tmp_path / "o.geojson").read_text())["features"]) == 9
     pair = ("--queries", table, "--gallery", table, "--query-view", "drone", "--gallery-view", "satellite")
-    assert again("evaluate", *pair, "--out", tmp_path / "pair", "--multi-query", "--protocol", "queried-only").code == 0
-    assert again("train", "smoke", "--shards", tiny_shards, "--out", tmp_path / "run2", *small, "--seed", 5).code == 0
-    mixed = again("embed_gallery", "--shards", tiny_shards, "--checkpoint", tmp_path / "run2/last.pt", "--out", table)
+    pair += ("--multi-query", "--protocol", "queried-only")
+    assert forked("evaluate", *pair, "--out", tmp_path / "pair").code == 0
+    assert forked("train", "smoke", "--shards", tiny_shards, "--out", tmp_path / "run2", *small, "--seed", 5).code == 0
+    mixed = forked("embed_gallery", "--shards", tiny_shards, "--checkpoint", tmp_path / "run2/last.pt", "--out", table)
     assert mixed.code == 2
     assert "choose another --out" in mixed.said

@@ -93,6 +93,7 @@ class Ground:
 
     def seconds(self, stage: Stage, spread: bool) -> float:
         """How long the stage takes undisturbed; measured when first asked."""
+        spread = spread and bool(stage.alone)  # else Ray's workers do it in any case
         if (stage.name, spread) not in self._seconds:
             self.prepare(stage)
             self._seconds[stage.name, spread] = self._done(stage, spread)

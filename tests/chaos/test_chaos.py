@@ -3,7 +3,6 @@
 benchmarks/chaos.py is the long one. What that found stands here first, by its seed.
 """
 
-import os
 from collections.abc import Iterator
 
 import pytest
@@ -11,8 +10,6 @@ from campaign import Case, Verdict, cases, trial
 from grounds import Ground, ground
 from stages import STAGES, Stage
 
-TRIED = STAGES if os.environ.get("PVDA_CHAOS_ALL") else STAGES[:3]
-"Embedding, indexing and evaluating take minutes more: PVDA_CHAOS_ALL=1 has them too, and the long campaign."
 FAULTS = 10
 "Per stage, besides those that once did harm."
 HARMED = {
@@ -52,7 +49,7 @@ def chosen(stage: Stage) -> list[Case]:
     return harmed + [case for case in quick if case.name not in passed_over]
 
 
-@pytest.mark.parametrize("stage", TRIED, ids=lambda stage: stage.name)
+@pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.name)
 def test_a_stage_that_meets_faults_ends_with_what_an_undisturbed_one_writes(here: Ground, stage: Stage) -> None:
     here.undisturbed(stage)
     verdicts = list[Verdict]()
