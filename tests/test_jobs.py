@@ -110,8 +110,8 @@ def test_the_road_by_command_lines_and_again(
     assert forked("locate", *given, *near, photos).code == 0
     assert len(json.loads((tmp_path / "o.geojson").read_text())["features"]) == 9
     pair = ("--queries", table, "--gallery", table, "--query-view", "drone", "--gallery-view", "satellite")
-    pair += ("--multi-query", "--protocol", "queried-only")
-    assert forked("evaluate", *pair, "--out", tmp_path / "pair").code == 0
+    ways = ("--multi-query", "--protocol", "queried-only")
+    assert forked("evaluate", *pair, *ways, "--out", tmp_path / "pair").code == 0
     assert forked("train", "smoke", "--shards", tiny_shards, "--out", tmp_path / "run2", *small, "--seed", 5).code == 0
     mixed = forked("embed_gallery", "--shards", tiny_shards, "--checkpoint", tmp_path / "run2/last.pt", "--out", table)
     assert mixed.code == 2
