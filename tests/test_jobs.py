@@ -7,18 +7,13 @@ from pathlib import Path
 
 import faiss
 import pytest
-from launcher import PATIENCE, Ended, Launcher
+from launcher import Ended, Launcher
 
 ROOT = Path(__file__).parent.parent
 JOBS = [
     "simulate", "make_shards", "train", "embed_gallery", "build_index", "evaluate", "import_weights", "calibrate", "locate",
     "demo",
 ]  # fmt: skip
-
-
-def call(job: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(ROOT / "jobs" / f"{job}.py"), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
 
 
 @pytest.mark.parametrize("job", JOBS)
@@ -90,8 +85,8 @@ def test_the_road_by_command_lines_and_again(
         ("evaluate", ["--table", table, "--out", out, "--shards", tiny_shards, "--run", run]),
     ]
     for job, arguments in calls:
-        done = call(job, *arguments)
-        assert done.returncode == 0, done.stderr
+        ended = forked(job, *arguments)
+        assert ended.code == 0, ended.said
     packing = ["--source", "university1652", "--root", tiny_world, "--out", tiny_shards, "--samples-per-shard", 8]
     for job, arguments in [("make_shards", packing), *calls]:
         ended = forked(job, *arguments)

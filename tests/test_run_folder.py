@@ -130,16 +130,16 @@ def test_a_process_killed_at_a_random_moment_and_run_again_ends_as_if_nothing_ha
 @pytest.fixture(scope="module")
 def by_ray(tiny_shards: str, tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) -> Path:
     out = tmp_path_factory.mktemp("by_ray")
-    train(settings(tiny_shards, out, recipe=tiny(12), workers=1))
+    train(settings(tiny_shards, out, recipe=tiny(8), workers=1))
     return out
 
 
 def test_ray_train_takes_the_same_steps_as_this_process(tiny_shards: str, tmp_path: Path, by_ray: Path) -> None:
-    train(settings(tiny_shards, tmp_path, recipe=tiny(12)))
+    train(settings(tiny_shards, tmp_path, recipe=tiny(8)))
     # Another number of threads may sum in another order, and AdamW makes whole steps of a last bit's sign.
     for one, other in zip(rows(tmp_path)[:3], rows(by_ray)[:3], strict=True):
         assert one["location_loss"] == pytest.approx(other["location_loss"], rel=1e-3)
-    assert [row["epoch"] for row in rows(by_ray)] == list(range(1, 13))
+    assert [row["epoch"] for row in rows(by_ray)] == list(range(1, 9))
 
 
 def test_a_ray_worker_killed_is_replaced_and_the_run_goes_on_from_the_last_checkpoint(
@@ -156,11 +156,11 @@ def test_a_ray_worker_killed_is_replaced_and_the_run_goes_on_from_the_last_check
 
     killer = threading.Thread(target=murder, daemon=True)
     killer.start()
-    train(settings(tiny_shards, out, recipe=tiny(12), workers=1))
+    train(settings(tiny_shards, out, recipe=tiny(8), workers=1))
     killer.join()
     assert len(victims) == 1
     assert "lost a worker" in capfd.readouterr().err
-    assert [row["epoch"] for row in rows(out)] == list(range(1, 13))
+    assert [row["epoch"] for row in rows(out)] == list(range(1, 9))
     assert_same_run(out, by_ray)
 
 
