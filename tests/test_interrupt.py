@@ -203,8 +203,11 @@ def test_ctrl_c_while_the_libraries_are_imported_says_so_too(tmp_path: Path) -> 
     process, log = begin(
         "train", ["smoke", "--shards", str(tmp_path), "--out", str(tmp_path / "out")], tmp_path / "log"
     )
-    time.sleep(0.7)
+    loaded = Path(f"/proc/{process.pid}/maps")  # before, Python starts, and is ended by Ctrl-C in its own words
+    assert wait_for(lambda: "libtorch" in loaded.read_text(), BEGINS), log.read_text()
     process.send_signal(signal.SIGINT)
-    # Python ends itself by the signal; 2: it was quicker.
-    assert process.wait(ENDS) in (-signal.SIGINT, 128 + signal.SIGINT, 2)
+    code = process.wait(ENDS)
+    # Python ends itself by the signal, or with 1 where some library's end has it forget that; 2: it was quicker.
+    assert code in (-signal.SIGINT, 1, 128 + signal.SIGINT, 2)
+    assert STOPPED in log.read_text() or code == 2
     assert "Traceback" not in log.read_text()
