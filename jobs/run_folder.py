@@ -144,11 +144,12 @@ class Keeper:
     def epoch_over(self, now: Callable[[], Checkpoint], history: list[dict[str, Any]]) -> None:
         """After an epoch, whose row is the last of `history`."""
         epoch = len(history)
+        # Before its checkpoint: a row without one is dropped by the next run, an epoch without its row would stay so.
+        self._curves.write(history)
         if epoch % self._run.checkpoint_epochs == 0 or epoch == self._run.recipe.schedule.epochs:
             self._write(now())
         else:
             self.step_over(now)
-        self._curves.write(history)
 
     def _write(self, checkpoint: Checkpoint) -> None:
         self._checkpoints.write(checkpoint)

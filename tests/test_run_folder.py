@@ -122,9 +122,35 @@ def test_a_process_killed_at_a_random_moment_and_run_again_ends_as_if_nothing_ha
     job.end(job.seconds + random.uniform(0, 1.5))
     assert begin(tmp_path / "killed").end().code == 0
     assert_same_run(tmp_path / "killed", tmp_path / "whole")
-    board = EventAccumulator(str(tmp_path / "killed" / "tensorboard"))
+    assert on_board(tmp_path / "killed") == [1, 2, 3]
+
+
+@pytest.mark.parametrize("written", [False, True])
+def test_killed_as_an_epochs_checkpoint_is_written_a_run_has_that_epochs_row_once(
+    tiny_shards: str, tmp_path: Path, undisturbed: Path, written: bool
+) -> None:
+    write = Checkpoints.write
+
+    def killed(checkpoints: Checkpoints, checkpoint: Checkpoint) -> None:
+        if checkpoint.epoch < 1 or written:
+            write(checkpoints, checkpoint)
+        if checkpoint.epoch == 1:
+            raise Killed
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Checkpoints, "write", killed)
+        with pytest.raises(Killed):
+            train(settings(tiny_shards, tmp_path))
+    train(settings(tiny_shards, tmp_path))
+    assert_same_run(tmp_path, undisturbed)
+    assert on_board(tmp_path) == [1, 2, 3]
+
+
+def on_board(out: Path) -> list[int]:
+    """The epochs that TensorBoard shows."""
+    board = EventAccumulator(str(out / "tensorboard"))
     board.Reload()
-    assert [event.step for event in board.Scalars("location_loss")] == [1, 2, 3]
+    return [event.step for event in board.Scalars("location_loss")]
 
 
 @pytest.fixture(scope="module")
