@@ -27,7 +27,6 @@ from model.training import Training
 from pipeline import storage
 from pipeline.records import InputError, Unfinished
 
-ROOT = Path(__file__).parent.parent
 TIMES = {"seconds", "images_per_second"}
 FLAGS = ("--epochs", 3, "--batch-size", 2, "--part-dim", 16, "--discriminator-channels", 16, "--dropout", 0.5)
 
@@ -120,6 +119,7 @@ def test_a_process_killed_at_a_random_moment_and_run_again_ends_as_if_nothing_ha
         assert job.code is None
         time.sleep(0.01)
     job.end(job.seconds + random.uniform(0, 1.5))
+    time.sleep(1)  # TensorBoard orders a run's files by the second in which each was begun
     assert begin(tmp_path / "killed").end().code == 0
     assert_same_run(tmp_path / "killed", tmp_path / "whole")
     assert on_board(tmp_path / "killed") == [1, 2, 3]
@@ -141,6 +141,7 @@ def test_killed_as_an_epochs_checkpoint_is_written_a_run_has_that_epochs_row_onc
         patch.setattr(Checkpoints, "write", killed)
         with pytest.raises(Killed):
             train(settings(tiny_shards, tmp_path))
+    time.sleep(1)  # TensorBoard orders a run's files by the second in which each was begun
     train(settings(tiny_shards, tmp_path))
     assert_same_run(tmp_path, undisturbed)
     assert on_board(tmp_path) == [1, 2, 3]
@@ -153,23 +154,8 @@ def on_board(out: Path) -> list[int]:
     return [event.step for event in board.Scalars("location_loss")]
 
 
-@pytest.fixture(scope="module")
-def by_ray(tiny_shards: str, tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) -> Path:
-    out = tmp_path_factory.mktemp("by_ray")
-    train(settings(tiny_shards, out, recipe=tiny(8), workers=1))
-    return out
-
-
-def test_ray_train_takes_the_same_steps_as_this_process(tiny_shards: str, tmp_path: Path, by_ray: Path) -> None:
-    train(settings(tiny_shards, tmp_path, recipe=tiny(8)))
-    # Another number of threads may sum in another order, and AdamW makes whole steps of a last bit's sign.
-    for one, other in zip(rows(tmp_path)[:3], rows(by_ray)[:3], strict=True):
-        assert one["location_loss"] == pytest.approx(other["location_loss"], rel=1e-3)
-    assert [row["epoch"] for row in rows(by_ray)] == list(range(1, 9))
-
-
 def test_a_ray_worker_killed_is_replaced_and_the_run_goes_on_from_the_last_checkpoint(
-    tiny_shards: str, tmp_path: Path, by_ray: Path, capfd: pytest.CaptureFixture[str]
+    tiny_shards: str, tmp_path: Path, ray_cluster: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
     victims: list[int] = []
     out = tmp_path / "killed"
@@ -187,7 +173,8 @@ def test_a_ray_worker_killed_is_replaced_and_the_run_goes_on_from_the_last_check
     assert len(victims) == 1
     assert "lost a worker" in capfd.readouterr().err
     assert [row["epoch"] for row in rows(out)] == list(range(1, 9))
-    assert_same_run(out, by_ray)
+    train(settings(tiny_shards, tmp_path / "whole", recipe=tiny(8), workers=1))
+    assert_same_run(out, tmp_path / "whole")
 
 
 def test_the_last_checkpoints_are_kept_and_a_damaged_one_gives_way_to_the_one_before(

@@ -127,6 +127,17 @@ def test_damaged_images_are_counted_in_the_row_and_said_once_an_epoch(
         assert ("the first of them is train-drone-" in note) == (number == 3)
 
 
+def test_ray_train_takes_the_same_steps_as_this_process(tiny_shards: str, tmp_path: Path, ray_cluster: None) -> None:
+    train(settings(tiny_shards, tmp_path / "here", tiny(1)))
+    train(settings(tiny_shards, tmp_path / "ray", tiny(1), workers=1))
+    here, there = weights(tmp_path / "here"), weights(tmp_path / "ray")
+    # Another number of threads may sum in another order, and AdamW makes whole steps of a last bit's sign.
+    assert all(torch.allclose(here[name].float(), there[name].float(), atol=1e-3, rtol=1e-3) for name in here)
+    [one], [other] = rows(tmp_path / "here"), rows(tmp_path / "ray")
+    assert one["location_loss"] == pytest.approx(other["location_loss"], rel=1e-4)
+    assert [row["epoch"] for row in rows(tmp_path / "ray")] == [1]
+
+
 def test_synchronised_batchnorm_without_gpus_is_refused(tiny_shards: str, tmp_path: Path, ray_cluster: None) -> None:
     recipe = replace(tiny(1), sync_bn=True)
     with pytest.raises(InputError, match="2 workers have no GPUs, expected GPUs"):
