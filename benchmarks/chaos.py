@@ -16,11 +16,11 @@ from statistics import median
 
 import tyro
 
-sys.path.extend(str(Path(__file__).parents[1] / "tests" / folder) for folder in ("", "chaos"))
+sys.path.append(str(Path(__file__).parents[1]))
 
-from campaign import Verdict, cases, trial
-from grounds import ground
-from stages import STAGES
+from tests.chaos.campaign import Verdict, cases, trial
+from tests.chaos.grounds import ground
+from tests.chaos.stages import STAGES
 
 
 @dataclass(frozen=True, kw_only=True)

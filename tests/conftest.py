@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import hypothesis
 import pytest
-from launcher import Launcher
+from tests.launcher import Launcher
 
 if TYPE_CHECKING:
     from model.pvda import FeatureEncoder

@@ -74,7 +74,7 @@ class Launcher:
     def __init__(self, scratch: Path, environment: Mapping[str, str]) -> None:
         self._log, self._jobs = scratch / "job.log", dict[int, Job]()
         self._server = subprocess.Popen(
-            [sys.executable, __file__], cwd=ROOT, text=True, bufsize=1, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            [sys.executable, "-m", "tests.launcher"], cwd=ROOT, text=True, bufsize=1, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             env=os.environ | environment | {"PYTHONPATH": os.pathsep.join(PATH)},
         )  # fmt: skip
         self._started: list[int] = []

@@ -6,7 +6,7 @@ from typing import Any
 
 import pyarrow as pa
 import pytest
-from test_evaluation import TEST_SET, made_table
+from tests.test_evaluation import TEST_SET, made_table
 
 from pipeline.comparison import compare, latex, markdown
 from pipeline.evaluation import EvaluationSettings, evaluate

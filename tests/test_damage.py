@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from damaging import MENDS, damages, found_or_equal, look_or_say_gone, sentence_of
+from tests.damaging import MENDS, damages, found_or_equal, look_or_say_gone, sentence_of
 
 from pipeline import rejects, sealed, shard_records, storage
 from pipeline.confidence import Confidence, read_confidence, write_confidence

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from damaging import damages, found_or_equal, look_or_say_gone, sentence_of
+from tests.damaging import damages, found_or_equal, look_or_say_gone, sentence_of
 
 from model.checkpoint import SEAL_BYTES, Checkpoint, CheckpointError, dumps, loads, refuse_damaged
 from model.pvda import FeatureEncoder, PVDAConfig

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from damaging import damages, found_or_equal, look_or_say_gone
-from index_tables import write_gallery
+from tests.damaging import damages, found_or_equal, look_or_say_gone
+from tests.index_tables import write_gallery
 
 from pipeline.evaluation import EvaluationSettings, plan
 from pipeline.features import open_table

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from damaging import MENDS, damages, found_or_equal, look_or_say_gone, sentence_of
+from tests.damaging import MENDS, damages, found_or_equal, look_or_say_gone, sentence_of
 from PIL import Image
 
 from jobs.recipes import smoke

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from damaging import say_again
+from tests.damaging import say_again
 
 from pipeline.embed import EmbeddingSettings, Encoder, Network, embed_gallery
 from pipeline.feature_parts import read_rejected

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from damaging import say_again
+from tests.damaging import say_again
 
 from pipeline import cluster, sealed, storage
 from pipeline.embed import EmbeddingSettings, Encoder, Incomplete, Network, embed_gallery

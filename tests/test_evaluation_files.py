@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from test_evaluation import TEST_SET, made_table
+from tests.test_evaluation import TEST_SET, made_table
 
 from jobs import evaluate as job
 from pipeline import breakdowns, storage

@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from index_tables import clustered, write_table_part
+from tests.index_tables import clustered, write_table_part
 
 from pipeline import feature_rows
 from pipeline.feature_rows import RowReader, readable

@@ -4,9 +4,9 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from test_report import TOWN, jpeg
-from test_report_map import A, B, query
-from test_report_sections import full, merged
+from tests.test_report import TOWN, jpeg
+from tests.test_report_map import A, B, query
+from tests.test_report_sections import full, merged
 
 from pipeline.figures import write_figures
 

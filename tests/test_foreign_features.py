@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.io
-from test_evaluation import TEST_SET, made_table
+from tests.test_evaluation import TEST_SET, made_table
 
 from pipeline import exports
 from pipeline.evaluation import EvaluationSettings, evaluate

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from index_tables import write_gallery
+from tests.index_tables import write_gallery
 
 from pipeline.gallery_map import GalleryMap, gallery_map
 from pipeline.index import Index

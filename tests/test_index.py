@@ -6,7 +6,7 @@ import faiss
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from index_tables import write_gallery
+from tests.index_tables import write_gallery
 
 from pipeline import storage
 from pipeline.feature_selection import Box

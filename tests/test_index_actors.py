@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from index_tables import write_gallery
+from tests.index_tables import write_gallery
 
 from pipeline.features import open_table
 from pipeline.index import Index

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from index_tables import clustered, write_gallery, write_table_part
+from tests.index_tables import clustered, write_gallery, write_table_part
 
 from pipeline import index_build, index_work, sealed, storage
 from pipeline.features import open_table

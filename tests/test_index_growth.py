@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from index_tables import clustered, write_gallery, write_table_part
+from tests.index_tables import clustered, write_gallery, write_table_part
 
 from pipeline import index_work
 from pipeline.features import open_table

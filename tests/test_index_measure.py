@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from index_tables import clustered, write_gallery
+from tests.index_tables import clustered, write_gallery
 
 from pipeline.features import open_table
 from pipeline.index import Index

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from launcher import Launcher
+from tests.launcher import Launcher
 from PIL import Image
 
 from jobs import STOPPED

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import faiss
 import pytest
-from launcher import Ended, Launcher
+from tests.launcher import Ended, Launcher
 
 ROOT = Path(__file__).parent.parent
 JOBS = [

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from launcher import Launcher
+from tests.launcher import Launcher
 from rich.console import Console
 
 from jobs.config_table import config_table, show_config

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from PIL import Image
-from test_report_sections import GAP, GROUPS, PARTS
+from tests.test_report_sections import GAP, GROUPS, PARTS
 
 from pipeline import report
 from pipeline.report_inputs import Extras, Findings

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from test_report import TOWN, findings, jpeg, result
+from tests.test_report import TOWN, findings, jpeg, result
 
 from pipeline import report
 from pipeline.report_choice import pair_up

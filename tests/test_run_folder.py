@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 import torch
-from launcher import Job, Launcher
-from processes import below, named, strike
+from tests.launcher import Job, Launcher
+from tests.processes import below, named, strike
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from jobs.recipes import Recipe, smoke

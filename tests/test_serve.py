@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import below, named
-from test_photo_encoder import facts, photo
+from tests.processes import below, named
+from tests.test_photo_encoder import facts, photo
 
 from jobs.photo_encoder import PhotoEncoder
 from jobs.serve import Settings, load, main

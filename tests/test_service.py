@@ -12,7 +12,7 @@ import pytest
 from aiohttp import web
 from aiohttp.test_utils import BaseTestServer, TestClient
 from PIL import Image
-from test_service_question import bomb, photo
+from tests.test_service_question import bomb, photo
 
 from pipeline.index import Hit
 from pipeline.locate import Answer, Position

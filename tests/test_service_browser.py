@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 from aiohttp import web
-from test_report_browser import ARGUMENTS, CHROMIUM, sync_api
-from test_service import TOKEN, Engine
-from test_service_question import photo
+from tests.test_report_browser import ARGUMENTS, CHROMIUM, sync_api
+from tests.test_service import TOKEN, Engine
+from tests.test_service_question import photo
 
 from pipeline.service.app import Service
 from pipeline.service.settings import ServiceSettings

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from aiohttp.test_utils import TestClient, TestServer
-from test_service_question import photo
+from tests.test_service_question import photo
 
 from pipeline import sealed
 from pipeline.features import Floats, PartFooter, PartRows, write_part

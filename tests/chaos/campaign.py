@@ -11,11 +11,11 @@ import shutil
 import signal
 from dataclasses import dataclass, field
 
-from faults import DAMAGE, KILLS, PLACES, STORAGE, Damaged, damage
-from grounds import Ground, Undisturbed
-from launcher import Ended
-from processes import strike
-from stages import Stage
+from tests.chaos.faults import DAMAGE, KILLS, PLACES, STORAGE, Damaged, damage
+from tests.chaos.grounds import Ground, Undisturbed
+from tests.launcher import Ended
+from tests.processes import strike
+from tests.chaos.stages import Stage
 
 TRIES = 6
 "Runs after the faults in which the stage has to come to its end."

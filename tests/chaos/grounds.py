@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from faults import STORAGE
-from launcher import PATH, Ended, Job, Launcher
-from processes import cluster, daemons, working
-from stages import Content, Stage
+from tests.chaos.faults import STORAGE
+from tests.launcher import PATH, Ended, Job, Launcher
+from tests.processes import cluster, daemons, working
+from tests.chaos.stages import Content, Stage
 
 PATIENCE = 180.0
 "Seconds, and ten times as long as an undisturbed run, after which a run counts as hung."

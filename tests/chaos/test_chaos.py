@@ -6,9 +6,9 @@ benchmarks/chaos.py is the long one. What that found stands here first, by its s
 from collections.abc import Iterator
 
 import pytest
-from campaign import Case, Verdict, cases, trial
-from grounds import Ground, ground
-from stages import STAGES, Stage
+from tests.chaos.campaign import Case, Verdict, cases, trial
+from tests.chaos.grounds import Ground, ground
+from tests.chaos.stages import STAGES, Stage
 
 FAULTS = 10
 "Per stage, besides those that once did harm."

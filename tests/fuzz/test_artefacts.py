@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fuzz.bounds import bounded, examples
-from fuzz.hostile import damaged, twisted
+from tests.fuzz.bounds import bounded, examples
+from tests.fuzz.hostile import damaged, twisted
 from pipeline import storage
 from pipeline.confidence import FEATURES, Confidence, read_confidence, write_confidence
 from pipeline.feature_parts import PartFooter, PartRows, read_rejected, write_part

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from fuzz.bounds import bounded, examples
-from fuzz.hostile import damaged, numbers
+from tests.fuzz.bounds import bounded, examples
+from tests.fuzz.hostile import damaged, numbers
 from pipeline.sources.camera_tags import read_tags
 from pipeline.sources.image_blocks import Blocks, UnreadableTag, find_blocks
 from pipeline.sources.kml import place_of_kml

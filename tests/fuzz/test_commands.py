@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fuzz.bounds import bounded, examples
+from tests.fuzz.bounds import bounded, examples
 from jobs import cli
 
 NUMBERS = [

@@ -15,8 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rasterio.transform import Affine
 
-from fuzz.bounds import bounded, examples
-from fuzz.hostile import damaged
+from tests.fuzz.bounds import bounded, examples
+from tests.fuzz.hostile import damaged
 from pipeline.records import ImageRecord, InputError, Rejection
 from pipeline.sources.geotiff import GeoTiff
 from pipeline.transforms import DecodeError

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from fuzz.bounds import bounded, examples
-from fuzz.hostile import damaged
+from tests.fuzz.bounds import bounded, examples
+from tests.fuzz.hostile import damaged
 from pipeline.inspection import inspect
 from pipeline.transforms import DecodeError, decode, resize
 

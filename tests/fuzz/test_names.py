@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from fuzz.bounds import bounded, examples
-from fuzz.hostile import NAMES
+from tests.fuzz.bounds import bounded, examples
+from tests.fuzz.hostile import NAMES
 from jobs import cli
 from pipeline import progress as told
 from pipeline.packing import PackingSettings, pack

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fuzz.bounds import bounded, examples
-from fuzz.hostile import damaged, names, numbers, twisted, values
+from tests.fuzz.bounds import bounded, examples
+from tests.fuzz.hostile import damaged, names, numbers, twisted, values
 from pipeline.records import ImageRecord, InputError, Rejection
 from pipeline.sources import mbtiles
 from pipeline.sources.denseuav import parse_line, read_geotags

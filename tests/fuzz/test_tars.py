@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fuzz.bounds import bounded, examples
-from fuzz.hostile import damaged, names, twisted, values
+from tests.fuzz.bounds import bounded, examples
+from tests.fuzz.hostile import damaged, names, twisted, values
 from pipeline.foreign import open_manifest
 from pipeline.records import InputError, Split, View
 from pipeline.samples import read_locations, read_shard

@@ -15,8 +15,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fuzz.bounds import bounded, examples
-from fuzz.hostile import VALUES, damaged, twisted, values
+from tests.fuzz.bounds import bounded, examples
+from tests.fuzz.hostile import VALUES, damaged, twisted, values
 from jobs.import_weights import Settings, import_weights
 from model.checkpoint import Checkpoint, CheckpointError, build_encoder, dumps, fingerprint, loads
 from model.pvda import FeatureEncoder, PVDAConfig

@@ -1,0 +1,1 @@
+"""The fault campaign: processes killed and files damaged on purpose."""
