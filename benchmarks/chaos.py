@@ -1,9 +1,11 @@
-"""The fault campaign in full: every stage of the road meets at least so many faults, and a table says what came of them.
+"""The fault campaign in full: every stage of the road meets at least so many faults, and a table
+says what came of them.
 
     benchmarks/chaos.py [--faults 100] [--stages pack embed ...] [--seed 0] [--out runs/chaos]
 
-Prints a line per trial, and in the end the table of docs/reliability.md. Hours on two cores where all stages are asked for;
-exit code 1 where anything was lost, doubled, hung, or said with a traceback instead of a sentence.
+Prints a line per trial, and in the end the table of docs/reliability.md. Hours on two cores where
+all stages are asked for; exit code 1 where anything was lost, doubled, hung, or said with a
+traceback instead of a sentence.
 """
 
 import sys
@@ -60,7 +62,11 @@ def main(settings: Settings) -> None:
 def line(verdict: Verdict) -> str:
     """One trial in a line."""
     case = verdict.case
-    wrong = [*(verdict.lost or verdict.doubled)[:2], *verdict.unclear[:1], *["hung"] * verdict.hangs]
+    wrong = [
+        *(verdict.lost or verdict.doubled)[:2],
+        *verdict.unclear[:1],
+        *["hung"] * verdict.hangs,
+    ]
     return (
         f"{case.stage.name:9} seed {case.seed:2} {case.name:28} faults {verdict.faults} runs {verdict.runs} "
         f"restart {verdict.restart_seconds:.1f} s {verdict.found} "
@@ -81,10 +87,15 @@ def table(verdicts: Iterable[Verdict]) -> str:
     for (stage, name), group in groups.items():
         found = [sum(one.found == how for one in group) for how in ("by default", "by --verify")]
         figures = [
-            sum(one.faults for one in group), sum(one.runs for one in group), sum(bool(one.lost) for one in group),
-            sum(bool(one.doubled) for one in group), sum(one.hangs for one in group), sum(bool(one.unclear) for one in group),
-            f"{found[0]} / {found[1]}", f"{median(one.restart_seconds for one in group):.1f}",
-        ]  # fmt: skip
+            sum(one.faults for one in group),
+            sum(one.runs for one in group),
+            sum(bool(one.lost) for one in group),
+            sum(bool(one.doubled) for one in group),
+            sum(one.hangs for one in group),
+            sum(bool(one.unclear) for one in group),
+            f"{found[0]} / {found[1]}",
+            f"{median(one.restart_seconds for one in group):.1f}",
+        ]
         lines.append(f"| {stage} | {name} | " + " | ".join(map(str, figures)) + " |")
     return "\n".join(lines)
 

@@ -1,4 +1,5 @@
-"""What it costs to find damage: one line per figure, each a ratio to the same work without, in one run.
+"""What it costs to find damage: one line per figure, each a ratio to the same work without, in one
+run.
 
 In: made vectors, networks and images in a temporary folder. Files are read from the page cache.
 
@@ -20,10 +21,17 @@ import torch
 
 from model.checkpoint import Checkpoint, dumps, refuse_damaged
 from model.pvda import FeatureEncoder, PVDAConfig
-from pipeline import parquet_files
-from pipeline.feature_parts import PAGE_BYTES, ROW_GROUP, PartFooter, PartRows, verify_part, write_part
-from pipeline.feature_rows import RowReader
-from pipeline.features import open_table
+from pipeline.core import parquet as parquet_files
+from pipeline.features.part import (
+    PAGE_BYTES,
+    ROW_GROUP,
+    PartFooter,
+    PartRows,
+    verify_part,
+    write_part,
+)
+from pipeline.features.row_reader import RowReader
+from pipeline.features.table import open_table
 
 DIMENSION, REPEATS, NEIGHBOURS = 2048, 7, 30
 
@@ -43,9 +51,14 @@ def make_rows(count: int) -> PartRows:
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     keys = [f"gallery-drone-{number:08d}" for number in range(count)]
     return PartRows(
-        keys=keys, locations=[key[-8:-2] for key in keys], views=["drone"] * count, splits=["gallery"] * count,
-        lats=[47.0] * count, lons=[8.0] * count, embeddings_BD=vectors,
-    )  # fmt: skip
+        keys=keys,
+        locations=[key[-8:-2] for key in keys],
+        views=["drone"] * count,
+        splits=["gallery"] * count,
+        lats=[47.0] * count,
+        lons=[8.0] * count,
+        embeddings_BD=vectors,
+    )
 
 
 def table(folder: Path, count: int) -> None:
@@ -66,7 +79,9 @@ def table(folder: Path, count: int) -> None:
 
     def read_plain() -> None:
         with open(plain, "rb") as stream:
-            for _ in pq.ParquetFile(stream, buffer_size=1 << 20).iter_batches(columns=["embedding"]):
+            for _ in pq.ParquetFile(stream, buffer_size=1 << 20).iter_batches(
+                columns=["embedding"]
+            ):
                 pass
 
     def read_sealed() -> None:
@@ -75,13 +90,29 @@ def table(folder: Path, count: int) -> None:
                 pass
 
     megabytes = Path(path).stat().st_size / 1e6
-    say("Parquet written, with seal and checksums", seconds(write_sealed), seconds(write_plain), megabytes)
+    say(
+        "Parquet written, with seal and checksums",
+        seconds(write_sealed),
+        seconds(write_plain),
+        megabytes,
+    )
     say("embeddings read, checksums compared", seconds(read_sealed), seconds(read_plain), megabytes)
-    say("every byte of a part (--verify)", seconds(lambda: verify_part(path)), seconds(read_plain), megabytes)
+    say(
+        "every byte of a part (--verify)",
+        seconds(lambda: verify_part(path)),
+        seconds(read_plain),
+        megabytes,
+    )
     small = folder / "small"
     small.mkdir()
-    write_part(str(small / "part.parquet"), make_rows(64), PartFooter(fingerprint="f", shard_sha256="s", rows=64))
-    print(f"a table of one small part opened: {1e3 * seconds(lambda: open_table(str(small))):.2f} ms")
+    write_part(
+        str(small / "part.parquet"),
+        make_rows(64),
+        PartFooter(fingerprint="f", shard_sha256="s", rows=64),
+    )
+    print(
+        f"a table of one small part opened: {1e3 * seconds(lambda: open_table(str(small))):.2f} ms"
+    )
     single_rows(folder, count)
 
 
@@ -117,16 +148,22 @@ def checkpoint() -> None:
     plain = seconds(lambda: torch.load(io.BytesIO(data), weights_only=True))
     look = seconds(lambda: refuse_damaged(data, "it"))
     megabytes = len(data) / 1e6
-    print(f"a checkpoint of {megabytes:.0f} MB: looked at in {look:.3f} s, {100 * look / megabytes:.3f} s per 100 MB")
+    print(
+        f"a checkpoint of {megabytes:.0f} MB: looked at in {look:.3f} s, {100 * look / megabytes:.3f} s per 100 MB"
+    )
     say("a checkpoint loaded", look + plain, plain, megabytes)
 
 
 def say(what: str, with_it: float, without: float, megabytes: float) -> None:
-    print(f"{what}: {with_it / without:.2f} x the time without; {100 * with_it / megabytes:.3f} s per 100 MB")
+    print(
+        f"{what}: {with_it / without:.2f} x the time without; {100 * with_it / megabytes:.3f} s per 100 MB"
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rows", type=int, default=32_768)
     rows = parser.parse_args().rows
     with tempfile.TemporaryDirectory() as folder:

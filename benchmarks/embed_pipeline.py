@@ -1,8 +1,9 @@
-"""What embedding loses between the tar and the Parquet part: the stage's speed over that of the encoder alone, and its memory.
+"""What embedding loses between the tar and the Parquet part: the stage's speed over that of the
+encoder alone, and its memory.
 
-Prints one line per figure: images per second from tar to Parquet by one worker as a ratio to the same encoder, in the same
-worker and by turns, on tensors that are there already (goal: at least 0.95); and a worker's peak memory over many images to
-that over a quarter of them (goal: 1).
+Prints one line per figure: images per second from tar to Parquet by one worker as a ratio to the
+same encoder, in the same worker and by turns, on tensors that are there already (goal: at least
+0.95); and a worker's peak memory over many images to that over a quarter of them (goal: 1).
 """
 
 import argparse
@@ -22,14 +23,14 @@ import numpy as np
 import ray
 from PIL import Image
 
-from jobs.encoders import CALIBRATING, PROBES, EncoderSettings, network_of
+from jobs.encoding.encoder import CALIBRATING, PROBES, EncoderSettings, network_of
 from model.checkpoint import Checkpoint, dumps
 from model.pvda import FeatureEncoder, PVDAConfig
-from pipeline import cluster
-from pipeline.embed import EmbeddingSettings
-from pipeline.records import Split, View
-from pipeline.shard_embedder import IN_FLIGHT, Assignment, Network, ShardEmbedder
-from pipeline.shards import Shard
+from pipeline.core import cluster
+from pipeline.core.records import Split, View
+from pipeline.features.embed import EmbeddingSettings
+from pipeline.features.embed_worker import IN_FLIGHT, Assignment, Network, ShardEmbedder
+from pipeline.shards.manifest import Shard
 
 SOURCE_SIDE = 512
 "Of the images in the tars: University-1652's."
@@ -61,11 +62,15 @@ class Measured(ShardEmbedder):
 
 
 def photo(rng: np.random.Generator) -> bytes:
-    """A JPEG with the detail of a photo: noise at several scales, the finer the fainter; some 50 kB."""
+    """A JPEG with the detail of a photo: noise at several scales, the finer the fainter; some 50
+    kB.
+    """
     image = np.zeros((SOURCE_SIDE, SOURCE_SIDE, 3))
     for cells, share in ((4, 0.45), (16, 0.3), (64, 0.15), (256, 0.1)):
         coarse = Image.fromarray(rng.integers(0, 256, (cells, cells, 3), np.uint8))
-        image += share * np.asarray(coarse.resize((SOURCE_SIDE, SOURCE_SIDE), Image.Resampling.BICUBIC))
+        image += share * np.asarray(
+            coarse.resize((SOURCE_SIDE, SOURCE_SIDE), Image.Resampling.BICUBIC)
+        )
     buffer = io.BytesIO()
     Image.fromarray(image.astype(np.uint8)).save(buffer, "JPEG", quality=90)
     return buffer.getvalue()
@@ -77,29 +82,48 @@ def write_shard(folder: str, number: int, images: list[bytes], count: int) -> Sh
     with tarfile.open(Path(folder) / f"{name}.tar", "w") as tar:
         for position in range(count):
             key = f"{name}-{position:06d}"
-            said = {"key": key, "location": key, "view": "drone", "split": "gallery", "geotag": None}
-            for ending, data in (("jpg", images[position % len(images)]), ("json", json.dumps(said).encode())):
+            said = {
+                "key": key,
+                "location": key,
+                "view": "drone",
+                "split": "gallery",
+                "geotag": None,
+            }
+            for ending, data in (
+                ("jpg", images[position % len(images)]),
+                ("json", json.dumps(said).encode()),
+            ):
                 member = tarfile.TarInfo(f"{key}.{ending}")
                 member.size = len(data)
                 tar.addfile(member, io.BytesIO(data))
-    return Shard(name=name, split=Split.GALLERY, view=View.DRONE, samples=count, bytes=0, sha256="s")
+    return Shard(
+        name=name, split=Split.GALLERY, view=View.DRONE, samples=count, bytes=0, sha256="s"
+    )
 
 
 def checkpoint(depth: Any, size: int) -> bytes:
     """A network with the weights that chance gave it."""
     config = PVDAConfig(depth=depth, image_size=size)
     weights = {"modules": {"encoder": FeatureEncoder(config).state_dict()}}
-    return dumps(Checkpoint(network=config, recipe={}, locations=[], epoch=0, history=[], state=weights))
+    return dumps(
+        Checkpoint(network=config, recipe={}, locations=[], epoch=0, history=[], state=weights)
+    )
 
 
 def network(
-    made: bytes, batch: int, folder: str, images: list[bytes], settings: EncoderSettings | None = None
+    made: bytes,
+    batch: int,
+    folder: str,
+    images: list[bytes],
+    settings: EncoderSettings | None = None,
 ) -> Network:
     """The network as a worker builds it, checked by images of a shard of its own."""
     apart = Path(folder) / "probe"
     apart.mkdir(exist_ok=True)
     write_shard(str(apart), 0, images, PROBES + CALIBRATING)
-    embedding = EmbeddingSettings(shards=str(apart), out="none", split=Split.GALLERY, view=View.DRONE, batch_size=batch)
+    embedding = EmbeddingSettings(
+        shards=str(apart), out="none", split=Split.GALLERY, view=View.DRONE, batch_size=batch
+    )
     return network_of(made, "the benchmark's", embedding, settings)
 
 
@@ -112,7 +136,11 @@ def worker(folder: str, made: Network, batch: int, threads: int, decoders: int) 
         threads=threads,
         decode_threads=decoders,
     )
-    actor: Any = ray.remote(num_cpus=threads)(Measured).options(max_concurrency=IN_FLIGHT).remote(given, made)
+    actor: Any = (
+        ray.remote(num_cpus=threads)(Measured)
+        .options(max_concurrency=IN_FLIGHT)
+        .remote(given, made)
+    )
     ray.get(actor.start.remote())
     return actor
 
@@ -148,7 +176,9 @@ def measure_speed(given: argparse.Namespace, images: list[bytes]) -> None:
             through.append(rate)
             alone.append(ray.get(actor.resident.remote(SHARDS * each // 2)))
             told = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.items())
-            print(f"  round: {rate:.1f} images/s through the stage, {max(alone[-2:]):.1f} resident ({told})")
+            print(
+                f"  round: {rate:.1f} images/s through the stage, {max(alone[-2:]):.1f} resident ({told})"
+            )
         # Other work on the machine only ever slows: the best of either is what it can do.
         print(
             f"tar -> Parquet, ResNet-{given.depth} at {given.size} px, batches of {given.batch}, {threads} threads, "
@@ -176,14 +206,18 @@ def measure_memory(given: argparse.Namespace, images: list[bytes]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--depth", type=int, default=50, choices=(18, 34, 50, 101), help="layers of the ResNet")
+    parser.add_argument(
+        "--depth", type=int, default=50, choices=(18, 34, 50, 101), help="layers of the ResNet"
+    )
     parser.add_argument("--size", type=int, default=256, help="side of its images in pixels")
     parser.add_argument("--batch", type=int, default=8, help="images of a pass")
     parser.add_argument("--threads", type=int, help="of the encoder; all cores by default")
     parser.add_argument("--decoders", type=int, default=1, help="threads that decode")
     parser.add_argument("--seconds", type=float, default=8.0, help="of a measured run, roughly")
     parser.add_argument("--rounds", type=int, default=3, help="of the two in turn")
-    parser.add_argument("--few", type=int, default=1000, help="images for the memory to compare with")
+    parser.add_argument(
+        "--few", type=int, default=1000, help="images for the memory to compare with"
+    )
     given = parser.parse_args()
     cluster.connect()
     rng = np.random.default_rng(0)

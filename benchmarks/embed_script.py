@@ -1,8 +1,10 @@
-"""Embedding against a plain script that does what the field's test scripts do, in one run; prints one line per figure.
+"""Embedding against a plain script that does what the field's test scripts do, in one run; prints
+one line per figure.
 
-The script: PyTorch as it comes (eager, float32, channels first), a DataLoader over image files, Pillow to decode and resize,
-image and mirror image in two passes. Ours: one worker from tar to Parquet part, float32 compiled (goal: at least 1.8 x the
-script) and int8 (goal: at least 5 x). Beside each: the cosine of its embeddings with the script's. By turns, the best of each.
+The script: PyTorch as it comes (eager, float32, channels first), a DataLoader over image files,
+Pillow to decode and resize, image and mirror image in two passes. Ours: one worker from tar to
+Parquet part, float32 compiled (goal: at least 1.8 x the script) and int8 (goal: at least 5 x).
+Beside each: the cosine of its embeddings with the script's. By turns, the best of each.
 
     python benchmarks/embed_script.py [--images 96]
 """
@@ -23,10 +25,10 @@ from PIL import Image
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from jobs.encoders import EncoderSettings
+from jobs.encoding.encoder import EncoderSettings
 from model.checkpoint import build_encoder, loads
-from pipeline import cluster
-from pipeline.features import Floats
+from pipeline.core import cluster
+from pipeline.features.table import Floats
 
 
 class Files(Dataset[Tensor]):
@@ -63,15 +65,21 @@ def ours(
 ) -> Callable[[], tuple[float, Floats]]:
     """A worker that is there already; each call embeds all images from tars to parts."""
     settings = EncoderSettings(precision=precision, compiling="always")  # type: ignore[arg-type]
-    actor = worker(folder, network(made, given.batch, folder, images, settings), given.batch, given.threads, 1)
+    actor = worker(
+        folder, network(made, given.batch, folder, images, settings), given.batch, given.threads, 1
+    )
     half = given.images // 2
     shards = [
-        write_shard(folder, number, images[number * half :] + images[: number * half], half) for number in range(2)
+        write_shard(folder, number, images[number * half :] + images[: number * half], half)
+        for number in range(2)
     ]
 
     def measured() -> tuple[float, Floats]:
         rate, _ = end_to_end(actor, shards)
-        parts = [pq.read_table(f"{folder}/table/{shard.name}.parquet", columns=["embedding"]) for shard in shards]
+        parts = [
+            pq.read_table(f"{folder}/table/{shard.name}.parquet", columns=["embedding"])
+            for shard in shards
+        ]
         flat = [part["embedding"].combine_chunks().flatten().to_numpy() for part in parts]
         return rate, np.concatenate(flat).reshape(given.images, -1)
 
@@ -80,7 +88,9 @@ def ours(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
-    parser.add_argument("--depth", type=int, default=50, choices=(18, 34, 50, 101), help="layers of the ResNet")
+    parser.add_argument(
+        "--depth", type=int, default=50, choices=(18, 34, 50, 101), help="layers of the ResNet"
+    )
     parser.add_argument("--size", type=int, default=256, help="side of its images in pixels")
     parser.add_argument("--batch", type=int, default=16, help="images of a pass")
     parser.add_argument("--images", type=int, default=64, help="of a measured run; even")
@@ -99,15 +109,26 @@ def main() -> None:
             paths.append(Path(folder) / f"{number:05d}.jpg")
             paths[-1].write_bytes(data)
         for precision in ("float32", "int8"):  # one worker at a time: two would share the cores
-            print(f"tar -> Parquet in {precision}, ResNet-{given.depth} at {given.size} px, mirrored: ", flush=True)
-            print(compare(precision, made, images, paths, str(Path(folder) / precision), given), flush=True)
+            print(
+                f"tar -> Parquet in {precision}, ResNet-{given.depth} at {given.size} px, mirrored: ",
+                flush=True,
+            )
+            print(
+                compare(precision, made, images, paths, str(Path(folder) / precision), given),
+                flush=True,
+            )
             ray.shutdown()
             cluster.connect()
     ray.shutdown()
 
 
 def compare(
-    precision: str, made: bytes, images: list[bytes], paths: list[Path], folder: str, given: argparse.Namespace
+    precision: str,
+    made: bytes,
+    images: list[bytes],
+    paths: list[Path],
+    folder: str,
+    given: argparse.Namespace,
 ) -> str:
     """Ours and the script by turns: what is to be said of them."""
     Path(folder).mkdir()

@@ -1,7 +1,8 @@
 """A feature table of crops of real overhead images by a trained network, for `index.py --table`.
 
-Crops of any place, size and turn of each image, resized to the network's pixels; crops of one image lie near each other as
-views of one place do. Queries are crops of their own. The table is what `embed_gallery` writes, in float16.
+Crops of any place, size and turn of each image, resized to the network's pixels; crops of one image
+lie near each other as views of one place do. Queries are crops of their own. The table is what
+`embed_gallery` writes, in float16.
 """
 
 import argparse
@@ -16,10 +17,10 @@ from index import PART_ROWS
 from torch import Tensor
 
 from model.checkpoint import build_encoder, loads
-from model.inference import embed
-from pipeline.features import Floats, PartFooter, PartRows, write_part
-from pipeline.index_measure import HELD_QUERIES
-from pipeline.transforms import decode
+from model.inference.embed import embed
+from pipeline.features.table import Floats, PartFooter, PartRows, write_part
+from pipeline.images.decode import decode
+from pipeline.index.recall import HELD_QUERIES
 
 BATCH = 512
 SMALLEST = 0.35  # side of a crop as a share of the image's
@@ -30,14 +31,18 @@ METRES_PER_DEGREE = 111_195
 def crops(
     images_N: list[Tensor], order: np.ndarray, size: int, rng: np.random.Generator
 ) -> Iterator[tuple[Tensor, np.ndarray]]:
-    """Batches (B, 3, size, size) of bytes, and of each crop its image and the middle (x, y) in pixels, (B, 3)."""
+    """Batches (B, 3, size, size) of bytes, and of each crop its image and the middle (x, y) in
+    pixels, (B, 3).
+    """
     for first in range(0, len(order), BATCH):
         batch, said = [], []
         for number in order[first : first + BATCH].tolist():
             image_3HW = images_N[number]
             side = int(min(image_3HW.shape[1:]) * rng.uniform(SMALLEST, 1))
             y, x = (int(rng.integers(0, extent - side + 1)) for extent in image_3HW.shape[1:])
-            turned = image_3HW[None, :, y : y + side, x : x + side].rot90(int(rng.integers(4)), (2, 3))
+            turned = image_3HW[None, :, y : y + side, x : x + side].rot90(
+                int(rng.integers(4)), (2, 3)
+            )
             crop = turned.contiguous(
                 memory_format=torch.channels_last
             )  # bytes of this layout are resized five times as fast
@@ -47,7 +52,13 @@ def crops(
 
 
 def write_split(
-    arguments: argparse.Namespace, images_N: list[Tensor], names: list[str], split: str, view: str, rows: int, seed: int
+    arguments: argparse.Namespace,
+    images_N: list[Tensor],
+    names: list[str],
+    split: str,
+    view: str,
+    rows: int,
+    seed: int,
 ) -> None:
     """Embed `rows` crops and write the parts of one split."""
     checkpoint = loads(Path(arguments.checkpoint).read_bytes(), arguments.checkpoint)
@@ -65,15 +76,24 @@ def write_split(
             number, count = written // PART_ROWS, len(said)
             degrees = said[:, 1:] * METRES_PER_PIXEL / METRES_PER_DEGREE
             part = PartRows(
-                keys=[f"{split}-{view}-{written + i:09d}" for i in range(count)], locations=[names[int(n)] for n in said[:, 0]],
-                views=[view] * count, splits=[split] * count, lats=(said[:, 0] // 40 * 0.01 + degrees[:, 1]).tolist(),
-                lons=(said[:, 0] % 40 * 0.01 + degrees[:, 0]).tolist(), embeddings_BD=vectors,
-            )  # fmt: skip
-            footer = PartFooter(fingerprint=arguments.checkpoint, shard_sha256=f"{seed}-{number}", rows=count)
-            write_part(f"{arguments.out}/{split}-{view}-{number:06d}.parquet", part, footer, "float16")
+                keys=[f"{split}-{view}-{written + i:09d}" for i in range(count)],
+                locations=[names[int(n)] for n in said[:, 0]],
+                views=[view] * count,
+                splits=[split] * count,
+                lats=(said[:, 0] // 40 * 0.01 + degrees[:, 1]).tolist(),
+                lons=(said[:, 0] % 40 * 0.01 + degrees[:, 0]).tolist(),
+                embeddings_BD=vectors,
+            )
+            footer = PartFooter(
+                fingerprint=arguments.checkpoint, shard_sha256=f"{seed}-{number}", rows=count
+            )
+            write_part(
+                f"{arguments.out}/{split}-{view}-{number:06d}.parquet", part, footer, "float16"
+            )
             written, waiting = written + count, []
             print(
-                f"{split}: {written:,} of {rows:,}, {written / (time.perf_counter() - begin):.0f} crops/s", flush=True
+                f"{split}: {written:,} of {rows:,}, {written / (time.perf_counter() - begin):.0f} crops/s",
+                flush=True,
             )
 
 

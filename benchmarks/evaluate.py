@@ -1,7 +1,9 @@
-"""What exact ranking costs at University-1652's size, as a ratio to the bare matrix products it cannot do without.
+"""What exact ranking costs at University-1652's size, as a ratio to the bare matrix products it
+cannot do without.
 
-Prints one line per figure: seconds, and the ratio to the float32 products of the same blocks in the same run. `--large` ranks
-a gallery of the size of University160k's, streamed from a table on disk, and says how far memory grew beyond the start.
+Prints one line per figure: seconds, and the ratio to the float32 products of the same blocks in the
+same run. `--large` ranks a gallery of the size of University160k's, streamed from a table on disk,
+and says how far memory grew beyond the start.
 """
 
 import argparse
@@ -14,21 +16,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.features import Floats, PartFooter, PartRows, open_table, write_part
-from pipeline.metrics import Whole
-from pipeline.ranking import Blocks, Side, rank, side_of_array
-from pipeline.retrieval import side_of
+from pipeline.core.arrays import Whole
+from pipeline.features.table import Floats, PartFooter, PartRows, open_table, write_part
+from pipeline.retrieval.ranking import Blocks, Side, rank, side_of_array
+from pipeline.retrieval.tasks import side_of
 
 DIMENSION = 2048
 TASKS = {"drone->satellite": (701, 54, 951, 1), "satellite->drone": (701, 1, 951, 54)}
-LARGE_GALLERY = 168_437  # University-1652's 951 satellite images and University160k's 167,486 distractors
+LARGE_GALLERY = (
+    168_437  # University-1652's 951 satellite images and University160k's 167,486 distractors
+)
 PART_ROWS = 8_192
 ROUNDS = 3  # the best of so many, in turn: other work on the machine slows some of them
 
 
 def made_vectors(label_Q: Whole, centres_LD: Floats, seed: int, noise: float = 3) -> Floats:
-    """Unit vectors round the centre of each label; cosines of true matches are near 0.1, of others near 0."""
-    vectors_QD = np.random.default_rng(seed).standard_normal((len(label_Q), DIMENSION), dtype=np.float32)
+    """Unit vectors round the centre of each label; cosines of true matches are near 0.1, of others
+    near 0.
+    """
+    vectors_QD = np.random.default_rng(seed).standard_normal(
+        (len(label_Q), DIMENSION), dtype=np.float32
+    )
     vectors_QD *= noise
     vectors_QD += centres_LD[label_Q]
     vectors_QD /= np.linalg.norm(vectors_QD, axis=1, keepdims=True)
@@ -63,7 +71,9 @@ def measure(name: str, queries: Side, gallery: Side, rounds: int = ROUNDS) -> No
         begin = time.perf_counter()
         found = rank(queries, gallery)
         totals.append(time.perf_counter() - begin)
-    ratios = ", ".join(f"{total / product:.2f}" for total, product in zip(totals, products, strict=True))
+    ratios = ", ".join(
+        f"{total / product:.2f}" for total, product in zip(totals, products, strict=True)
+    )
     print(
         f"{name} {len(queries.keys)} x {len(gallery.keys)} x {DIMENSION}: {min(totals):.1f} s, "
         f"{min(totals) / min(products):.2f} x the float32 products (round by round {ratios}; "
@@ -76,25 +86,36 @@ def write_tables(folder: str, query_rows: int, gallery_rows: int) -> None:
     """Queries of 54 a location, and a gallery whose first 951 rows show the locations."""
     centres_LD = np.random.default_rng(0).standard_normal((951, DIMENSION), dtype=np.float32)
     around_LD = np.concatenate([centres_LD, np.zeros((1, DIMENSION), np.float32)])
-    for split, view, rows, each in (("query", "drone", query_rows, 54), ("gallery", "satellite", gallery_rows, 1)):
+    for split, view, rows, each in (
+        ("query", "drone", query_rows, 54),
+        ("gallery", "satellite", gallery_rows, 1),
+    ):
         for first in range(0, rows, PART_ROWS):
             label = np.arange(first, min(first + PART_ROWS, rows)) // each
             count = len(label)
             write_part(
                 f"{folder}/{split}/{first:07d}.parquet",
                 PartRows(
-                    keys=[f"{split}-{first + i}" for i in range(count)], locations=[f"{i:06d}" for i in label],
-                    views=[view] * count, splits=[split] * count, lats=[None] * count, lons=[None] * count,
-                    embeddings_BD=made_vectors(np.minimum(label, len(centres_LD)), around_LD, first + each),
+                    keys=[f"{split}-{first + i}" for i in range(count)],
+                    locations=[f"{i:06d}" for i in label],
+                    views=[view] * count,
+                    splits=[split] * count,
+                    lats=[None] * count,
+                    lons=[None] * count,
+                    embeddings_BD=made_vectors(
+                        np.minimum(label, len(centres_LD)), around_LD, first + each
+                    ),
                 ),
                 PartFooter(fingerprint="f", shard_sha256=f"{first}", rows=count),
-            )  # fmt: skip
+            )
 
 
 class Interleaved:
-    """A gallery that keeps its last blocks, and multiplies each with each block of queries right after that was ranked.
+    """A gallery that keeps its last blocks, and multiplies each with each block of queries right
+    after that was ranked.
 
-    On a machine with other work, products measured minutes before or after the ranking say little; these share its minutes.
+    On a machine with other work, products measured minutes before or after the ranking say little;
+    these share its minutes.
     """
 
     def __init__(self, queries: Side, gallery: Side) -> None:
@@ -133,7 +154,9 @@ def large(scale: float) -> None:
         )
         maker.start()
         maker.join()
-        queries, gallery = (side_of(open_table(f"{folder}/{split}")) for split in ("query", "gallery"))
+        queries, gallery = (
+            side_of(open_table(f"{folder}/{split}")) for split in ("query", "gallery")
+        )
         beside = Interleaved(queries, gallery)
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         begin = time.perf_counter()
@@ -151,7 +174,9 @@ def large(scale: float) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scale", type=float, default=1.0, help="share of the locations to rank")
-    parser.add_argument("--large", action="store_true", help="a gallery of 168,437 images from disk; takes minutes")
+    parser.add_argument(
+        "--large", action="store_true", help="a gallery of 168,437 images from disk; takes minutes"
+    )
     arguments = parser.parse_args()
     scale: float = arguments.scale
     if arguments.large:

@@ -1,14 +1,17 @@
-"""From photos to positions: single, together and as a flight, over real overhead images, and whether the confidence is true.
+"""From photos to positions: single, together and as a flight, over real overhead images, and
+whether the confidence is true.
 
-In: a folder of 1,000 overhead images. Out: one line per figure on the terminal, and reliability.svg. 900 places: about 400 to
-train on, 100 held out of training to calibrate by, 200 to find, 200 more in the gallery; `smoke` trained for a few minutes. Run
-again, it goes on where it was.
+In: a folder of 1,000 overhead images. Out: one line per figure on the terminal, and
+reliability.svg. 900 places: about 400 to train on, 100 held out of training to calibrate by, 200 to
+find, 200 more in the gallery; `smoke` trained for a few minutes. Run again, it goes on where it
+was.
 
     python benchmarks/locate.py --textures IMAGES --out DIR
 
-A flight visits unseen places, each time the nearest that it has not seen, with a photo of each from a random side, at 15 m/s;
-the track is told that no UAV is faster than 25 m/s. Photos from outside the gallery are those of unseen places whose images,
-and those around, are left out of what the search finds; in other flights every fifth photo is one.
+A flight visits unseen places, each time the nearest that it has not seen, with a photo of each from
+a random side, at 15 m/s; the track is told that no UAV is faster than 25 m/s. Photos from outside
+the gallery are those of unseen places whose images, and those around, are left out of what the
+search finds; in other flights every fifth photo is one.
 """
 
 import argparse
@@ -20,29 +23,29 @@ import numpy as np
 
 from jobs.calibrate import Settings as CalibrationSettings
 from jobs.calibrate import calibrate_index
-from jobs.encoders import network_of
-from jobs.recipes import smoke
+from jobs.encoding.encoder import network_of
 from jobs.train import Settings as TrainSettings
 from jobs.train import train
-from pipeline import cluster, storage
-from pipeline.calibration import Example
-from pipeline.calibration_examples import Labelled, examples
-from pipeline.confidence import Confidence
-from pipeline.embed import EmbeddingSettings, embed_gallery
-from pipeline.features import open_table
-from pipeline.flight import motion_over, settle
-from pipeline.gallery_map import GalleryMap, gallery_map
-from pipeline.index import Index
-from pipeline.index_build import IndexSettings, build_index
-from pipeline.locate import Answer, answers
-from pipeline.metrics import Doubles
-from pipeline.packing import PackingSettings, pack
-from pipeline.positions import haversine_m
-from pipeline.records import Split, View
-from pipeline.reliability import Bin, calibration_error, diagram, reliability
-from pipeline.simulate import SimulationSettings, simulate
+from jobs.training.recipes import smoke
+from pipeline.core import cluster, storage
+from pipeline.core.arrays import Doubles
+from pipeline.core.geo import haversine_m
+from pipeline.core.records import Split, View
+from pipeline.features.embed import EmbeddingSettings, embed_gallery
+from pipeline.features.table import open_table
+from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.searcher import Index
+from pipeline.locate.calibration import Example
+from pipeline.locate.calibration_data import Labelled, examples
+from pipeline.locate.confidence import Confidence
+from pipeline.locate.flight import motion_over, settle
+from pipeline.locate.gallery_map import GalleryMap, gallery_map
+from pipeline.locate.locate import Answer, answers
+from pipeline.locate.reliability import Bin, calibration_error, diagram, reliability
+from pipeline.locate.track import TRACKED, Start
+from pipeline.shards.pack import PackingSettings, pack
+from pipeline.simulation.simulate import SimulationSettings, simulate
 from pipeline.sources.university1652 import University1652
-from pipeline.track import TRACKED, Start
 
 SPEED, WITHIN_M = 15.0, 25.0
 FLIGHTS, STOPS, DRAWS = 8, 25, 5
@@ -52,16 +55,26 @@ START_M = 500.0
 
 def prepare(textures: str, out: Path, epochs: int) -> None:
     """The data, the network, the index and its calibration, as the jobs make them."""
-    flights, shards, run, table, index = (str(out / name) for name in ("flights", "shards", "run", "table", "index"))
+    flights, shards, run, table, index = (
+        str(out / name) for name in ("flights", "shards", "run", "table", "index")
+    )
     cluster.connect()
     simulate(
         SimulationSettings(
-            out=flights, textures=textures, train_locations=500, test_locations=200, distractors=200, views=12, size=96
+            out=flights,
+            textures=textures,
+            train_locations=500,
+            test_locations=200,
+            distractors=200,
+            views=12,
+            size=96,
         )
     )
     pack(University1652(), PackingSettings(root=flights, out=shards))
     checkpoint = train(
-        TrainSettings(recipe=replace(smoke(epochs=epochs), hold_out=0.2), shards=shards, out=run, workers=0)
+        TrainSettings(
+            recipe=replace(smoke(epochs=epochs), hold_out=0.2), shards=shards, out=run, workers=0
+        )
     )
     for split, view in ((Split.QUERY, View.DRONE), (Split.GALLERY, View.SATELLITE)):
         embedding = EmbeddingSettings(shards=shards, out=table, split=split, view=view)
@@ -77,7 +90,11 @@ def photos_of(table: str) -> Labelled:
     facts = [
         {"key": key, "location": location, "view": "drone", "geotag": {"lat": lat, "lon": lon}}
         for key, location, lat, lon in zip(
-            *(values.tolist() for values in (labels.keys, labels.locations, labels.lats, labels.lons)), strict=True
+            *(
+                values.tolist()
+                for values in (labels.keys, labels.locations, labels.lats, labels.lons)
+            ),
+            strict=True,
         )
     ]
     return Labelled(facts=facts, embeddings_QD=rows.embeddings())
@@ -94,30 +111,47 @@ def grouped(photos: Labelled, views: int) -> Labelled:
 
 def within(found: list[Answer], asked: list[Example]) -> Doubles:
     """Which answers, known or not, lie within the tolerance: 1 or 0."""
-    at_Q2 = np.array([(one.position.lat, one.position.lon) if one.position else (np.nan, np.nan) for one in found])
-    return np.asarray(haversine_m(at_Q2, np.array([(one.lat, one.lon) for one in asked])) <= WITHIN_M, np.float64)
+    at_Q2 = np.array(
+        [
+            (one.position.lat, one.position.lon) if one.position else (np.nan, np.nan)
+            for one in found
+        ]
+    )
+    return np.asarray(
+        haversine_m(at_Q2, np.array([(one.lat, one.lon) for one in asked])) <= WITHIN_M, np.float64
+    )
 
 
 def confidence_lines(name: str, asked: list[Example], confidence: Confidence) -> list[Bin]:
-    """How true the probabilities are, and what the threshold does, photos from inside and outside the gallery alike.
+    """How true the probabilities are, and what the threshold does, photos from inside and outside
+    the gallery alike.
 
     Returns the bins of the reliability diagram.
     """
-    inside, outside = (answers([getattr(one, side) for one in asked], 5, confidence) for side in ("inside", "outside"))
+    inside, outside = (
+        answers([getattr(one, side) for one in asked], 5, confidence)
+        for side in ("inside", "outside")
+    )
     right_Q = within(inside, asked)
     said_N = np.array([one.probability for one in [*inside, *outside]], np.float64)
     bins = reliability(said_N, np.concatenate([right_Q, 0 * right_Q]), np.ones(len(said_N)))
     known_Q = np.array([one.known for one in inside])
     print(f"{name}: within {WITHIN_M:.0f} m {right_Q.mean():.1%} of {len(asked)}")
     print(f"{name}: expected calibration error {calibration_error(bins):.3f}")
-    print(f"{name}: from outside the gallery, answered unknown {np.mean([not one.known for one in outside]):.1%}")
+    print(
+        f"{name}: from outside the gallery, answered unknown {np.mean([not one.known for one in outside]):.1%}"
+    )
     print(f"{name}: right answers lost to unknown {1 - known_Q[right_Q > 0].mean():.1%}")
-    print(f"{name}: of the answers given inside the gallery, right {right_Q[known_Q].mean():.1%} of {known_Q.sum()}")
+    print(
+        f"{name}: of the answers given inside the gallery, right {right_Q[known_Q].mean():.1%} of {known_Q.sum()}"
+    )
     return bins
 
 
 def flights_of(asked: list[Example], rng: np.random.Generator) -> list[list[int]]:
-    """Numbers of the photos of each flight: always to the nearest place not seen yet, a photo of each."""
+    """Numbers of the photos of each flight: always to the nearest place not seen yet, a photo of
+    each.
+    """
     by_place: dict[str, list[int]] = {}
     for number, one in enumerate(asked):
         by_place.setdefault(one.location, []).append(number)
@@ -141,19 +175,29 @@ def flights_of(asked: list[Example], rng: np.random.Generator) -> list[list[int]
     return [[int(rng.choice(by_place[name])) for name in flight] for flight in flights]
 
 
-def track_lines(asked: list[Example], confidence: Confidence, gallery: GalleryMap, strangers: float) -> None:
-    """Photos of flights, a share of them from outside the gallery: each by itself, as tracks, and with a rough start."""
+def track_lines(
+    asked: list[Example], confidence: Confidence, gallery: GalleryMap, strangers: float
+) -> None:
+    """Photos of flights, a share of them from outside the gallery: each by itself, as tracks, and
+    with a rough start.
+    """
     rng = np.random.default_rng(0)
     motion = motion_over(gallery, 25.0)
-    rows: dict[str, list[tuple[bool, bool, bool]]] = {name: [] for name in ("single", "track", "track with start")}
+    rows: dict[str, list[tuple[bool, bool, bool]]] = {
+        name: [] for name in ("single", "track", "track with start")
+    }
     spent = 0.0
     for _ in range(DRAWS):
         for flight in flights_of(asked, rng):
             stops = [asked[number] for number in flight]
             strange = rng.uniform(size=len(stops)) < strangers
             at_T2 = np.array([(one.lat, one.lon) for one in stops])
-            times = np.concatenate([[0.0], np.cumsum(haversine_m(at_T2[1:], at_T2[:-1]) / SPEED + 1)]).tolist()
-            hits = [one.outside if odd else one.inside for one, odd in zip(stops, strange, strict=True)]
+            times = np.concatenate(
+                [[0.0], np.cumsum(haversine_m(at_T2[1:], at_T2[:-1]) / SPEED + 1)]
+            ).tolist()
+            hits = [
+                one.outside if odd else one.inside for one, odd in zip(stops, strange, strict=True)
+            ]
             single = answers(hits, TRACKED, confidence)
             off = float(rng.uniform(-0.5, 0.5)) * START_M / 111_195
             start = Start(lat=float(at_T2[0, 0]) + off, lon=float(at_T2[0, 1]), radius_m=START_M)
@@ -165,7 +209,9 @@ def track_lines(asked: list[Example], confidence: Confidence, gallery: GalleryMa
             spent += time.perf_counter() - begin
             for name, said in found.items():
                 known = [one.known for one in said]
-                rows[name] += zip(strange.tolist(), known, (within(said, stops) > 0).tolist(), strict=True)
+                rows[name] += zip(
+                    strange.tolist(), known, (within(said, stops) > 0).tolist(), strict=True
+                )
     for name, told in rows.items():
         odd_N, known_N, right_N = np.array(told).T
         kind = f"flights, {strangers:.0%} from outside, {name}"
@@ -177,8 +223,12 @@ def track_lines(asked: list[Example], confidence: Confidence, gallery: GalleryMa
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--textures", required=True, help="folder of overhead images, 0.3 m a pixel")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--textures", required=True, help="folder of overhead images, 0.3 m a pixel"
+    )
     parser.add_argument("--out", required=True, type=Path)
     parser.add_argument("--epochs", type=int, default=100)
     given = parser.parse_args()
@@ -186,17 +236,22 @@ def main() -> None:
     index = Index(str(given.out / "index"))
     confidence = calibrate_index(
         CalibrationSettings(
-            checkpoint=str(given.out / "run" / "last.pt"), shards=str(given.out / "shards"), index=index.path
+            checkpoint=str(given.out / "run" / "last.pt"),
+            shards=str(given.out / "shards"),
+            index=index.path,
         )
     )
     photos = photos_of(str(given.out / "table"))
     nobody = Labelled(facts=[], embeddings_QD=photos.embeddings_QD[:0])
     for views in (1, 3, 12):
         asked = examples(grouped(photos, views), nobody, index, confidence.spacing_m, WITHIN_M)
-        bins = confidence_lines(f"{views} photo{'s together' if views > 1 else ''}", asked, confidence)
+        bins = confidence_lines(
+            f"{views} photo{'s together' if views > 1 else ''}", asked, confidence
+        )
         if views == 1:
             picture = diagram(
-                bins, "Probability said and share that was right, test photos inside and outside the gallery"
+                bins,
+                "Probability said and share that was right, test photos inside and outside the gallery",
             )
             storage.write_bytes(str(given.out / "reliability.svg"), picture.encode())
             for strangers in (0.0, 0.2):

@@ -1,9 +1,12 @@
-"""The service under load from another process: latency and rate at 1, 8 and 32 clients, and what batching gains.
+"""The service under load from another process: latency and rate at 1, 8 and 32 clients, and what
+batching gains.
 
-Starts jobs/serve.py twice, with batches of one photo and as it comes, and asks them by turns; each client sends its next photo
-when the last one is answered. Prints one line per figure. Loopback only; bounded in time and number of requests.
+Starts jobs/serve.py twice, with batches of one photo and as it comes, and asks them by turns; each
+client sends its next photo when the last one is answered. Prints one line per figure. Loopback
+only; bounded in time and number of requests.
 
-    python benchmarks/serve.py --checkpoint run/last.pt --index index --photos flights/test/query_drone
+    python benchmarks/serve.py --checkpoint run/last.pt --index index --photos
+    flights/test/query_drone
 """
 
 import argparse
@@ -82,7 +85,9 @@ async def load(
         while time.perf_counter() < began + seconds and (number := next(numbers)) < MOST_REQUESTS:
             sent = time.perf_counter()
             async with session.post(
-                f"{address}/locate", data=photos[number % len(photos)], headers={"Content-Type": "image/jpeg"}
+                f"{address}/locate",
+                data=photos[number % len(photos)],
+                headers={"Content-Type": "image/jpeg"},
             ) as response:
                 await response.read()
             statuses[response.status] += 1
@@ -121,14 +126,21 @@ async def measure(given: argparse.Namespace, addresses: dict[str, str]) -> None:
             await load(
                 session, address, photos, given.batch, given.seconds
             )  # each size of batch is slow the first time
-        print(f"{len(photos)} photos, {mean:.0f} kB in the mean; {given.rounds} rounds of {given.seconds:g} s by turns")
+        print(
+            f"{len(photos)} photos, {mean:.0f} kB in the mean; {given.rounds} rounds of {given.seconds:g} s by turns"
+        )
         for clients in given.clients:
-            found: dict[str, list[tuple[list[float], float, Counter[int]]]] = {name: [] for name in addresses}
+            found: dict[str, list[tuple[list[float], float, Counter[int]]]] = {
+                name: [] for name in addresses
+            }
             for _ in range(given.rounds):
                 for name, address in addresses.items():
                     found[name].append(await load(session, address, photos, clients, given.seconds))
             alone, batched = (told(clients, name, rounds) for name, rounds in found.items())
-            print(f"{clients:2d} clients: batching {batched / alone:.2f} x the photos/s of one at a time", flush=True)
+            print(
+                f"{clients:2d} clients: batching {batched / alone:.2f} x the photos/s of one at a time",
+                flush=True,
+            )
 
 
 def main() -> None:
@@ -136,14 +148,23 @@ def main() -> None:
     parser.add_argument("--checkpoint", required=True)
     parser.add_argument("--index", required=True)
     parser.add_argument("--photos", required=True, help="folder of JPEGs")
-    parser.add_argument("--clients", type=int, nargs="+", default=CLIENTS, help="that ask at the same time")
+    parser.add_argument(
+        "--clients", type=int, nargs="+", default=CLIENTS, help="that ask at the same time"
+    )
     parser.add_argument("--seconds", type=float, default=6, help="of a measurement")
     parser.add_argument("--rounds", type=int, default=2, help="of all in turn")
     parser.add_argument("--batch", type=int, default=8, help="photos of the larger batch")
     given = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # told to stop, it ends the services too
-    with service(given, "--batch", "1") as alone, service(given, "--batch", str(given.batch)) as batched:
-        asyncio.run(measure(given, {"one at a time": alone, f"batches of up to {given.batch}": batched}))
+    signal.signal(
+        signal.SIGTERM, lambda *_: sys.exit(143)
+    )  # told to stop, it ends the services too
+    with (
+        service(given, "--batch", "1") as alone,
+        service(given, "--batch", str(given.batch)) as batched,
+    ):
+        asyncio.run(
+            measure(given, {"one at a time": alone, f"batches of up to {given.batch}": batched})
+        )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
-"""Packing against `tar cf` of the same files: one line per figure, each a ratio to tar in the same run.
+"""Packing against `tar cf` of the same files: one line per figure, each a ratio to tar in the same
+run.
 
-In: made JPEGs in a temporary folder (or `--scratch`). Reading is from the page cache in both, writing ends with fsync in both.
+In: made JPEGs in a temporary folder (or `--scratch`). Reading is from the page cache in both,
+writing ends with fsync in both.
 
     python benchmarks/shards.py [--images 20000]
 """
@@ -18,8 +20,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from pipeline import cluster
-from pipeline.packing import PackingSettings, pack
+from pipeline.core import cluster
+from pipeline.shards.pack import PackingSettings, pack
 from pipeline.sources.university1652 import University1652
 
 PER_LOCATION = 50
@@ -29,14 +31,18 @@ def make_images(root: Path, images: int, side: int) -> int:
     """That many JPEGs in University-1652's layout, no two alike; returns their bytes in all."""
     rng, total = np.random.default_rng(0), 0
     for number in range(images):
-        path = root / f"train/drone/{number // PER_LOCATION:04d}/image-{number % PER_LOCATION:02d}.jpeg"
+        path = (
+            root
+            / f"train/drone/{number // PER_LOCATION:04d}/image-{number % PER_LOCATION:02d}.jpeg"
+        )
         path.parent.mkdir(parents=True, exist_ok=True)
         if number < 200:
             coarse = Image.fromarray(rng.integers(0, 256, (side // 8, side // 8, 3), np.uint8))
             coarse.resize((side, side), Image.Resampling.BICUBIC).save(path, quality=92)
         else:  # a picture made before, told apart by its comment: drawing all would take an hour
             data = (
-                root / f"train/drone/{number % 200 // PER_LOCATION:04d}/image-{number % PER_LOCATION:02d}.jpeg"
+                root
+                / f"train/drone/{number % 200 // PER_LOCATION:04d}/image-{number % PER_LOCATION:02d}.jpeg"
             ).read_bytes()
             path.write_bytes(data[:2] + b"\xff\xfe\x00\x0a" + f"{number:08d}".encode() + data[2:])
         total += path.stat().st_size

@@ -1,4 +1,5 @@
-"""Pictures per second and core that the simulator makes, the making of the worlds and JPEG included: a line per figure.
+"""Pictures per second and core that the simulator makes, the making of the worlds and JPEG
+included: a line per figure.
 
 `python benchmarks/simulate.py` measures; with `--sheet FILE` it writes a contact sheet instead: one location a row, the
 satellite's picture first, then the flight from its first view to its last.
@@ -17,7 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from PIL import Image
 
-from pipeline.worlds.location import Order, photograph
+from pipeline.simulation.location import Order, photograph
 
 VIEWS = 54
 
@@ -31,25 +32,40 @@ def measure(size: int, locations: int) -> float:
     return locations * (VIEWS + 1) / (time.process_time() - begin)
 
 
-def contact_sheet(path: Path, *, locations: list[int], views: int = 5, size: int = 160, seed: int = 0) -> None:
+def contact_sheet(
+    path: Path, *, locations: list[int], views: int = 5, size: int = 160, seed: int = 0
+) -> None:
     """Write a JPEG with a row per location."""
     rows = []
     for location in locations:
         taken = photograph(Order(seed=seed, location=location, views=views, size=size))
-        rows.append(np.hstack([np.asarray(Image.open(io.BytesIO(data))) for data in (taken.satellite, *taken.drone)]))
+        rows.append(
+            np.hstack(
+                [
+                    np.asarray(Image.open(io.BytesIO(data)))
+                    for data in (taken.satellite, *taken.drone)
+                ]
+            )
+        )
     Image.fromarray(np.vstack(rows)).save(path, quality=78)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sheet", type=Path, help="write a contact sheet of made towns to this JPEG")
-    parser.add_argument("--locations", type=int, nargs="+", default=[14, 11, 22, 13, 25, 12, 16], help="its rows")
+    parser.add_argument(
+        "--sheet", type=Path, help="write a contact sheet of made towns to this JPEG"
+    )
+    parser.add_argument(
+        "--locations", type=int, nargs="+", default=[14, 11, 22, 13, 25, 12, 16], help="its rows"
+    )
     asked = parser.parse_args()
     if asked.sheet:
         contact_sheet(asked.sheet, locations=asked.locations)
         return
     for size, locations in ((64, 4), (128, 4), (256, 3), (512, 1)):
-        print(f"simulate: {measure(size, locations):.1f} images/s per core at {size} px, worlds and JPEG included")
+        print(
+            f"simulate: {measure(size, locations):.1f} images/s per core at {size} px, worlds and JPEG included"
+        )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
-"""How fast one core reads, decodes and resizes images for the network, against a plain Pillow loop, and in how much memory.
+"""How fast one core reads, decodes and resizes images for the network, against a plain Pillow loop,
+and in how much memory.
 
-Prints one line per figure: images per second as a ratio to Pillow's (goal at 512 -> 256 px: at least 2.5), the time to
-inspect an image, and the peak memory of a process that streams many images over that of one that streams few (goal: 1).
+Prints one line per figure: images per second as a ratio to Pillow's (goal at 512 -> 256 px: at
+least 2.5), the time to inspect an image, and the peak memory of a process that streams many images
+over that of one that streams few (goal: 1).
 """
 
 import argparse
@@ -19,11 +21,12 @@ import numpy as np
 import torch
 from PIL import Image
 
-from pipeline.inspection import inspect
-from pipeline.records import Split, View
-from pipeline.samples import read_shard
-from pipeline.stream import decoded
-from pipeline.transforms import decode, resize
+from pipeline.batches.ordered import decoded
+from pipeline.core.records import Split, View
+from pipeline.images.decode import decode
+from pipeline.images.inspect import inspect
+from pipeline.images.transforms import resize
+from pipeline.shards.samples import read_shard
 
 CASES = {"512 -> 256": (512, 512, 256), "512 -> 64": (512, 512, 64), "256 -> 128": (256, 256, 128),
          "1000 x 750 -> 256": (1000, 750, 256)}  # fmt: skip
@@ -37,7 +40,9 @@ MEMORY_SIDE, MEMORY_SHARD = 256, 1000
 
 
 def photos(width: int, height: int, count: int) -> list[bytes]:
-    """JPEGs with the detail of a photo: noise at several scales, the finer the fainter; 512 px make some 50 kB."""
+    """JPEGs with the detail of a photo: noise at several scales, the finer the fainter; 512 px make
+    some 50 kB.
+    """
     rng, made = np.random.default_rng(0), []
     for _ in range(count):
         image = np.zeros((height, width, 3))
@@ -71,7 +76,9 @@ def measure_speed(distinct: int) -> None:
     for name, (width, height, size) in CASES.items():
         images = photos(width, height, distinct)
         by_ours(images[0], size)  # torch is imported
-        rounds = [(speed(by_ours, images, size), speed(by_pillow, images, size)) for _ in range(ROUNDS)]
+        rounds = [
+            (speed(by_ours, images, size), speed(by_pillow, images, size)) for _ in range(ROUNDS)
+        ]
         ours, pillow = (float(np.median(column)) for column in zip(*rounds, strict=True))
         ratios = ", ".join(f"{one / other:.2f}" for one, other in rounds)
         kilobytes = np.mean([len(data) for data in images]) / 1000
@@ -83,7 +90,9 @@ def measure_speed(distinct: int) -> None:
         for data in images:
             inspect(data)
         seconds = (time.perf_counter() - began) / len(images)
-        print(f"{name} px: inspection {1e6 * seconds:.1f} microseconds, {seconds * ours:.4f} x decoding and resizing")
+        print(
+            f"{name} px: inspection {1e6 * seconds:.1f} microseconds, {seconds * ours:.4f} x decoding and resizing"
+        )
 
 
 def write_shards(folder: Path, count: int, distinct: int) -> None:
@@ -114,7 +123,11 @@ def peak(folder: str, count: int) -> float:
     """Peak memory in MB of a process of its own that streams so many images."""
     command = [sys.executable, __file__, "--stream", folder, "--images", str(count)]
     told = subprocess.run(
-        command, capture_output=True, text=True, check=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
+        command,
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
     )
     return float(told.stdout)
 
@@ -123,16 +136,22 @@ def measure_memory(few: int, many: int, distinct: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         write_shards(Path(folder), many, distinct)
         low, high = peak(folder, few), peak(folder, many)
-    print(f"peak memory of {many} images streamed: {high / low:.3f} x that of {few} ({high:.0f} MB, {low:.0f} MB)")
+    print(
+        f"peak memory of {many} images streamed: {high / low:.3f} x that of {few} ({high:.0f} MB, {low:.0f} MB)"
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--distinct", type=int, default=DISTINCT, help="images made of each size")
-    parser.add_argument("--few", type=int, default=2_000, help="images streamed for the memory to compare with")
+    parser.add_argument(
+        "--few", type=int, default=2_000, help="images streamed for the memory to compare with"
+    )
     parser.add_argument("--many", type=int, default=20_000, help="images streamed for the memory")
     parser.add_argument(
-        "--stream", metavar="DIR", help="only stream the shards of this folder and print the peak memory"
+        "--stream",
+        metavar="DIR",
+        help="only stream the shards of this folder and print the peak memory",
     )
     parser.add_argument("--images", type=int, default=2_000, help="with --stream: how many")
     given = parser.parse_args()

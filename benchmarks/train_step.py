@@ -1,6 +1,8 @@
-"""What a training step costs when its images are streamed, as a ratio to the same step on one batch that is there already.
+"""What a training step costs when its images are streamed, as a ratio to the same step on one batch
+that is there already.
 
-Prints one line per figure: the ratio (goal: at most 1.03), images per second, and the share of time of each part.
+Prints one line per figure: the ratio (goal: at most 1.03), images per second, and the share of time
+of each part.
 """
 
 import argparse
@@ -15,16 +17,16 @@ import numpy as np
 import torch
 from PIL import Image
 
-from jobs.recipes import Recipe, paper, smoke
-from jobs.run_folder import Run
-from jobs.training_loop import Place, Tensors, Worker
+from jobs.training.checkpoints import Run
+from jobs.training.loop import Place, Tensors, Worker
+from jobs.training.recipes import Recipe, paper, smoke
 from model.losses import adversarial_terms, location_terms
 from model.schedule import Phase
-from pipeline import storage
-from pipeline.records import ImageRecord, Split, View
-from pipeline.shard_plan import ShardPlan
-from pipeline.shard_writing import write_shard
-from pipeline.shards import MANIFEST, Manifest
+from pipeline.core import storage
+from pipeline.core.records import ImageRecord, Split, View
+from pipeline.shards.manifest import MANIFEST, Manifest
+from pipeline.shards.plan import ShardPlan
+from pipeline.shards.writer import write_shard
 from pipeline.sources.university1652 import University1652
 
 NOW = Phase(alpha=0.9, rate_scale=0.01)
@@ -33,7 +35,9 @@ ROUNDS = 3
 
 
 def made_shards(folder: str, side: int, images: int) -> str:
-    """So many satellite images, and as many of a UAV, of `side` pixels: noise at several scales, which JPEG finds hard."""
+    """So many satellite images, and as many of a UAV, of `side` pixels: noise at several scales,
+    which JPEG finds hard.
+    """
     rng, written = np.random.default_rng(0), []
     for view in (View.DRONE, View.SATELLITE):
         records = []
@@ -44,8 +48,12 @@ def made_shards(folder: str, side: int, images: int) -> str:
                 image += np.asarray(coarse.resize((side, side), Image.Resampling.BICUBIC)) / 3
             path = f"{folder}/{view}-{number:04d}.jpg"
             Image.fromarray(image.astype(np.uint8)).save(path, quality=90)
-            records.append(ImageRecord(path=path, split=Split.TRAIN, view=view, location=f"{number:04d}"))
-        plan = ShardPlan(name=f"train-{view}-000000", split=Split.TRAIN, view=view, records=tuple(records))
+            records.append(
+                ImageRecord(path=path, split=Split.TRAIN, view=view, location=f"{number:04d}")
+            )
+        plan = ShardPlan(
+            name=f"train-{view}-000000", split=Split.TRAIN, view=view, records=tuple(records)
+        )
         written.append(write_shard(plan, University1652(), folder, "").shard)
     classes = tuple(f"{number:04d}" for number in range(images))
     manifest = Manifest(shards=tuple(written), classes=classes, packing={}, rejected=0)
@@ -61,7 +69,9 @@ def finished(device: torch.device) -> float:
 
 
 def streamed(worker: Worker, epoch: int, steps: int) -> tuple[float, float]:
-    """Seconds of a step that is fed by the stream, and of these the seconds that it waits for its batch."""
+    """Seconds of a step that is fed by the stream, and of these the seconds that it waits for its
+    batch.
+    """
     batches = worker.batches(epoch)
     step(worker, next(batches))  # the stream starts
     waited, began = 0.0, finished(worker.training.device)
@@ -87,7 +97,9 @@ def step(worker: Worker, batch: Tensors) -> None:
 
 
 def parts(worker: Worker, batch: Tensors, steps: int) -> dict[str, float]:
-    """Seconds of each part of a step: the same computations, one after the other and each waited for."""
+    """Seconds of each part of a step: the same computations, one after the other and each waited
+    for.
+    """
     training, spent = worker.training, defaultdict[str, float](float)
 
     @contextmanager
@@ -131,14 +143,24 @@ def measure(name: str, recipe: Recipe, side: int, steps: int, device: str, compi
         worker = Worker(run, Place(device=device), lambda told: print(told["note"]))
         batch = next(iter(worker.batches(0)))
         resident(worker, batch, 3)  # warm
-        rounds = [(*streamed(worker, epoch, steps), resident(worker, batch, steps)) for epoch in range(ROUNDS)]
+        rounds = [
+            (*streamed(worker, epoch, steps), resident(worker, batch, steps))
+            for epoch in range(ROUNDS)
+        ]
         spent = parts(worker, batch, steps)
     fed, waited, there = (float(np.median(column)) for column in zip(*rounds, strict=True))
     ratios = ", ".join(f"{one / other:.3f}" for one, _, other in rounds)
-    print(f"{name}: streamed step {1000 * fed:.1f} ms, {fed / there:.3f} x the resident step (rounds: {ratios})")
-    print(f"{name}: {2 * recipe.batch_size / fed:.1f} images/s, waits for data {100 * waited / fed:.1f} % of the step")
+    print(
+        f"{name}: streamed step {1000 * fed:.1f} ms, {fed / there:.3f} x the resident step (rounds: {ratios})"
+    )
+    print(
+        f"{name}: {2 * recipe.batch_size / fed:.1f} images/s, waits for data {100 * waited / fed:.1f} % of the step"
+    )
     whole = sum(spent.values())
-    print(f"{name}: " + ", ".join(f"{part} {100 * seconds / whole:.0f} %" for part, seconds in spent.items()))
+    print(
+        f"{name}: "
+        + ", ".join(f"{part} {100 * seconds / whole:.0f} %" for part, seconds in spent.items())
+    )
 
 
 CASES: dict[str, Callable[[], tuple[Recipe, int, int]]] = {

@@ -11,12 +11,15 @@ STOPPED = "stopped; run the same command again to go on"
 Hook = Callable[[type[BaseException], BaseException, TracebackType | None], Any]
 
 
-def _quietly(otherwise: Hook, kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+def _quietly(
+    otherwise: Hook, kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
     if issubclass(kind, KeyboardInterrupt):
         print(STOPPED, file=sys.stderr)
     else:
         otherwise(kind, error, trace)
 
 
-# Before jobs/cli.py has begun: seconds go by while torch and Ray are imported, and Ctrl-C is pressed in these too.
+# Before jobs/command_line/cli.py has begun: seconds go by while torch and Ray are imported, and
+# Ctrl-C is pressed in these too.
 sys.excepthook = partial(_quietly, sys.excepthook)

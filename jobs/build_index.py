@@ -1,28 +1,32 @@
 """Feature table -> FAISS index: `build_index.py --table TABLE --out INDEX`.
 
-And of a finished index: `--extend --table TABLE --out INDEX` adds the table's new parts, `--remove LOCATION ... --out INDEX`
-makes locations answer no more, `--verify --out INDEX` looks at every byte. `--verify` while building: of the table.
+And of a finished index: `--extend --table TABLE --out INDEX` adds the table's new parts, `--remove
+LOCATION ... --out INDEX` makes locations answer no more, `--verify --out INDEX` looks at every
+byte. `--verify` while building: of the table.
 """
 
 import sys
 
 import tyro
 
-from jobs.cli import run
-from pipeline.index_build import IndexSettings, build_index
-from pipeline.index_growth import extend_index, remove_locations, verify_index
+from jobs.command_line.cli import run
+from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.update import extend_index, remove_locations, verify_index
 
 
 def main(settings: IndexSettings) -> None:
     """Build a searchable index of a feature table, within a memory budget.
 
-    Of a finished index: `--extend --table TABLE --out INDEX` adds the table's new parts, `--remove LOCATION ... --out INDEX`
-    makes locations answer no more, `--verify --out INDEX` looks at every byte.
+    Of a finished index: `--extend --table TABLE --out INDEX` adds the table's new parts, `--remove
+    LOCATION ... --out INDEX` makes locations answer no more, `--verify --out INDEX` looks at every
+    byte.
     """
     build_index(settings)
 
 
-def extend(table: str, out: str, extend: tyro.conf.FlagCreatePairsOff[bool] = False, workers: int = 0) -> None:
+def extend(
+    table: str, out: str, extend: tyro.conf.FlagCreatePairsOff[bool] = False, workers: int = 0
+) -> None:
     """Add those parts of a table to a finished index that it does not hold yet."""
     extend_index(table, out, workers)
 

@@ -1,7 +1,8 @@
 """How sure an index's answers are: `calibrate.py --checkpoint FILE --shards DIR --index INDEX`.
 
-Photos of places that the network was not trained on are asked of the index, once with their place in the gallery and once
-without. Writes INDEX/calibration.json, which locate.py and serve.py take from there, and the reliability diagram beside it.
+Photos of places that the network was not trained on are asked of the index, once with their place
+in the gallery and once without. Writes INDEX/calibration.json, which locate.py and serve.py take
+from there, and the reliability diagram beside it.
 """
 
 from dataclasses import dataclass
@@ -9,22 +10,23 @@ from itertools import islice
 
 import numpy as np
 
-from jobs.cli import run
-from jobs.encoders import read_checkpoint
-from jobs.photo_encoder import PhotoEncoder
+from jobs.command_line.cli import run
+from jobs.encoding.encoder import read_checkpoint
+from jobs.encoding.photo_encoder import PhotoEncoder
 from model.checkpoint import loads
-from pipeline import storage
-from pipeline.calibration import Gallery, Judging, calibrate
-from pipeline.calibration_examples import Labelled, examples
-from pipeline.confidence import FILE, Confidence, read_confidence, write_confidence
-from pipeline.foreign import open_manifest
-from pipeline.gallery_map import gallery_map
-from pipeline.index import Index
-from pipeline.progress import console, progress, results
-from pipeline.records import InputError, Split, View
-from pipeline.reliability import diagram
-from pipeline.samples import read_shard
-from pipeline.shards import refuse_missing
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.core.progress import console, progress, results
+from pipeline.core.records import Split, View
+from pipeline.index.searcher import Index
+from pipeline.locate.calibration import Gallery, Judging, calibrate
+from pipeline.locate.calibration_data import Labelled, examples
+from pipeline.locate.confidence import FILE, Confidence, read_confidence, write_confidence
+from pipeline.locate.gallery_map import gallery_map
+from pipeline.locate.reliability import diagram
+from pipeline.shards.external import open_manifest
+from pipeline.shards.manifest import refuse_missing
+from pipeline.shards.samples import read_shard
 
 BATCH = 256
 "Photos that are encoded and asked at a time."
@@ -37,13 +39,15 @@ class Settings(Judging):
     checkpoint: str
     "The network that the index was made with."
     shards: str
-    "Folder or URI of shards with photos of places that the network was not trained on, and the gallery's view of them."
+    """Folder or URI of shards with photos of places that the network was not trained on, and the
+    gallery's view of them."""
     index: str
     "Folder or URI of the index."
     out: str | None = None
     "The calibration; by default INDEX/calibration.json."
     split: Split = Split.TRAIN
-    "Which split's photos; of the training split, those of places held out (train.py --hold-out). Never the test set's."
+    """Which split's photos; of the training split, those of places held out (train.py --hold-out).
+    Never the test set's."""
     view: View = View.DRONE
     "Of the photos."
     gallery_view: View = View.SATELLITE
@@ -58,7 +62,8 @@ class Settings(Judging):
 
 
 def calibrate_index(settings: Settings) -> Confidence:
-    """Calibrate an index, unless its calibration is there; one of another gallery or settings is replaced. Returns it.
+    """Calibrate an index, unless its calibration is there; one of another gallery or settings is
+    replaced. Returns it.
 
     Raises InputError and CheckpointError on unusable input.
     """
@@ -77,18 +82,24 @@ def calibrate_index(settings: Settings) -> Confidence:
     overhead = embedded(settings, encoder, settings.gallery_view, trained_on, None)
     spacing_m = gallery_map(index).spacing_m
     found = examples(photos, overhead, index, spacing_m, settings.tolerance)
-    gallery = Gallery(fingerprint=encoder.fingerprint, rows=len(index), spacing_m=spacing_m, asked=asked)
+    gallery = Gallery(
+        fingerprint=encoder.fingerprint, rows=len(index), spacing_m=spacing_m, asked=asked
+    )
     confidence = calibrate(found, settings, gallery)
     write_confidence(out, confidence)
     picture = f"{out.removesuffix('.json')}.svg"
-    storage.write_bytes(picture, diagram(confidence.bins, f"Reliability over {confidence.photos} photos").encode())
+    storage.write_bytes(
+        picture, diagram(confidence.bins, f"Reliability over {confidence.photos} photos").encode()
+    )
     console.print(told(confidence))
     results.print(f"calibration: {out}, diagram: {picture}", soft_wrap=True)
     return confidence
 
 
 def finished(out: str, index: Index) -> Confidence | None:
-    """The calibration that is there; none where it is another network's or damaged, as it is to be replaced."""
+    """The calibration that is there; none where it is another network's or damaged, as it is to be
+    replaced.
+    """
     try:
         return read_confidence(out, index.facts) if storage.exists(out) else None
     except InputError:
@@ -96,9 +107,14 @@ def finished(out: str, index: Index) -> Confidence | None:
 
 
 def embedded(
-    settings: Settings, encoder: PhotoEncoder, view: View, trained_on: frozenset[str], most: int | None
+    settings: Settings,
+    encoder: PhotoEncoder,
+    view: View,
+    trained_on: frozenset[str],
+    most: int | None,
 ) -> Labelled:
-    """The first images of a view that show places which were not trained on, with their embeddings; damaged ones left out.
+    """The first images of a view that show places which were not trained on, with their embeddings;
+    damaged ones left out.
 
     Shards are in the order of hashes, so the first ones are a fair sample.
     """
@@ -115,7 +131,11 @@ def embedded(
         wanted = islice(samples, most)
         while batch := list(islice(wanted, BATCH)):
             block_BD, rejected = encoder.encode([sample.data for sample in batch])
-            facts += [sample.facts for sample, refused in zip(batch, rejected, strict=True) if refused is None]
+            facts += [
+                sample.facts
+                for sample, refused in zip(batch, rejected, strict=True)
+                if refused is None
+            ]
             blocks.append(block_BD)
             meter.advance(len(batch))
     return Labelled(facts=facts, embeddings_QD=np.concatenate(blocks))
@@ -132,7 +152,9 @@ def told(confidence: Confidence) -> str:
 
 
 def main(settings: Settings) -> None:
-    """Calibrate how sure an index's answers are, on photos of places that the network was not trained on."""
+    """Calibrate how sure an index's answers are, on photos of places that the network was not
+    trained on.
+    """
     calibrate_index(settings)
 
 

@@ -7,15 +7,17 @@ from typing import Annotated
 
 import tyro
 
-from jobs.cli import run
-from pipeline import storage
-from pipeline.comparison import compare, latex, markdown
-from pipeline.progress import console, results
-from pipeline.report_inputs import read_findings
+from jobs.command_line.cli import run
+from pipeline.core import storage
+from pipeline.core.progress import console, results
+from pipeline.evaluation.compare import compare, latex, markdown
+from pipeline.report.inputs import read_findings
 
 
 def main(
-    runs: Annotated[tuple[str, ...], tyro.conf.Positional], out: str | None = None, published: bool = False
+    runs: Annotated[tuple[str, ...], tyro.conf.Positional],
+    out: str | None = None,
+    published: bool = False,
 ) -> None:
     """Compare evaluations of the same images.
 

@@ -1,36 +1,47 @@
-"""The whole road on one machine: `demo.py [--out DIR]`. Simulate, pack, train, embed, index, evaluate, report, locate.
+"""The whole road on one machine: `demo.py [--out DIR]`. Simulate, pack, train, embed, index,
+evaluate, report, locate.
 
-Every stage is the one that the other jobs run, on a data set small enough for minutes on two cores. Run again, it goes on
-where it was.
+Every stage is the one that the other jobs run, on a data set small enough for minutes on two cores.
+Run again, it goes on where it was.
 """
 
+import csv
+import io
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
+from rich import box
+from rich.table import Table
 from rich.text import Text
 
-from jobs.cli import run
-from jobs.demo_photos import Demo, locate_some
-from jobs.encoders import network_of
+from jobs.calibrate import Settings as CalibrationSettings
+from jobs.calibrate import calibrate_index
+from jobs.command_line.cli import run
+from jobs.encoding.encoder import network_of
 from jobs.evaluate import print_table
-from jobs.recipes import smoke
-from jobs.run_folder import Run
+from jobs.locate import Settings as LocateSettings
+from jobs.locate import locate_photos
 from jobs.train import Settings as TrainSettings
 from jobs.train import train
-from jobs.training_loop import untrained
-from pipeline import cluster, storage
-from pipeline.embed import EmbeddingSettings, embed_gallery
-from pipeline.evaluation import EvaluationSettings, evaluate
-from pipeline.features import open_table
-from pipeline.index import Index
-from pipeline.index_build import IndexSettings, build_index
-from pipeline.packing import PackingSettings, pack
-from pipeline.progress import console
-from pipeline.records import Split, View
-from pipeline.simulate import SimulationSettings, simulate
+from jobs.training.checkpoints import Run
+from jobs.training.loop import untrained
+from jobs.training.recipes import smoke
+from pipeline.core import cluster, storage
+from pipeline.core.errors import InputError
+from pipeline.core.progress import console, results
+from pipeline.core.records import Split, View
+from pipeline.evaluation.evaluate import EvaluationSettings, evaluate
+from pipeline.features.embed import EmbeddingSettings, embed_gallery
+from pipeline.features.table import open_table
+from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.searcher import Index
+from pipeline.locate.geojson import Located
+from pipeline.locate.page import Place, away_m, told_m
+from pipeline.shards.pack import PackingSettings, pack
+from pipeline.simulation.simulate import SimulationSettings, simulate
 from pipeline.sources.university1652 import University1652
 
 
@@ -75,7 +86,11 @@ def demo(settings: Settings) -> list[dict[str, Any]]:
         )
     with step(seconds, "2 pack", "images into webdataset shards"):
         pack(University1652(), PackingSettings(root=flights, out=shards))
-    with step(seconds, "3 train", "PVDA from scratch by recipe smoke: small, quick, the same two-step method"):
+    with step(
+        seconds,
+        "3 train",
+        "PVDA from scratch by recipe smoke: small, quick, the same two-step method",
+    ):
         recipe = replace(smoke(epochs=settings.epochs), hold_out=settings.hold_out)
         checkpoint = train(TrainSettings(recipe=recipe, shards=shards, out=trained))
         start = storage.join(out, "untrained.pt")
@@ -83,14 +98,23 @@ def demo(settings: Settings) -> list[dict[str, Any]]:
             storage.write_bytes(start, untrained(Run(shards=shards, out=trained, recipe=recipe)))
     rows: dict[str, list[dict[str, Any]]] = {}
     for number, (name, file) in enumerate({"untrained": start, "trained": checkpoint}.items()):
-        table, results = storage.join(out, f"features-{name}"), storage.join(out, f"evaluation-{name}")
+        table, results = (
+            storage.join(out, f"features-{name}"),
+            storage.join(out, f"evaluation-{name}"),
+        )
         with step(
-            seconds, f"{4 + 2 * number} embed", f"test images with the {name} network, one Parquet part per shard"
+            seconds,
+            f"{4 + 2 * number} embed",
+            f"test images with the {name} network, one Parquet part per shard",
         ):
             for split in (Split.QUERY, Split.GALLERY):
                 embedding = EmbeddingSettings(shards=shards, out=table, split=split)
                 embed_gallery(embedding, network_of(storage.read_bytes(file), file, embedding))
-        with step(seconds, f"{5 + 2 * number} evaluate", f"both directions and multi-query, the {name} network"):
+        with step(
+            seconds,
+            f"{5 + 2 * number} evaluate",
+            f"both directions and multi-query, the {name} network",
+        ):
             rows[name] = evaluate(
                 EvaluationSettings(
                     table=table,
@@ -108,7 +132,13 @@ def demo(settings: Settings) -> list[dict[str, Any]]:
         console.print(ask(index, table))
     with step(seconds, "9 locate", "a few unseen photos: where were they taken?"):
         page = locate_some(
-            Demo(flights=flights, shards=shards, checkpoint=checkpoint, index=index, out=storage.join(out, "located"))
+            Demo(
+                flights=flights,
+                shards=shards,
+                checkpoint=checkpoint,
+                index=index,
+                out=storage.join(out, "located"),
+            )
         )
     console.rule("done")
     console.print("seconds: " + ", ".join(f"{name} {spent:.0f}" for name, spent in seconds.items()))
@@ -118,15 +148,22 @@ def demo(settings: Settings) -> list[dict[str, Any]]:
         f"{rows['untrained'][0]['r1']:.2%}, trained {rows['trained'][0]['r1']:.2%}"
     )
     print_table(rows["trained"])
-    print(f"report: {storage.join(out, 'evaluation-trained', 'report.html')}\nphotos on the map: {page}")
+    print(
+        f"report: {storage.join(out, 'evaluation-trained', 'report.html')}\nphotos on the map: {page}"
+    )
     return rows["trained"]
 
 
 def ask(index: str, table: str) -> str:
-    """How many UAV images of places never seen find their place first, asked of the index as a user would."""
+    """How many UAV images of places never seen find their place first, asked of the index as a user
+    would.
+    """
     photos = open_table(table).select(Split.QUERY, View.DRONE)
     answers = Index(index).search(photos.embeddings(), k=1)
-    right = sum(hits[0].location == place for hits, place in zip(answers, photos.labels().locations, strict=True))
+    right = sum(
+        hits[0].location == place
+        for hits, place in zip(answers, photos.labels().locations, strict=True)
+    )
     return f"{right} of {len(answers)} UAV images find their place at the first attempt"
 
 
@@ -146,3 +183,72 @@ def main(settings: Settings) -> None:
 
 if __name__ == "__main__":
     run(main)
+
+PHOTOS = 10
+"Places that are asked for, each by its first photo and by all of its photos together."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo:
+    """Where the demo has put what it made."""
+
+    flights: str
+    shards: str
+    checkpoint: str
+    index: str
+    out: str
+    "Folder for the answers."
+
+
+def locate_some(demo: Demo) -> str:
+    """Calibrate the index, locate photos, print how far off they are; the page's path."""
+    try:
+        calibrate_index(
+            CalibrationSettings(checkpoint=demo.checkpoint, shards=demo.shards, index=demo.index)
+        )
+    except InputError as error:  # a demo made smaller than it is may hold out too few places
+        console.print(f"not calibrated: {error}")
+    places = positions(storage.join(demo.flights, "locations.csv"))
+    root = storage.join(demo.flights, "test", "query_drone")
+    names = sorted(name for name in places if storage.is_folder(storage.join(root, name)))[:PHOTOS]
+    folders = {storage.join(root, name): places[name] for name in names}
+    firsts = {
+        storage.join(folder, storage.names(folder)[0]): place for folder, place in folders.items()
+    }
+    page = storage.join(demo.out, "photos.html")
+    asked = LocateSettings(
+        photos=tuple(firsts),
+        checkpoint=demo.checkpoint,
+        index=demo.index,
+        shards=demo.shards,
+        page=page,
+        out=storage.join(demo.out, "photos.geojson"),
+    )
+    alone = locate_photos(asked, firsts)
+    of_places = storage.join(demo.out, "places.geojson")
+    together = locate_photos(
+        replace(asked, photos=tuple(folders), together=True, out=of_places, page=None)
+    )
+    table = Table(title="unseen UAV photos: how far off", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for heading in ("place", "one photo", "sure", "all together", "sure"):
+        table.add_column(heading, justify="left" if heading == "place" else "right", no_wrap=True)
+    for name, one, all_ in zip(names, alone, together, strict=True):
+        table.add_row(name, *_cells(one, places[name]), *_cells(all_, places[name]))
+    results.print(table)
+    return page
+
+
+def positions(path: str) -> dict[str, Place]:
+    """Latitude and longitude by location, as the simulator wrote them."""
+    rows = csv.DictReader(io.StringIO(storage.read_bytes(path).decode()))
+    return {row["location"]: (float(row["lat"]), float(row["lon"])) for row in rows}
+
+
+def _cells(one: Located, place: Place) -> tuple[str, str]:
+    """How far off an answer is, and how sure it was."""
+    answer = one.answer
+    if answer is None:
+        return "not decoded", ""
+    off = told_m(away_m(answer, place))
+    sure = "" if answer.probability is None else f"{answer.probability:.0%}"
+    return off if answer.known else f"unknown ({off})", sure

@@ -1,11 +1,13 @@
-"""Shards + checkpoint -> feature table: `embed_gallery.py --shards DIR --checkpoint FILE --out TABLE`."""
+"""Shards + checkpoint -> feature table: `embed_gallery.py --shards DIR --checkpoint FILE --out
+TABLE`.
+"""
 
 from dataclasses import dataclass, fields
 
-from jobs.cli import run
-from jobs.encoders import EncoderSettings, network_of, read_checkpoint
-from pipeline import storage
-from pipeline.embed import EmbeddingSettings, embed_gallery
+from jobs.command_line.cli import run
+from jobs.encoding.encoder import EncoderSettings, network_of, read_checkpoint
+from pipeline.core import storage
+from pipeline.features.embed import EmbeddingSettings, embed_gallery
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +24,9 @@ def main(settings: Settings) -> None:
     given = {field.name: getattr(settings, field.name) for field in fields(EmbeddingSettings)}
     given |= {"shards": storage.absolute(settings.shards), "out": storage.absolute(settings.out)}
     embedding = EmbeddingSettings(**given)
-    encoder = EncoderSettings(**{field.name: getattr(settings, field.name) for field in fields(EncoderSettings)})
+    encoder = EncoderSettings(
+        **{field.name: getattr(settings, field.name) for field in fields(EncoderSettings)}
+    )
     network = network_of(checkpoint, settings.checkpoint, embedding, encoder)
     embed_gallery(embedding, network)
 

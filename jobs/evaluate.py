@@ -1,7 +1,9 @@
-"""Evaluate features exactly: every task that a table allows (--table), or one of two tables (--queries and --gallery).
+"""Evaluate features exactly: every task that a table allows (--table), or one of two tables
+(--queries and --gallery).
 
-Writes metrics.json, metrics.parquet, queries.parquet, views.json, parts.json, view_gap.json and report.html to --out, what
---by, --exports and --figures ask for beside them, and prints the measures in percent.
+Writes metrics.json, metrics.parquet, queries.parquet, views.json, parts.json, view_gap.json and
+report.html to --out, what --by, --exports and --figures ask for beside them, and prints the
+measures in percent.
 """
 
 from collections.abc import Sequence
@@ -10,12 +12,12 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
-from jobs.cli import run
-from pipeline.evaluation import EvaluationSettings, evaluate
-from pipeline.part_measures import part_label
-from pipeline.progress import results
-from pipeline.published import ABLATION, TABLE
-from pipeline.report_inputs import read_besides
+from jobs.command_line.cli import run
+from pipeline.core.progress import results
+from pipeline.evaluation.compare import ABLATION, TABLE
+from pipeline.evaluation.evaluate import EvaluationSettings, evaluate
+from pipeline.report.inputs import read_besides
+from pipeline.retrieval.parts import part_label
 
 MEASURES = {"r1": "R@1", "r5": "R@5", "r10": "R@10", "r1p": "R@1%", "ap": "AP"}
 SURE = ("r1", "r5", "ap")
@@ -25,8 +27,8 @@ def main(settings: EvaluationSettings, published: bool = False) -> None:
     """Rank queries against galleries and measure: Recall@K and AP, official protocol first.
 
     Args:
-        settings: What to evaluate.
-        published: Print the figures that papers published for University-1652's official test beside ours.
+        settings: What to evaluate. published: Print the figures that papers published for
+        University-1652's official test beside ours.
     """
     rows = evaluate(settings)
     print_table(rows)
@@ -34,7 +36,9 @@ def main(settings: EvaluationSettings, published: bool = False) -> None:
     besides = read_besides(settings.out)
     print_groups(besides["views"], "views")
     print_groups(besides["groups"], "value")
-    print_groups([row | {"by": "part", "value": part_label(row)} for row in besides["parts"]], "value")
+    print_groups(
+        [row | {"by": "part", "value": part_label(row)} for row in besides["parts"]], "value"
+    )
     print_gaps(besides["gaps"])
     if published:
         print_published(list(dict.fromkeys(row["task"] for row in rows)))
@@ -68,7 +72,9 @@ def print_published(tasks: list[str]) -> None:
             table.add_column(heading, justify="right", no_wrap=True)
         for line in (*TABLE, *ABLATION):
             if figures := line.of(task):
-                table.add_row(line.method, str(line.pixels), *(f"{figure:.2f}" for figure in figures))
+                table.add_row(
+                    line.method, str(line.pixels), *(f"{figure:.2f}" for figure in figures)
+                )
         if table.row_count:
             results.print(table)
 
@@ -79,12 +85,30 @@ def print_positions(rows: list[dict[str, Any]]) -> None:
     if not known:
         return
     table = _table("distance of the best answer")
-    for heading in ("task", "median", "≤ 25 m", "50 m", "100 m", "SDM@1", "SDM@3", "SDM@5", "queries"):
+    for heading in (
+        "task",
+        "median",
+        "≤ 25 m",
+        "50 m",
+        "100 m",
+        "SDM@1",
+        "SDM@3",
+        "SDM@5",
+        "queries",
+    ):
         table.add_column(heading, justify="left" if heading == "task" else "right", no_wrap=True)
     for row in known:
         shares = (f"{100 * row[f'within_{metres}m']:.2f}" for metres in (25, 50, 100))
-        marks = ("-" if row[f"sdm{k}"] is None else f"{100 * row[f'sdm{k}']:.2f}" for k in (1, 3, 5))
-        table.add_row(row["task"], f"{row['distance_median_m']:.1f} m", *shares, *marks, f"{row['geo_queries']:,}")
+        marks = (
+            "-" if row[f"sdm{k}"] is None else f"{100 * row[f'sdm{k}']:.2f}" for k in (1, 3, 5)
+        )
+        table.add_row(
+            row["task"],
+            f"{row['distance_median_m']:.1f} m",
+            *shares,
+            *marks,
+            f"{row['geo_queries']:,}",
+        )
     results.print(table)
 
 
@@ -96,7 +120,10 @@ def print_gaps(gaps: Sequence[dict[str, Any]]) -> None:
     for heading in ("task", "true pairs", "other pairs", "distance"):
         table.add_column(heading, justify="left" if heading == "task" else "right", no_wrap=True)
     for gap in gaps:
-        said = (f"{of['mean']:.3f} ({of['low']:.2f} to {of['high']:.2f})" for of in (gap["true"], gap["other"]))
+        said = (
+            f"{of['mean']:.3f} ({of['low']:.2f} to {of['high']:.2f})"
+            for of in (gap["true"], gap["other"])
+        )
         table.add_row(gap["task"], *said, f"{gap['distance']:.3f}")
     results.print(table)
 
@@ -110,7 +137,11 @@ def print_groups(rows: Sequence[dict[str, Any]], first: str) -> None:
             table.add_column(column, justify="right", no_wrap=True)
         for row in rows:
             if (row["task"], row.get("by", "views a query")) == (task, heading):
-                cells = (cell for name in ("r1", "ap") for cell in (f"{100 * row[name]:.2f}", _interval(row, name)))
+                cells = (
+                    cell
+                    for name in ("r1", "ap")
+                    for cell in (f"{100 * row[name]:.2f}", _interval(row, name))
+                )
                 table.add_row(str(row[first]), *cells, f"{row['queries']:,}")
         results.print(table)
 

@@ -1,20 +1,25 @@
-"""Another program's features (.mat) -> feature tables that jobs/evaluate.py judges as it judges ours.
+"""Another program's features (.mat) -> feature tables that jobs/evaluate.py judges as it judges
+ours.
 
 Takes the file that University-1652's test.py and its descendants save (pytorch_result.mat).
 """
 
-from jobs.cli import run
-from pipeline.foreign_features import ImportSettings, import_features
-from pipeline.progress import console
+from jobs.command_line.cli import run
+from pipeline.core.progress import console
+from pipeline.features.import_mat import ImportSettings, import_features
 
 
 def main(settings: ImportSettings) -> None:
-    """Import gallery_f, gallery_label, query_f and query_label (and the paths, if there) into OUT/queries and OUT/gallery."""
+    """Import gallery_f, gallery_label, query_f and query_label (and the paths, if there) into
+    OUT/queries and OUT/gallery.
+    """
     written = import_features(settings)
     for table, rows in written.values():
         console.print(f"{table}: {rows:,} rows")
     queries, gallery = (written[name][0] for name in ("query", "gallery"))
-    console.print(f"judge them: python jobs/evaluate.py --queries {queries} --gallery {gallery} --out DIR")
+    console.print(
+        f"judge them: python jobs/evaluate.py --queries {queries} --gallery {gallery} --out DIR"
+    )
 
 
 if __name__ == "__main__":

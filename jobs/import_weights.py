@@ -1,7 +1,8 @@
-"""Foreign weights -> a checkpoint of ours: `import_weights.py (--torchvision FILE | --lpn FILE) --out FILE`.
+"""Foreign weights -> a checkpoint of ours: `import_weights.py (--torchvision FILE | --lpn FILE)
+--out FILE`.
 
-Takes a torchvision ResNet's state dict, or that of a three_view_net of the public LPN code. Depth, width, rings and numbers
-per ring are read off the file. jobs/embed_gallery.py takes what comes out.
+Takes a torchvision ResNet's state dict, or that of a three_view_net of the public LPN code. Depth,
+width, rings and numbers per ring are read off the file. jobs/embed_gallery.py takes what comes out.
 """
 
 import jobs  # noqa: F401, I001  # before torch: Ctrl-C is heeded from here on
@@ -14,14 +15,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from jobs.cli import run
+from jobs.command_line.cli import run
 from model.checkpoint import Checkpoint, CheckpointError, dumps, loads
-from model.lpn import convert_lpn
+from model.weights.lpn import convert_lpn
 from model.pvda import FeatureEncoder, PVDAConfig
-from model.weights import TORCHVISION, load_backbone, measure_backbone, parse_state_dict
-from pipeline import storage
-from pipeline.progress import console
-from pipeline.records import InputError
+from model.weights.load import TORCHVISION, load_backbone, measure_backbone, parse_state_dict
+from pipeline.core import storage
+from pipeline.core.progress import console
+from pipeline.core.errors import InputError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,23 +55,36 @@ class Settings:
 
 
 def import_weights(settings: Settings) -> str:
-    """Write the checkpoint and return its path; one that was made of the same file is left as it is.
+    """Write the checkpoint and return its path; one that was made of the same file is left as it
+    is.
 
     Raises InputError or CheckpointError on unusable input.
     """
     if not storage.exists(settings.source):
-        expected = TORCHVISION if settings.kind == "torchvision" else "the net_*.pth of a training run of the LPN code"
+        expected = (
+            TORCHVISION
+            if settings.kind == "torchvision"
+            else "the net_*.pth of a training run of the LPN code"
+        )
         raise InputError(f"no weights at {settings.source}; expected {expected}")
     if storage.is_folder(settings.source):
-        raise InputError(f"{settings.source} is a folder, expected a file of weights; name the file in it")
+        raise InputError(
+            f"{settings.source} is a folder, expected a file of weights; name the file in it"
+        )
     data = storage.read_bytes(settings.source)
-    made_of = {"kind": settings.kind, "sha256": hashlib.sha256(data).hexdigest(), "image_size": settings.image_size}
+    made_of = {
+        "kind": settings.kind,
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "image_size": settings.image_size,
+    }
     out = storage.absolute(settings.out)
     if storage.exists(out):
         refuse_others(out, made_of)
         console.print(f"{out} is complete: made of {settings.source}; nothing to do")
         return out
-    convert: Callable[..., Checkpoint] = from_torchvision if settings.kind == "torchvision" else from_lpn
+    convert: Callable[..., Checkpoint] = (
+        from_torchvision if settings.kind == "torchvision" else from_lpn
+    )
     try:
         checkpoint = convert(parse_state_dict(data, settings.source), settings, made_of)
     except CheckpointError:
@@ -93,18 +107,26 @@ def refuse_others(out: str, made_of: dict[str, Any]) -> None:
     except (CheckpointError, OSError):
         held = None
     if held != made_of:
-        raise InputError(f"{out} is there and was not made of this file and image size; choose another --out")
+        raise InputError(
+            f"{out} is there and was not made of this file and image size; choose another --out"
+        )
 
 
-def from_torchvision(state: dict[str, Tensor], settings: Settings, made_of: dict[str, Any]) -> Checkpoint:
-    """The paper's encoder before training: torchvision's backbone, a refinement of random numbers, no classifier."""
+def from_torchvision(
+    state: dict[str, Tensor], settings: Settings, made_of: dict[str, Any]
+) -> Checkpoint:
+    """The paper's encoder before training: torchvision's backbone, a refinement of random numbers,
+    no classifier.
+    """
     depth, width = measure_backbone(state, settings.source)
     network = PVDAConfig(depth=depth, width=width, image_size=settings.image_size)
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(0)  # the same file gives the same embeddings
         encoder = FeatureEncoder(network)
     load_backbone(encoder.backbone, state, settings.source)
-    console.print("the refinement of the rings is untrained: train before judging by the embeddings")
+    console.print(
+        "the refinement of the rings is untrained: train before judging by the embeddings"
+    )
     return imported(network, {"encoder": encoder.state_dict()}, [], made_of)
 
 
@@ -113,20 +135,30 @@ def from_lpn(state: dict[str, Tensor], settings: Settings, made_of: dict[str, An
     converted = convert_lpn(state, settings.source, settings.image_size)
     if converted.left_out:
         console.print(f"{converted.left_out} is left out: LPN's backbone of street and web images")
-    console.print("taken as trained with stride 1 and average pooling; LPN's opts.yaml says whether it was")
-    # Named by number: the file has no names. LPN numbers its training folders in the order of their names.
+    console.print(
+        "taken as trained with stride 1 and average pooling; LPN's opts.yaml says whether it was"
+    )
+    # Named by number: the file has no names. LPN numbers its training folders in the order of their
+    # names.
     digits = len(str(converted.locations - 1))
     names = [f"unnamed-{number:0{digits}}" for number in range(converted.locations)]
     return imported(converted.network, converted.modules, names, made_of)
 
 
 def imported(
-    network: PVDAConfig, modules: dict[str, dict[str, Tensor]], locations: list[str], made_of: dict[str, Any]
+    network: PVDAConfig,
+    modules: dict[str, dict[str, Tensor]],
+    locations: list[str],
+    made_of: dict[str, Any],
 ) -> Checkpoint:
     return Checkpoint(
-        network=network, recipe={"name": f"imported from {made_of['kind']}", "made_of": made_of}, locations=locations,
-        epoch=0, history=[], state={"modules": modules},
-    )  # fmt: skip
+        network=network,
+        recipe={"name": f"imported from {made_of['kind']}", "made_of": made_of},
+        locations=locations,
+        epoch=0,
+        history=[],
+        state={"modules": modules},
+    )
 
 
 def main(settings: Settings) -> None:

@@ -1,7 +1,9 @@
-"""Where were these photos taken? `locate.py --checkpoint FILE --index INDEX --out FILE.geojson PHOTO...`
+"""Where were these photos taken? `locate.py --checkpoint FILE --index INDEX --out FILE.geojson
+PHOTO...`
 
-Photos, or folders of them, are embedded as the index's images were, and the index is asked. Writes GeoJSON, on demand CSV and a
-page with a map. Photos that cannot be decoded are listed with the reason, the others are answered, and the exit code is 1.
+Photos, or folders of them, are embedded as the index's images were, and the index is asked. Writes
+GeoJSON, on demand CSV and a page with a map. Photos that cannot be decoded are listed with the
+reason, the others are answered, and the exit code is 1.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,33 +16,37 @@ import tyro
 from rich import box
 from rich.table import Table
 
-from jobs.cli import run
-from jobs.encoders import read_checkpoint
-from jobs.photo_encoder import PhotoEncoder
-from jobs.photos import Query, read_photos, together
-from pipeline import answer_files, rejects, storage
-from pipeline.answer_files import Located
-from pipeline.answer_page import Place, Surroundings, render
-from pipeline.confidence import Confidence, find_confidence, read_confidence
-from pipeline.feature_parts import verify_part
-from pipeline.flight import LIKELIER, motion_over, settle
-from pipeline.gallery_map import GalleryMap, gallery_map
-from pipeline.index import Index
-from pipeline.locate import Answer, locate
-from pipeline.photo_files import find_photos, read_times, seconds
-from pipeline.progress import console, results
-from pipeline.records import InputError, Unfinished
-from pipeline.report_inputs import no_pictures
-from pipeline.shard_records import footprints
-from pipeline.shards import read_manifest
-from pipeline.stream import fetch
-from pipeline.track import TRACKED, Motion, Start
-from pipeline.where import Near, Where
+from jobs.command_line.cli import run
+from jobs.encoding.encoder import read_checkpoint
+from jobs.encoding.photo_encoder import PhotoEncoder
+from jobs.encoding.queries import Query, read_photos, together
+from pipeline.core import rejections, storage
+from pipeline.core.errors import InputError, Unfinished
+from pipeline.core.geo import Near
+from pipeline.core.progress import console, results
+from pipeline.features.part import verify_part
+from pipeline.images.thumbnails import no_pictures
+from pipeline.index.filters import Where
+from pipeline.index.searcher import Index
+from pipeline.locate import geojson
+from pipeline.locate.confidence import Confidence, find_confidence, read_confidence
+from pipeline.locate.flight import LIKELIER, motion_over, settle
+from pipeline.locate.gallery_map import GalleryMap, gallery_map
+from pipeline.locate.geojson import Located
+from pipeline.locate.locate import Answer, locate
+from pipeline.locate.page import Place, Surroundings, render
+from pipeline.locate.photo_files import find_photos, read_times, seconds
+from pipeline.locate.track import TRACKED, Motion, Start
+from pipeline.shards.manifest import read_manifest
+from pipeline.shards.record_table import footprints
+from pipeline.shards.samples import fetch
 
 THREE_NUMBERS: Any = tyro.constructors.PrimitiveConstructorSpec(
     nargs=3,  # tyro's own reading of an optional tuple takes the photos behind it as well
     metavar="LAT LON METRES",
-    instance_from_str=lambda said: Near(lat=float(said[0]), lon=float(said[1]), radius_m=float(said[2])),
+    instance_from_str=lambda said: Near(
+        lat=float(said[0]), lon=float(said[1]), radius_m=float(said[2])
+    ),
     is_instance=lambda value: value is None or isinstance(value, Near),
     str_from_instance=lambda value: (
         [str(value)] if value is None else [str(value.lat), str(value.lon), str(value.radius_m)]
@@ -66,19 +72,23 @@ class Settings:
     together: bool = False
     "All photos of a folder show one place: they are asked as one, by the mean of their embeddings."
     near: Annotated[Near | None, THREE_NUMBERS] = None
-    "Only gallery images in this circle may answer. With --track it is where the flight began, when its first photo was taken."
+    """Only gallery images in this circle may answer. With --track it is where the flight began,
+    when its first photo was taken."""
     track: bool = False
-    "The photos are of one flight: each is placed in the light of all, and GeoJSON begins with the flight's line."
+    """The photos are of one flight: each is placed in the light of all, and GeoJSON begins with the
+    flight's line."""
     max_speed: float = 25.0
     "Of the flight, metres per second over the ground; 25 is beyond most multicopters."
     elsewhere: float = 0.1
     "Of the flight, the share of photos expected to show no place of the gallery."
     times: str | None = None
-    "CSV table with the columns photo and time (seconds or ISO 8601); by default the camera's own times."
+    """CSV table with the columns photo and time (seconds or ISO 8601); by default the camera's own
+    times."""
     interval: float | None = None
     "Seconds between photos in the order of their names, where neither tables nor cameras say when."
     verify: bool = False
-    "Look at every byte of the index first, and of the table's parts where it answers by their vectors."
+    """Look at every byte of the index first, and of the table's parts where it answers by their
+    vectors."""
     calibration: str | None = None
     "What jobs/calibrate.py wrote; by default INDEX/calibration.json where it is there."
     csv: str | None = None
@@ -86,7 +96,8 @@ class Settings:
     page: str | None = None
     "An HTML page with photos, candidates and a map, in one file that needs no network."
     shards: str | None = None
-    "Those that the index was made of: the pictures of the page; needed besides where the index's embeddings are int8."
+    """Those that the index was made of: the pictures of the page; needed besides where the index's
+    embeddings are int8."""
 
     def __post_init__(self) -> None:
         if self.top < 1:
@@ -101,7 +112,8 @@ class Settings:
 
 
 def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None) -> list[Located]:
-    """Answer, write what was asked for, and return the answers in the order of the photos (of their folders, together).
+    """Answer, write what was asked for, and return the answers in the order of the photos (of their
+    folders, together).
 
     `truths`: where photos were really taken, by name, for the page. Raises InputError and CheckpointError on unusable input.
     """
@@ -121,9 +133,13 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
     if settings.track:
         asked = timed(asked, settings)
     answers = ask(asked, index, gallery, confidence, settings)
-    answered = dict(zip((query.name for query in asked), zip(asked, answers, strict=True), strict=True))
+    answered = dict(
+        zip((query.name for query in asked), zip(asked, answers, strict=True), strict=True)
+    )
     located = [
-        _located(*answered[query.name], settings.top) if query.name in answered else _located(query, None, settings.top)
+        _located(*answered[query.name], settings.top)
+        if query.name in answered
+        else _located(query, None, settings.top)
         for query in queries
     ]
     if settings.track:
@@ -132,15 +148,21 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
         "index": settings.index, "fingerprint": encoder.fingerprint, "together": settings.together,
         "threshold": LIKELIER if settings.track else confidence.threshold if confidence else None,
     }  # fmt: skip
-    storage.write_bytes(settings.out, answer_files.geojson(located, about, settings.track))
+    storage.write_bytes(settings.out, geojson.geojson(located, about, settings.track))
     if settings.csv:
-        storage.write_bytes(settings.csv, answer_files.table(located))
+        storage.write_bytes(settings.csv, geojson.table(located))
     if settings.page:
         around = Surroundings(
-            title="Where these photos were taken", gallery=gallery, confidence=confidence, fingerprint=encoder.fingerprint,
-            track=settings.track, truths=truths or {},
-        )  # fmt: skip
-        storage.write_bytes(settings.page, page(located, around, settings.shards).encode("utf-8", "replace"))
+            title="Where these photos were taken",
+            gallery=gallery,
+            confidence=confidence,
+            fingerprint=encoder.fingerprint,
+            track=settings.track,
+            truths=truths or {},
+        )
+        storage.write_bytes(
+            settings.page, page(located, around, settings.shards).encode("utf-8", "replace")
+        )
     return located
 
 
@@ -148,7 +170,9 @@ def ask(
     queries: Sequence[Query], index: Index, gallery: GalleryMap, confidence: Confidence | None, settings: Settings
 ) -> list[Answer]:  # fmt: skip
     """An answer per query, in the light of the whole flight with --track."""
-    embeddings_QD = np.array([query.embedding_D for query in queries], np.float32).reshape(-1, index.dimension)
+    embeddings_QD = np.array([query.embedding_D for query in queries], np.float32).reshape(
+        -1, index.dimension
+    )
     near = settings.near
     if not settings.track or confidence is None:
         where = Where(near=near) if near else None
@@ -156,7 +180,9 @@ def ask(
     single = locate(index, embeddings_QD, max(settings.top, TRACKED), None, confidence)
     start = Start(lat=near.lat, lon=near.lon, radius_m=near.radius_m) if near else None
     motion = motion_over(gallery, settings.max_speed, settings.elsewhere)
-    return settle(single, [seconds(query.taken_at or "0") for query in queries], confidence, motion, start)
+    return settle(
+        single, [seconds(query.taken_at or "0") for query in queries], confidence, motion, start
+    )
 
 
 def confidence_of(settings: Settings, index: Index) -> Confidence | None:
@@ -173,7 +199,9 @@ def confidence_of(settings: Settings, index: Index) -> Confidence | None:
             "with jobs/calibrate.py"
         )
     if confidence is None:
-        console.print("not calibrated: answers come without a probability, and none is unknown; see jobs/calibrate.py")
+        console.print(
+            "not calibrated: answers come without a probability, and none is unknown; see jobs/calibrate.py"
+        )
     elif confidence.gallery != len(index):
         console.print(
             f"calibrated over {confidence.gallery} gallery images, the index has {len(index)}: probabilities are "
@@ -184,7 +212,8 @@ def confidence_of(settings: Settings, index: Index) -> Confidence | None:
 
 
 def timed(queries: Sequence[Query], settings: Settings) -> list[Query]:
-    """The photos with when each was taken: by the table, else by the interval, else as the cameras say.
+    """The photos with when each was taken: by the table, else by the interval, else as the cameras
+    say.
 
     Raises InputError where that is not known of all.
     """
@@ -206,7 +235,13 @@ def timed(queries: Sequence[Query], settings: Settings) -> list[Query]:
 
 def _located(query: Query, answer: Answer | None, top: int) -> Located:
     shown = replace(answer, candidates=answer.candidates[:top]) if answer else None
-    return Located(name=query.name, photos=query.photos, answer=shown, rejected=query.rejected, taken_at=query.taken_at)
+    return Located(
+        name=query.name,
+        photos=query.photos,
+        answer=shown,
+        rejected=query.rejected,
+        taken_at=query.taken_at,
+    )
 
 
 def page(located: Sequence[Located], around: Surroundings, shards: str | None) -> str:
@@ -225,7 +260,11 @@ def print_answers(located: Sequence[Located]) -> None:
     """The answers on standard output, a line each."""
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for heading in ("photo", "position", "within", "sure", "location", "score"):
-        table.add_column(heading, justify="left" if heading in ("photo", "location") else "right", overflow="fold")
+        table.add_column(
+            heading,
+            justify="left" if heading in ("photo", "location") else "right",
+            overflow="fold",
+        )
     for one in located:
         table.add_row(one.name, *_cells(one))
     results.print(table)
@@ -235,7 +274,11 @@ def _cells(one: Located) -> list[str]:
     answer = one.answer
     if answer is None:
         return [one.rejected[0].reason, "", "", "", ""]
-    position = f"{answer.position.lat:.6f}, {answer.position.lon:.6f}" if answer.position else "no position"
+    position = (
+        f"{answer.position.lat:.6f}, {answer.position.lon:.6f}"
+        if answer.position
+        else "no position"
+    )
     return [
         position if answer.known else "unknown",
         f"{answer.position.radius_m:.0f} m" if answer.position and answer.known else "",
@@ -249,12 +292,15 @@ def main(settings: Settings) -> None:
     """Answer where photos were taken: a position, how sure it is, and the candidates behind it."""
     located = locate_photos(settings)
     print_answers(located)
-    results.print(f"answers: {settings.out}" + (f", page: {settings.page}" if settings.page else ""), soft_wrap=True)
+    results.print(
+        f"answers: {settings.out}" + (f", page: {settings.page}" if settings.page else ""),
+        soft_wrap=True,
+    )
     damaged = [refused for one in located for refused in one.rejected]
     if damaged:
         raise Unfinished(
             f"{len(damaged)} of {sum(len(one.photos) for one in located)} photos could not be decoded: "
-            f"{rejects.commonest(damaged)}; they are listed in {settings.out}"
+            f"{rejections.commonest(damaged)}; they are listed in {settings.out}"
         )
 
 

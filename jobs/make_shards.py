@@ -1,7 +1,7 @@
 """Imagery -> shards: `make_shards.py --source university1652 --root DIR --out DIR`.
 
-And of a finished set: `make_shards.py --verify --out DIR` checks every byte, `make_shards.py --export FILE --out DIR` writes
-its record table as Parquet or GeoJSON.
+And of a finished set: `make_shards.py --verify --out DIR` checks every byte, `make_shards.py
+--export FILE --out DIR` writes its record table as Parquet or GeoJSON.
 """
 
 import sys
@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from jobs.cli import run
-from pipeline import shard_records, storage
-from pipeline.packing import PackingSettings, pack
-from pipeline.progress import console
-from pipeline.records import InputError, Unfinished
-from pipeline.shards import read_manifest
+from jobs.command_line.cli import run
+from pipeline.core import storage
+from pipeline.core.errors import InputError, Unfinished
+from pipeline.core.progress import console
+from pipeline.shards import record_table
+from pipeline.shards.manifest import read_manifest
+from pipeline.shards.pack import PackingSettings, pack
+from pipeline.shards.verify import verify as verify_shards
 from pipeline.sources import SOURCES
-from pipeline.sources.source import Source
-from pipeline.verification import verify as verify_shards
+from pipeline.sources.base import Source
 
 if TYPE_CHECKING:
     SourceChoice = Source
@@ -43,7 +44,9 @@ def source_as_subcommand(arguments: list[str]) -> list[str]:
             raise InputError(f"--source is {chosen!r}, expected one of: {', '.join(SOURCES)}")
         return [chosen, *arguments[:place], *arguments[place + (1 if equals else 2) :]]
     if arguments and not {*SOURCES, "--help", "-h"} & set(arguments):
-        raise InputError(f"--source is missing, expected one of: {', '.join(SOURCES)}; see make_shards.py --help")
+        raise InputError(
+            f"--source is missing, expected one of: {', '.join(SOURCES)}; see make_shards.py --help"
+        )
     return arguments
 
 
@@ -81,8 +84,10 @@ def export(out: str, export: str) -> None:
         out: Folder or URI of the shards.
         export: The file: .parquet, or .geojson with a point for each image whose place is known.
     """
-    written, without = shard_records.export(storage.absolute(out), read_manifest(out), export)
-    console.print(f"{export}: {written} images" + (f", {without} without a place left out" if without else ""))
+    written, without = record_table.export(storage.absolute(out), read_manifest(out), export)
+    console.print(
+        f"{export}: {written} images" + (f", {without} without a place left out" if without else "")
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""A checkpoint and its index -> answers over HTTP: `serve.py --checkpoint FILE --index INDEX [--host H] [--port P]`."""
+"""A checkpoint and its index -> answers over HTTP: `serve.py --checkpoint FILE --index INDEX
+[--host H] [--port P]`.
+"""
 
 import asyncio
 import os
@@ -9,14 +11,14 @@ from typing import Any
 
 from aiohttp import web
 
-from jobs.cli import run
-from jobs.photo_encoder import PhotoEncoder
+from jobs.command_line.cli import run
+from jobs.encoding.photo_encoder import PhotoEncoder
 from model.checkpoint import CheckpointError
-from pipeline import cluster, storage
-from pipeline.index_facts import FACTS
-from pipeline.placement import place
-from pipeline.progress import console
-from pipeline.records import InputError
+from pipeline.core import cluster, storage
+from pipeline.core.cluster import place
+from pipeline.core.errors import InputError
+from pipeline.core.progress import console
+from pipeline.index.metadata import FACTS
 from pipeline.service.answerer import Answerer
 from pipeline.service.app import Service
 from pipeline.service.batcher import Gone
@@ -52,7 +54,9 @@ def load(checkpoint: str, index: str, shards: str | None, threads: int) -> Answe
     """What each replica calls. Raises InputError."""
     import torch
 
-    torch.set_num_threads(threads)  # FAISS takes OMP_NUM_THREADS, which Ray sets to the replica's cores
+    torch.set_num_threads(
+        threads
+    )  # FAISS takes OMP_NUM_THREADS, which Ray sets to the replica's cores
 
     def encoder_for(facts: dict[str, Any]) -> PhotoEncoder:
         try:
@@ -77,7 +81,9 @@ def main(settings: Settings) -> None:
 
 
 async def serve(settings: Settings, token: str | None) -> None:
-    """Listen at once, so that whoever asks for its health hears that it is loading; answer once it has loaded."""
+    """Listen at once, so that whoever asks for its health hears that it is loading; answer once it
+    has loaded.
+    """
     placement = place(cluster.nodes(), settings.replicas, settings.replicas, settings.threads)
     shards = None if settings.shards is None else storage.absolute(settings.shards)
     checkpoint, index = storage.absolute(settings.checkpoint), storage.absolute(settings.index)
@@ -110,9 +116,13 @@ async def serve(settings: Settings, token: str | None) -> None:
 
 
 async def work(replicas: Replicas) -> None:
-    """Load, then tell whenever another index answers or one was refused; replicas themselves are silent."""
+    """Load, then tell whenever another index answers or one was refused; replicas themselves are
+    silent.
+    """
     known = await asyncio.to_thread(replicas.start)
-    console.print(f"ready: {known.rows} rows, {known.factory}, network {known.fingerprint[:12]}; Ctrl-C ends it")
+    console.print(
+        f"ready: {known.rows} rows, {known.factory}, network {known.fingerprint[:12]}; Ctrl-C ends it"
+    )
     while True:
         await asyncio.sleep(LOOK_EVERY_S)
         try:

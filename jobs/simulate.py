@@ -1,11 +1,15 @@
-"""Simulated flights: `simulate.py --out DIR --train-locations N --test-locations N --distractors N`."""
+"""Simulated flights: `simulate.py --out DIR --train-locations N --test-locations N --distractors
+N`.
+"""
 
-from jobs.cli import run
-from pipeline.simulate import SimulationSettings, simulate
+from jobs.command_line.cli import run
+from pipeline.simulation.simulate import SimulationSettings, simulate
 
 
 def main(settings: SimulationSettings) -> None:
-    """Make a data set in University-1652's layout: procedural towns, or flights over real overhead images."""
+    """Make a data set in University-1652's layout: procedural towns, or flights over real overhead
+    images.
+    """
     simulate(settings)
 
 

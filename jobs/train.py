@@ -1,7 +1,8 @@
 """Shards -> trained PVDA: `train.py RECIPE --shards DIR --out RUN [--weights FILE] [--workers N]`.
 
-Writes RUN/last.pt (weights, config, and all that going on needs), RUN/metrics.jsonl (a row per epoch) and
-RUN/tensorboard. Killed, it goes on from the last checkpoint when run again; where a Ray worker dies, by itself.
+Writes RUN/last.pt (weights, config, and all that going on needs), RUN/metrics.jsonl (a row per
+epoch) and RUN/tensorboard. Killed, it goes on from the last checkpoint when run again; where a Ray
+worker dies, by itself.
 """
 
 import jobs  # noqa: F401, I001  # before torch: Ctrl-C is heeded from here on
@@ -21,20 +22,21 @@ from ray.util.queue import Empty, Queue
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from jobs.cli import run
-from jobs.config_table import show_config
-from jobs.recipes import RECIPES, Recipe
-from jobs.run_folder import CHECKPOINT, Conduct, Run, find_checkpoint
-from jobs.training_loop import Damage, Found, Place, open_stream, train_worker
+from jobs.command_line.cli import run
+from jobs.training.config_table import show_config
+from jobs.training.recipes import RECIPES, Recipe
+from jobs.training.checkpoints import CHECKPOINT, Conduct, Run, find_checkpoint
+from jobs.training.loop import Damage, Found, Place, open_stream, train_worker
 from model.checkpoint import CheckpointError
 from model.pvda import FeatureEncoder
-from model.weights import load_backbone, read_state_dict
-from pipeline import cluster, storage
-from pipeline.exclusive import one_at_a_time
-from pipeline.progress import Meter, console, progress
-from pipeline.records import InputError, Split, Unfinished
-from pipeline.shards import read_manifest, refuse_missing
-from pipeline.verification import refuse_damaged
+from model.weights.load import load_backbone, read_state_dict
+from pipeline.core import cluster, storage
+from pipeline.core.lock import one_at_a_time
+from pipeline.core.progress import Meter, console, progress
+from pipeline.core.errors import InputError, Unfinished
+from pipeline.core.records import Split
+from pipeline.shards.manifest import read_manifest, refuse_missing
+from pipeline.shards.verify import refuse_damaged
 
 if TYPE_CHECKING:
     RecipeChoice = Recipe
@@ -67,7 +69,8 @@ class Settings(Conduct):
     verify: bool = False
     "Look at every byte of the shards first; without it, that each tar is there and has its size."
     max_failures: int = 3
-    "How often lost Ray workers are replaced and training goes on from the last checkpoint, before the job gives up."
+    """How often lost Ray workers are replaced and training goes on from the last checkpoint, before
+    the job gives up."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -79,9 +82,12 @@ class Settings(Conduct):
         """The run as every worker is told of it."""
         conduct = {field.name: getattr(self, field.name) for field in fields(Conduct)}
         return Run(
-            shards=storage.absolute(self.shards), out=storage.absolute(self.out), recipe=self.recipe,
-            weights=self.weights and storage.absolute(self.weights), **conduct,
-        )  # fmt: skip
+            shards=storage.absolute(self.shards),
+            out=storage.absolute(self.out),
+            recipe=self.recipe,
+            weights=self.weights and storage.absolute(self.weights),
+            **conduct,
+        )
 
 
 @one_at_a_time(lambda settings: settings.out)
@@ -95,7 +101,9 @@ def train(settings: Settings) -> str:
     found, epochs = find_checkpoint(this, console.print), settings.recipe.schedule.epochs
     done, step = (found[1].epoch, found[1].step) if found is not None else (0, 0)
     if done == epochs:
-        console.print(f"{path} is complete: {epochs} epochs of recipe {settings.recipe.name}; nothing to do")
+        console.print(
+            f"{path} is complete: {epochs} epochs of recipe {settings.recipe.name}; nothing to do"
+        )
         return path
     if settings.verify:
         refuse_damaged(this.shards, None if settings.workers else 0)
@@ -103,15 +111,29 @@ def train(settings: Settings) -> str:
         refuse_missing(this.shards, read_manifest(this.shards).of(Split.TRAIN))
     steps = open_stream(this, Place(world=max(1, settings.workers))).steps
     if this.weights is not None and found is None:
-        load_backbone(FeatureEncoder(this.recipe.network).backbone, read_state_dict(this.weights), this.weights)
+        load_backbone(
+            FeatureEncoder(this.recipe.network).backbone,
+            read_state_dict(this.weights),
+            this.weights,
+        )
     if found is not None:
         within = f" and {step} of {steps} steps" if step else ""
         console.print(f"going on after epoch {done} of {epochs}{within}")
     del found  # as large as the networks and their optimisers
-    show_config(settings.recipe, shards=this.shards, out=this.out, weights=this.weights, workers=settings.workers)
-    with progress((epochs - done) * steps - step, f"training {settings.recipe.name}", "steps") as meter:
+    show_config(
+        settings.recipe,
+        shards=this.shards,
+        out=this.out,
+        weights=this.weights,
+        workers=settings.workers,
+    )
+    with progress(
+        (epochs - done) * steps - step, f"training {settings.recipe.name}", "steps"
+    ) as meter:
         if settings.workers == 0:
-            device = "cuda" if torch.cuda.is_available() and settings.gpus_per_worker != 0 else "cpu"
+            device = (
+                "cuda" if torch.cuda.is_available() and settings.gpus_per_worker != 0 else "cpu"
+            )
             train_worker(this, Place(device=device), lambda told: show(meter, told))
         else:
             train_on_ray(this, settings, meter)
@@ -120,10 +142,12 @@ def train(settings: Settings) -> str:
 
 
 def train_on_ray(this: Run, settings: Settings, meter: Meter) -> None:
-    """Train with Ray Train's workers. When one dies, the group is started again and goes on from the last checkpoint.
+    """Train with Ray Train's workers. When one dies, the group is started again and goes on from
+    the last checkpoint.
 
-    Not by Ray Train's own FailureConfig: that would try a run that has diverged again, and nobody would hear of it. Where Ray
-    Train's controller dies, the job ends (RayActorError): the places that it had asked for may be lost until then.
+    Not by Ray Train's own FailureConfig: that would try a run that has diverged again, and nobody
+    would hear of it. Where Ray Train's controller dies, the job ends (RayActorError): the places
+    that it had asked for may be lost until then.
     """
     cluster.connect()
     gpus = settings.gpus_per_worker
@@ -147,7 +171,9 @@ def train_on_ray(this: Run, settings: Settings, meter: Meter) -> None:
         except WorkerGroupError as error:
             if failures > settings.max_failures:
                 raise
-            lost = ", ".join(sorted({type(failure).__name__ for failure in error.worker_failures.values()}))
+            lost = ", ".join(
+                sorted({type(failure).__name__ for failure in error.worker_failures.values()})
+            )
             meter.note(
                 f"lost a worker ({lost}); going on from the last checkpoint, {failures} of {settings.max_failures}"
             )
@@ -156,7 +182,8 @@ def train_on_ray(this: Run, settings: Settings, meter: Meter) -> None:
 def train_group(this: Run, scaling: ScalingConfig, cpus: int, meter: Meter) -> None:
     """Train with one group of workers; what they tell comes back through a queue.
 
-    Raises what a worker gave as the reason why no other group would fare better, WorkerGroupError where one died.
+    Raises what a worker gave as the reason why no other group would fare better, WorkerGroupError
+    where one died.
     """
     told, refused = Queue(actor_options={"num_cpus": 0}), list[Exception]()
     listener = threading.Thread(target=listen, args=(told, meter, refused), daemon=True)
@@ -165,7 +192,8 @@ def train_group(this: Run, scaling: ScalingConfig, cpus: int, meter: Meter) -> N
         ray_worker,
         train_loop_config={"run": this, "told": told, "cpus": cpus},
         scaling_config=scaling,
-        # Ray Train's own records: our checkpoints are written by rank 0, so that they are the same with and without Ray.
+        # Ray Train's own records: our checkpoints are written by rank 0, so that they are the same
+        # with and without Ray.
         run_config=RunConfig(name="ray", storage_path=this.out),
     )
     try:
@@ -182,14 +210,18 @@ def train_group(this: Run, scaling: ScalingConfig, cpus: int, meter: Meter) -> N
 
 
 def hang_up(told: Queue, listener: threading.Thread) -> None:
-    """Let the listener hear what is still in the queue, and end. Where the queue's actor was lost, it has ended already."""
+    """Let the listener hear what is still in the queue, and end. Where the queue's actor was lost,
+    it has ended already.
+    """
     with suppress(RayActorError):
         told.put(None)
     listener.join()
 
 
 class _Trainer(TorchTrainer):
-    """Ray Train's, without its handler of Ctrl-C: that one ends the process with code 1 from within a call, and stays."""
+    """Ray Train's, without its handler of Ctrl-C: that one ends the process with code 1 from within
+    a call, and stays.
+    """
 
     def _register_sigint_handler(self, controller: Any) -> None:
         pass
@@ -197,7 +229,9 @@ class _Trainer(TorchTrainer):
 
 def ray_worker(config: dict[str, Any]) -> None:
     """A Ray Train worker: the same loop, with DDP around what is trained."""
-    torch.set_num_threads(config["cpus"])  # Ray's OMP_NUM_THREADS would say the same; set on purpose
+    torch.set_num_threads(
+        config["cpus"]
+    )  # Ray's OMP_NUM_THREADS would say the same; set on purpose
     context, device = get_context(), get_device()
     told, rank, world = config["told"], context.get_world_rank(), context.get_world_size()
     if device.type == "cuda":
@@ -213,8 +247,8 @@ def ray_worker(config: dict[str, Any]) -> None:
 
 
 def distribute(module: nn.Module) -> nn.Module:
-    # BatchNorm's running statistics stay each worker's own during training (rank 0's are kept): broadcasting them would
-    # write into buffers between the two forward passes of one step.
+    # BatchNorm's running statistics stay each worker's own during training (rank 0's are kept):
+    # broadcasting them would write into buffers between the two forward passes of one step.
     return DistributedDataParallel(module, broadcast_buffers=False)
 
 
@@ -233,11 +267,14 @@ def gather(damage: Damage) -> list[Damage]:
 
 
 def listen(told: Queue, meter: Meter, refused: list[Exception]) -> None:
-    """Show what the workers tell until None comes, or the queue's actor is lost; keep why they cannot go on."""
+    """Show what the workers tell until None comes, or the queue's actor is lost; keep why they
+    cannot go on.
+    """
     facts: dict[str, Any] | None = {}
     while facts is not None:
         try:
-            # With an end: an actor that SIGTERM has told to go waits for what it was asked, and answers nobody meanwhile.
+            # With an end: an actor that SIGTERM has told to go waits for what it was asked, and
+            # answers nobody meanwhile.
             facts = told.get(timeout=SECONDS_TO_LISTEN)
         except Empty:
             continue
@@ -260,7 +297,9 @@ def show(meter: Meter, told: dict[str, Any]) -> None:
 def known_recipe(arguments: list[str]) -> list[str]:
     """The arguments as they are; where the first word is no recipe, an InputError that names them."""
     if arguments and not arguments[0].startswith("-") and arguments[0] not in RECIPES:
-        raise InputError(f"unknown recipe {arguments[0]!r}, expected one of: {', '.join(RECIPES)}; see train.py --help")
+        raise InputError(
+            f"unknown recipe {arguments[0]!r}, expected one of: {', '.join(RECIPES)}; see train.py --help"
+        )
     return arguments
 
 

@@ -1,8 +1,10 @@
-"""Weights and config in one file that `torch.load(..., weights_only=True)` reads: no code runs when one is opened.
+"""Weights and config in one file that `torch.load(..., weights_only=True)` reads: no code runs when
+one is opened.
 
-In: a run's state. Out: bytes, and from bytes the encoder they describe. Where the bytes are kept is the caller's matter.
-torch.load compares none of the checksums that its zip has. So a checkpoint ends with the hash of all its bytes, as the zip's
-comment, which torch and zip programs pass over; of one from before there were seals the zip's checksums are compared.
+In: a run's state. Out: bytes, and from bytes the encoder they describe. Where the bytes are kept is
+the caller's matter. torch.load compares none of the checksums that its zip has. So a checkpoint
+ends with the hash of all its bytes, as the zip's comment, which torch and zip programs pass over;
+of one from before there were seals the zip's checksums are compared.
 """
 
 import dataclasses
@@ -15,8 +17,8 @@ from typing import Any
 
 import torch
 
-from model import torch_files
 from model.pvda import FeatureEncoder, PVDAConfig
+from model.weights import torch_files
 
 FORMAT = 1
 SEAL = re.compile(rb"pvda\.seal:([0-9a-f]{64}):pvda\.seal")
@@ -25,7 +27,9 @@ SEAL_BYTES = 2 * (len(MARK) + 1) + 64
 
 
 class CheckpointError(ValueError):
-    """A file that is not a checkpoint of ours. The message says what was found, what was expected and what to do."""
+    """A file that is not a checkpoint of ours. The message says what was found, what was expected
+    and what to do.
+    """
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -56,7 +60,9 @@ class Checkpoint:
 
 def dumps(checkpoint: Checkpoint) -> bytes:
     """The checkpoint as the bytes of a file."""
-    plain = {field.name: getattr(checkpoint, field.name) for field in dataclasses.fields(checkpoint)}
+    plain = {
+        field.name: getattr(checkpoint, field.name) for field in dataclasses.fields(checkpoint)
+    }
     plain |= {"format": FORMAT, "network": json.dumps(dataclasses.asdict(checkpoint.network))}
     plain |= {name: json.dumps(plain[name]) for name in ("recipe", "history")}
     buffer = io.BytesIO()
@@ -83,7 +89,8 @@ def loads(data: bytes, name: str = "the checkpoint") -> Checkpoint:
         held = Checkpoint(network=network, recipe=recipe, history=history, **plain)
         _refuse_strange(held)
         return held
-    except Exception as error:  # torch raises many kinds over a damaged file, struct.error and IndexError among them
+    # torch raises many kinds over a damaged file, struct.error and IndexError among them
+    except Exception as error:
         raise CheckpointError(
             f"{name} is not a checkpoint of format {FORMAT} ({type(error).__name__}); expected a last.pt written by "
             "jobs/train.py; name that file"
@@ -91,7 +98,8 @@ def loads(data: bytes, name: str = "the checkpoint") -> Checkpoint:
 
 
 def refuse_damaged(data: bytes, name: str) -> None:
-    """Raise CheckpointError where the bytes of a checkpoint, or of any file of torch.save's, are not what was written.
+    """Raise CheckpointError where the bytes of a checkpoint, or of any file of torch.save's, are
+    not what was written.
 
     0.1 s per 100 MB. Of bytes that are no zip nothing is said.
     """
@@ -124,9 +132,11 @@ def _zip_is_whole(data: bytes) -> tuple[bool, str]:
 
 
 def _refuse_strange(held: Checkpoint) -> None:
-    """Raise ValueError where a field is of another type, or the weights are of another network than is said.
+    """Raise ValueError where a field is of another type, or the weights are of another network than
+    is said.
 
-    The network is laid out without memory: one that says to be a million times as wide is not built to find out.
+    The network is laid out without memory: one that says to be a million times as wide is not built
+    to find out.
     """
     plain = (
         isinstance(held.recipe, dict)
@@ -142,7 +152,9 @@ def _refuse_strange(held: Checkpoint) -> None:
     if not plain:
         raise ValueError("a field of another type")
     with torch.device("meta"):
-        wanted = {name: tensor.shape for name, tensor in FeatureEncoder(held.network).state_dict().items()}
+        wanted = {
+            name: tensor.shape for name, tensor in FeatureEncoder(held.network).state_dict().items()
+        }
     if {name: tensor.shape for name, tensor in held.encoder_weights.items()} != wanted:
         raise ValueError("weights of another network")
 
@@ -161,9 +173,13 @@ def load_encoder(path: str) -> FeatureEncoder:
 
 
 def fingerprint(checkpoint: Checkpoint, preprocessing: str) -> str:
-    """Hash of all that an embedding depends on: weights, network and preprocessing; 64 hexadecimal digits."""
+    """Hash of all that an embedding depends on: weights, network and preprocessing; 64 hexadecimal
+    digits.
+    """
     digest = hashlib.sha256()
-    digest.update(json.dumps([dataclasses.asdict(checkpoint.network), preprocessing], sort_keys=True).encode())
+    digest.update(
+        json.dumps([dataclasses.asdict(checkpoint.network), preprocessing], sort_keys=True).encode()
+    )
     for name, tensor in sorted(checkpoint.encoder_weights.items()):
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.contiguous().flatten().view(torch.uint8).numpy().tobytes())

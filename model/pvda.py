@@ -1,7 +1,8 @@
 """The networks of PVDA: feature encoder, location classifier, view discriminator.
 
-In: images as bytes (B, 3, H, W). Out: maps for the discriminator, one embedding per ring for the classifier.
-Shapes: B images, H x W pixels or cells, C channels of the maps, P rings, D numbers per ring, L locations.
+In: images as bytes (B, 3, H, W). Out: maps for the discriminator, one embedding per ring for the
+classifier. Shapes: B images, H x W pixels or cells, C channels of the maps, P rings, D numbers per
+ring, L locations.
 """
 
 from dataclasses import dataclass
@@ -9,8 +10,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from model.backbone import BLOCKS, LEAST_CHANNELS, STRIDE, Depth, ResNet, layer1_channels
-from model.rings import Divisor, ring_average
+from model.backbones.resnet import BLOCKS, LEAST_CHANNELS, STRIDE, Depth, ResNet, layer1_channels
+from model.parts.ring_pooling import Divisor, ring_average
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 "Of red, green and blue in 0..1: what torchvision's weights were trained with."
@@ -41,7 +42,9 @@ class PVDAConfig:
 
     def __post_init__(self) -> None:
         if self.depth not in BLOCKS:
-            raise ValueError(f"depth is {self.depth}, expected one of {', '.join(map(str, BLOCKS))}")
+            raise ValueError(
+                f"depth is {self.depth}, expected one of {', '.join(map(str, BLOCKS))}"
+            )
         if layer1_channels(self.depth, self.width) < LEAST_CHANNELS:
             raise ValueError(
                 f"width is {self.width}, which gives layer1 of a ResNet-{self.depth} "
@@ -82,7 +85,9 @@ class FeatureEncoder(nn.Module):
         super().__init__()
         self.parts, self.divisor = config.parts, config.ring_divisor
         self.backbone = ResNet(config.depth, config.width)
-        self.refine = nn.ModuleList(refinement(self.backbone.channels, config.part_dim) for _ in range(config.parts))
+        self.refine = nn.ModuleList(
+            refinement(self.backbone.channels, config.part_dim) for _ in range(config.parts)
+        )
         for name, values in (("mean_31", IMAGENET_MEAN), ("std_31", IMAGENET_STD)):
             self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
 
@@ -91,7 +96,9 @@ class FeatureEncoder(nn.Module):
         normalised = (images_B3HW.to(self.mean_31.dtype) / 255 - self.mean_31) / self.std_31
         maps_BCHW = self.backbone(normalised)
         rings_BPC = ring_average(maps_BCHW, self.parts, self.divisor)
-        g_BPD = torch.stack([refine(rings_BPC[:, part]) for part, refine in enumerate(self.refine)], dim=1)
+        g_BPD = torch.stack(
+            [refine(rings_BPC[:, part]) for part, refine in enumerate(self.refine)], dim=1
+        )
         return maps_BCHW, g_BPD
 
 
@@ -110,7 +117,9 @@ class LocationClassifier(nn.Module):
     def __init__(self, config: PVDAConfig, locations: int) -> None:
         super().__init__()
         self.dropout = nn.Dropout(config.dropout)
-        self.branches = nn.ModuleList(nn.Linear(config.part_dim, locations) for _ in range(config.parts))
+        self.branches = nn.ModuleList(
+            nn.Linear(config.part_dim, locations) for _ in range(config.parts)
+        )
         for branch in self.branches:
             assert isinstance(branch, nn.Linear)
             nn.init.normal_(branch.weight, 0.0, 0.001)
@@ -119,7 +128,9 @@ class LocationClassifier(nn.Module):
     def forward(self, g_BPD: Tensor) -> Tensor:
         """Embeddings (B, P, D) -> logits (B, P, L)."""
         dropped_BPD = self.dropout(g_BPD)
-        return torch.stack([branch(dropped_BPD[:, part]) for part, branch in enumerate(self.branches)], dim=1)
+        return torch.stack(
+            [branch(dropped_BPD[:, part]) for part, branch in enumerate(self.branches)], dim=1
+        )
 
 
 class ViewDiscriminator(nn.Module):
@@ -129,11 +140,16 @@ class ViewDiscriminator(nn.Module):
         super().__init__()
         width = config.discriminator_channels
         self.blocks = nn.Sequential(
-            nn.Conv2d(channels, width, 3, padding=1, bias=False), nn.BatchNorm2d(width),
-            nn.Conv2d(width, width, 3, padding=1, bias=False), nn.BatchNorm2d(width), nn.AvgPool2d(2),
-            nn.Conv2d(width, width, 3, padding=1, bias=False), nn.BatchNorm2d(width), nn.AvgPool2d(2),
+            nn.Conv2d(channels, width, 3, padding=1, bias=False),
+            nn.BatchNorm2d(width),
+            nn.Conv2d(width, width, 3, padding=1, bias=False),
+            nn.BatchNorm2d(width),
+            nn.AvgPool2d(2),
+            nn.Conv2d(width, width, 3, padding=1, bias=False),
+            nn.BatchNorm2d(width),
+            nn.AvgPool2d(2),
             nn.ReLU(),
-        )  # fmt: skip
+        )
         self.verdict = nn.Linear(width, 2)
 
     def forward(self, maps_BCHW: Tensor) -> Tensor:

@@ -13,7 +13,8 @@ class Schedule:
     """How alpha and the learning rates move. The defaults are the paper's."""
 
     epochs: int = 560
-    "Passes over the satellite view in all: four periods [chosen: the ablation decays at 140, 280 and 420]."
+    """Passes over the satellite view in all: four periods [chosen: the ablation decays at 140, 280
+    and 420]."""
     alpha: float = 0.9
     "Weight of the adversarial loss in the first period [paper]."
     alpha_step: float = 0.1
@@ -21,11 +22,13 @@ class Schedule:
     period: int = 140
     "Epochs between two growths of alpha [paper]."
     shape: Literal["step", "cosine"] = "step"
-    "`step` is the paper's decay; `cosine` falls to zero over all epochs, for short runs from scratch."
+    """`step` is the paper's decay; `cosine` falls to zero over all epochs, for short runs from
+    scratch."""
     decay: float = 0.8
     "Factor at each decay epoch [paper]."
     decay_epochs: tuple[int, ...] = (60, 120)
-    "When the rates decay, counted from the period's start where they restart, else from the training's [paper]."
+    """When the rates decay, counted from the period's start where they restart, else from the
+    training's [paper]."""
     restart: bool = True
     "Whether the rates return to their start when alpha grows [paper: warm restart]."
     warmup_epochs: float = 0.0
@@ -33,7 +36,9 @@ class Schedule:
 
     def __post_init__(self) -> None:
         if self.epochs < 1 or self.period < 1:
-            raise ValueError(f"epochs is {self.epochs} and period {self.period}, expected at least 1 of each")
+            raise ValueError(
+                f"epochs is {self.epochs} and period {self.period}, expected at least 1 of each"
+            )
         if self.alpha < 0:
             raise ValueError(f"alpha is {self.alpha}, expected 0 (no adversary) or more")
 
@@ -48,7 +53,9 @@ class Phase:
 
 
 def phase(schedule: Schedule, epoch: float) -> Phase:
-    """Alpha and learning-rate scale after `epoch` passes; fractions of an epoch matter to warm-up and cosine only."""
+    """Alpha and learning-rate scale after `epoch` passes; fractions of an epoch matter to warm-up
+    and cosine only.
+    """
     whole = math.floor(epoch)
     periods, within = divmod(whole, schedule.period)
     alpha = schedule.alpha + periods * schedule.alpha_step

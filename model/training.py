@@ -1,7 +1,8 @@
 """The two-step update of PVDA, and the state that a checkpoint holds. Knows no Ray and no files.
 
-In: a batch of each view. Out: changed weights, and the measures of the step, which stay on the device.
-Shapes: B images of a view, H x W pixels or cells, C channels of the maps, P rings, L locations.
+In: a batch of each view. Out: changed weights, and the measures of the step, which stay on the
+device. Shapes: B images of a view, H x W pixels or cells, C channels of the maps, P rings, L
+locations.
 """
 
 from collections.abc import Callable
@@ -27,7 +28,8 @@ class Optimisation:
     """How the weights are moved. The defaults are the paper's."""
 
     kind: Literal["sgd", "adamw"] = "sgd"
-    "Of the encoder and classifier: SGD with Nesterov momentum [LPN], or AdamW for short runs from scratch."
+    """Of the encoder and classifier: SGD with Nesterov momentum [LPN], or AdamW for short runs from
+    scratch."""
     backbone_rate: float = 0.001
     "Learning rate of the backbone [paper]."
     head_rate: float = 0.01
@@ -43,10 +45,12 @@ class Optimisation:
 
 
 class Learner(nn.Module):
-    """Encoder and classifier as one module: one forward pass an iteration, which is what DDP wants to see.
+    """Encoder and classifier as one module: one forward pass an iteration, which is what DDP wants
+    to see.
 
-    The encoder runs once per view, so that BatchNorm's statistics are a view's own [LPN]; with `joint_bn` once on both, so
-    that they are common. Only common ones are what the encoder will be tested with, its running means.
+    The encoder runs once per view, so that BatchNorm's statistics are a view's own [LPN]; with
+    `joint_bn` once on both, so that they are common. Only common ones are what the encoder will be
+    tested with, its running means.
     """
 
     def __init__(self, config: PVDAConfig, locations: int, joint_bn: bool = False) -> None:
@@ -55,7 +59,9 @@ class Learner(nn.Module):
         self.encoder = FeatureEncoder(config)
         self.classifier = LocationClassifier(config, locations)
 
-    def forward(self, images1_B3HW: Tensor, images2_B3HW: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(
+        self, images1_B3HW: Tensor, images2_B3HW: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """UAV and satellite images -> maps of each (B, C, H, W), location logits of each (B, P, L)."""
         if self.joint_bn:
             count = len(images1_B3HW)
@@ -92,7 +98,9 @@ class Training:
         distribute: Callable[[nn.Module], nn.Module] = lambda module: module,
     ) -> None:
         self.device = torch.device(device)
-        self.bfloat16 = precision == "bfloat16" or (precision == "auto" and self.device.type == "cuda")
+        self.bfloat16 = precision == "bfloat16" or (
+            precision == "auto" and self.device.type == "cuda"
+        )
         self.learner = _placed(Learner(config, locations, joint_bn), self.device, sync_bn)
         self.discriminator: ViewDiscriminator | None = None
         if adversary:
@@ -100,14 +108,18 @@ class Training:
             self.discriminator = _placed(discriminator, self.device, sync_bn)
         for module in self.modules.values():
             module.train()
-        self.not_compiled = None if compile_for is None else self._compile(config.image_size, compile_for)
+        self.not_compiled = (
+            None if compile_for is None else self._compile(config.image_size, compile_for)
+        )
         "Why the networks are not compiled though they should be."
         self._learner = distribute(self.learner)
         self._discriminator = None if self.discriminator is None else distribute(self.discriminator)
         self.optimisers = self._optimisers(optimisation)
 
     def _optimisers(self, rates: Optimisation) -> list[Optimizer]:
-        """Of encoder and classifier, and of D where there is one; every group knows the rate that it starts with."""
+        """Of encoder and classifier, and of D where there is one; every group knows the rate that
+        it starts with.
+        """
 
         def group(name: str, module: nn.Module, rate: float) -> dict[str, Any]:
             return {"params": list(module.parameters()), "start": rate, "name": name}
@@ -118,39 +130,64 @@ class Training:
             group("classifier", self.learner.classifier, rates.classifier_rate),
         ]
         optimisers: list[Optimizer] = [
-            SGD(groups, lr=0.0, momentum=rates.momentum, nesterov=True, weight_decay=rates.weight_decay)
+            SGD(
+                groups,
+                lr=0.0,
+                momentum=rates.momentum,
+                nesterov=True,
+                weight_decay=rates.weight_decay,
+            )
             if rates.kind == "sgd"
             else AdamW(groups, lr=0.0, weight_decay=rates.weight_decay)
         ]
         if self.discriminator is not None:
-            optimisers.append(Adam([group("discriminator", self.discriminator, rates.discriminator_rate)], lr=0.0))
+            optimisers.append(
+                Adam([group("discriminator", self.discriminator, rates.discriminator_rate)], lr=0.0)
+            )
         return optimisers
 
     @property
     def modules(self) -> dict[str, nn.Module]:
         """The networks by the name under which a checkpoint holds them."""
-        named: dict[str, nn.Module] = {"encoder": self.learner.encoder, "classifier": self.learner.classifier}
-        return named | ({"discriminator": self.discriminator} if self.discriminator is not None else {})
+        named: dict[str, nn.Module] = {
+            "encoder": self.learner.encoder,
+            "classifier": self.learner.classifier,
+        }
+        return named | (
+            {"discriminator": self.discriminator} if self.discriminator is not None else {}
+        )
 
     @property
     def rates(self) -> dict[str, float]:
         """Learning rates in force, by group."""
-        return {group["name"]: group["lr"] for optimiser in self.optimisers for group in optimiser.param_groups}
+        return {
+            group["name"]: group["lr"]
+            for optimiser in self.optimisers
+            for group in optimiser.param_groups
+        }
 
     def step(
-        self, images1_B3HW: Tensor, location1_B: Tensor, images2_B3HW: Tensor, location2_B: Tensor, now: Phase
+        self,
+        images1_B3HW: Tensor,
+        location1_B: Tensor,
+        images2_B3HW: Tensor,
+        location2_B: Tensor,
+        now: Phase,
     ) -> dict[str, Tensor]:
         """One iteration: D takes a step on Eq. 2, then encoder and classifier one on Eq. 4.
 
-        One encoder pass serves both steps; D sees both views in one batch, since BatchNorm over separate batches would
-        erase the very shift that it must see. Returns the step's measures, detached scalars that are still on the device:
-        each loss, whole and by view (and ring), how often D was right, and the length of each network's gradient.
+        One encoder pass serves both steps; D sees both views in one batch, since BatchNorm over
+        separate batches would erase the very shift that it must see. Returns the step's measures,
+        detached scalars that are still on the device: each loss, whole and by view (and ring), how
+        often D was right, and the length of each network's gradient.
         """
         for optimiser in self.optimisers:
             for group in optimiser.param_groups:
                 group["lr"] = group["start"] * now.rate_scale
         with self._autocast():
-            maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = self._learner(images1_B3HW, images2_B3HW)
+            maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = self._learner(
+                images1_B3HW, images2_B3HW
+            )
         located_VP = location_terms(logits1_BPL, location1_B, logits2_BPL, location2_B)
         total = located_VP.sum()
         measures = {"location_loss": total} | _named("location_loss", located_VP)
@@ -165,10 +202,15 @@ class Training:
             adversarial_V = adversarial_terms(*verdict_B2.tensor_split([len(maps1_BCHW)]))
             adversarial = adversarial_V.sum()
             total = feature_loss(total, adversarial, now.alpha)
-            measures |= {"adversarial_loss": adversarial} | _named("adversarial_loss", adversarial_V)
+            measures |= {"adversarial_loss": adversarial} | _named(
+                "adversarial_loss", adversarial_V
+            )
         self.optimisers[0].zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
-        for name, module in (("encoder", self.learner.encoder), ("classifier", self.learner.classifier)):
+        for name, module in (
+            ("encoder", self.learner.encoder),
+            ("classifier", self.learner.classifier),
+        ):
             measures[f"gradient_norm/{name}"] = gradient_norm(module)
         self.optimisers[0].step()
         return {name: measure.detach() for name, measure in measures.items()}
@@ -185,7 +227,9 @@ class Training:
         loss.backward()  # type: ignore[no-untyped-call]
         norm = gradient_norm(self._discriminator)
         self.optimisers[1].step()
-        right_V = [(verdict_B2.argmax(1) == view).float() for view, verdict_B2 in enumerate(verdicts)]
+        right_V = [
+            (verdict_B2.argmax(1) == view).float() for view, verdict_B2 in enumerate(verdicts)
+        ]
         return (
             {"view_loss": loss, "discriminator_accuracy": torch.cat(right_V).mean()}
             | {"gradient_norm/discriminator": norm}
@@ -194,9 +238,14 @@ class Training:
         )
 
     def _compile(self, size: int, count: int) -> str | None:
-        """Compile the networks in place, and try them: torch compiles at the first call. Returns why it cannot."""
+        """Compile the networks in place, and try them: torch compiles at the first call. Returns
+        why it cannot.
+        """
         networks = [self.learner] + ([self.discriminator] if self.discriminator is not None else [])
-        held = [{name: tensor.clone() for name, tensor in network.state_dict().items()} for network in networks]
+        held = [
+            {name: tensor.clone() for name, tensor in network.state_dict().items()}
+            for network in networks
+        ]
         images_B3HW = torch.zeros(count, 3, size, size, dtype=torch.uint8, device=self.device)
         images_B3HW = images_B3HW.to(memory_format=torch.channels_last)
         try:
@@ -221,7 +270,9 @@ class Training:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16)
 
     def state(self) -> dict[str, Any]:
-        """Everything that the next step depends on, besides the data's order, as tensors and plain values."""
+        """Everything that the next step depends on, besides the data's order, as tensors and plain
+        values.
+        """
         return {
             "modules": {name: module.state_dict() for name, module in self.modules.items()},
             "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
@@ -239,7 +290,9 @@ class Training:
 
 def gradient_norm(module: nn.Module) -> Tensor:
     """Length of a network's gradient, all its parameters taken as one vector."""
-    return get_total_norm([parameter.grad for parameter in module.parameters() if parameter.grad is not None])
+    return get_total_norm(
+        [parameter.grad for parameter in module.parameters() if parameter.grad is not None]
+    )
 
 
 def _placed(module: Module, device: torch.device, sync_bn: bool) -> Module:

@@ -1,1 +1,3 @@
-"""Images and vectors in motion: folder -> shards -> batches -> feature table -> index -> answer. Never imports model."""
+"""Images and vectors in motion: folder -> shards -> batches -> feature table -> index -> answer.
+Never imports model.
+"""

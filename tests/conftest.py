@@ -1,4 +1,6 @@
-"""Fixtures that several tests share: one Ray for all, a tiny data set made by the simulator, a small encoder."""
+"""Fixtures that several tests share: one Ray for all, a tiny data set made by the simulator, a
+small encoder.
+"""
 
 import os
 from collections.abc import Iterator
@@ -7,17 +9,22 @@ from typing import TYPE_CHECKING
 
 import hypothesis
 import pytest
+
 from tests.launcher import Launcher
 
 if TYPE_CHECKING:
     from model.pvda import FeatureEncoder
 
-os.environ.setdefault("RAY_AUTH_MODE", "disabled")  # the same for every Ray process that the tests start
+os.environ.setdefault(
+    "RAY_AUTH_MODE", "disabled"
+)  # the same for every Ray process that the tests start
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-# Threads that wait for each other give their core away: spinning, they take it from whoever they wait for on a busy machine.
+# Threads that wait for each other give their core away: spinning, they take it from whoever they
+# wait for on a busy machine.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-# The same examples each time, and no clock: a pause of the machine is no defect. PVDA_FUZZ_EXAMPLES tries others.
+# The same examples each time, and no clock: a pause of the machine is no defect. PVDA_FUZZ_EXAMPLES
+# tries others.
 hypothesis.settings.register_profile(
     "house",
     deadline=None,
@@ -32,7 +39,7 @@ def ray_cluster() -> Iterator[None]:
     """A local Ray of this test session."""
     import ray
 
-    from pipeline import cluster
+    from pipeline.core import cluster
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_ADDRESS", "local")  # never a cluster that someone runs on this machine
@@ -43,19 +50,23 @@ def ray_cluster() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def tiny_world(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) -> Path:
-    """A data set in University-1652's layout: 6 training locations, 3 test locations, 2 distractors, 3 views of 64 px."""
-    from pipeline.simulate import SimulationSettings, simulate
+    """A data set in University-1652's layout: 6 training locations, 3 test locations, 2
+    distractors, 3 views of 64 px.
+    """
+    from pipeline.simulation.simulate import SimulationSettings, simulate
 
     out = tmp_path_factory.mktemp("world")
     return simulate(
-        SimulationSettings(out=str(out), train_locations=6, test_locations=3, distractors=2, views=3, size=64)
+        SimulationSettings(
+            out=str(out), train_locations=6, test_locations=3, distractors=2, views=3, size=64
+        )
     )
 
 
 @pytest.fixture(scope="session")
 def tiny_shards(tmp_path_factory: pytest.TempPathFactory, tiny_world: Path) -> str:
     """That data set as shards of 8 images."""
-    from pipeline.packing import PackingSettings, pack
+    from pipeline.shards.pack import PackingSettings, pack
     from pipeline.sources.university1652 import University1652
 
     out = str(tmp_path_factory.mktemp("shards"))
@@ -83,14 +94,18 @@ def ray_address(ray_cluster: None, monkeypatch: pytest.MonkeyPatch) -> str:
 
 @pytest.fixture
 def lively_encoder() -> "FeatureEncoder":
-    """A ResNet-18 of a quarter's width at 64 px whose BatchNorms have been somewhere, so that leaving one out shows."""
+    """A ResNet-18 of a quarter's width at 64 px whose BatchNorms have been somewhere, so that
+    leaving one out shows.
+    """
     import torch
     from torch import nn
 
     from model.pvda import FeatureEncoder, PVDAConfig
 
     torch.manual_seed(0)
-    encoder = FeatureEncoder(PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=16)).eval()
+    encoder = FeatureEncoder(
+        PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=16)
+    ).eval()
     with torch.no_grad():
         for module in encoder.modules():
             if isinstance(module, nn.modules.batchnorm._BatchNorm):

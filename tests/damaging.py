@@ -1,4 +1,6 @@
-"""Files damaged in seeded ways, and the verdict on who reads them: a sentence naming file and remedy, or the same content."""
+"""Files damaged in seeded ways, and the verdict on who reads them: a sentence naming file and
+remedy, or the same content.
+"""
 
 import hashlib
 import re
@@ -9,11 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline import sealed
-from pipeline.records import InputError
-from pipeline.shards import read_manifest
+from pipeline.core import json_files
+from pipeline.core.errors import InputError
+from pipeline.shards.manifest import read_manifest
 
-MENDS = re.compile(r"jobs/\w+\.py|embed its shard again|run the same command again|calibrate again|taking checkpoint")
+MENDS = re.compile(
+    r"jobs/\w+\.py|embed its shard again|run the same command again|calibrate again|taking checkpoint"
+)
 
 
 def damages(good: bytes, count: int, seed: int = 0) -> Iterator[bytes | None]:
@@ -29,7 +33,11 @@ def damages(good: bytes, count: int, seed: int = 0) -> Iterator[bytes | None]:
         else:
             for _ in range((1, 1, 1, 1, 1, 2, 4, 16)[number % 10]):
                 data[place] ^= 1 << int(rng.integers(8))
-                place = int(rng.integers(len(good))) if rng.random() < 0.5 else min(place + 1, len(good) - 1)
+                place = (
+                    int(rng.integers(len(good)))
+                    if rng.random() < 0.5
+                    else min(place + 1, len(good) - 1)
+                )
         yield bytes(data)
 
 
@@ -46,8 +54,12 @@ def unchanged(found: Any, expected: Any) -> None:
     assert found == expected, "other content, and not a word"
 
 
-def found_or_equal(path: Path, look: Callable[[], Any], count: int, errors: type[Exception] = InputError) -> int:
-    """Damage the file in so many ways; returns how many were refused, each naming it and what mends it."""
+def found_or_equal(
+    path: Path, look: Callable[[], Any], count: int, errors: type[Exception] = InputError
+) -> int:
+    """Damage the file in so many ways; returns how many were refused, each naming it and what mends
+    it.
+    """
     good, expected, refused = path.read_bytes(), look(), 0
     for data in damages(good, count):
         path.unlink(missing_ok=True)
@@ -63,7 +75,9 @@ def found_or_equal(path: Path, look: Callable[[], Any], count: int, errors: type
     return refused
 
 
-def look_or_say_gone(path: Path, look: Callable[[], Any], error: type[Exception] = InputError) -> Callable[[], Any]:
+def look_or_say_gone(
+    path: Path, look: Callable[[], Any], error: type[Exception] = InputError
+) -> Callable[[], Any]:
     """`look`, of a file whose absence means that nothing was done yet."""
 
     def looked() -> Any:
@@ -78,5 +92,9 @@ def say_again(shards: Path, name: str) -> None:
     """Have the manifest say what a tar is now, as if it had been packed so."""
     manifest = read_manifest(str(shards))
     digest = hashlib.sha256((shards / f"{name}.tar").read_bytes()).hexdigest()
-    said = tuple(replace(one, sha256=digest) if one.name == name else one for one in manifest.shards)
-    sealed.write(str(shards / "manifest.json"), asdict(replace(manifest, shards=said)))
+    said = tuple(
+        replace(one, sha256=digest) if one.name == name else one for one in manifest.shards
+    )
+    json_files.write_checksummed(
+        str(shards / "manifest.json"), asdict(replace(manifest, shards=said))
+    )

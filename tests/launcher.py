@@ -1,6 +1,8 @@
-"""Runs the real jobs from a process that has imported their libraries already: one begins in milliseconds, not in seconds.
+"""Runs the real jobs from a process that has imported their libraries already: one begins in
+milliseconds, not in seconds.
 
-The server forks; each child is a session of its own and does what `python jobs/NAME.py ARGUMENTS` would do.
+The server forks; each child is a session of its own and does what `python jobs/NAME.py ARGUMENTS`
+would do.
 """
 
 import atexit
@@ -23,7 +25,16 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 PATH = (str(Path(__file__).parent / "chaos" / "hook"), str(ROOT))
 "Of every Python process: where the faults of the storage are, and the project."
-LIBRARIES = ("torch", "ray", "ray.train.torch", "faiss", "pyarrow.parquet", "tensorboard", "PIL.Image", "simplejpeg")
+LIBRARIES = (
+    "torch",
+    "ray",
+    "ray.train.torch",
+    "faiss",
+    "pyarrow.parquet",
+    "tensorboard",
+    "PIL.Image",
+    "simplejpeg",
+)
 PATIENCE = 300.0
 "Seconds that a job may take on a busy machine."
 JOBS = ("simulate", "make_shards", "train", "embed_gallery", "build_index", "evaluate")
@@ -74,9 +85,14 @@ class Launcher:
     def __init__(self, scratch: Path, environment: Mapping[str, str]) -> None:
         self._log, self._jobs = scratch / "job.log", dict[int, Job]()
         self._server = subprocess.Popen(
-            [sys.executable, "-m", "tests.launcher"], cwd=ROOT, text=True, bufsize=1, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            [sys.executable, "-m", "tests.launcher"],
+            cwd=ROOT,
+            text=True,
+            bufsize=1,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
             env=os.environ | environment | {"PYTHONPATH": os.pathsep.join(PATH)},
-        )  # fmt: skip
+        )
         self._started: list[int] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -84,7 +100,12 @@ class Launcher:
     def start(self, name: str, arguments: Sequence[str], **environment: str) -> Job:
         assert self._server.stdin is not None
         known = len(self._started)
-        order = {"name": name, "arguments": list(arguments), "environment": environment, "log": str(self._log)}
+        order = {
+            "name": name,
+            "arguments": list(arguments),
+            "environment": environment,
+            "log": str(self._log),
+        }
         self._server.stdin.write(json.dumps(order) + "\n")
         while len(self._started) == known:
             if self._server.poll() is not None:
@@ -112,14 +133,19 @@ class Launcher:
 
 
 def serve() -> dict[str, Any]:
-    """Fork a child per order; returns in the children alone, with the order, and ends the server when its input does."""
+    """Fork a child per order; returns in the children alone, with the order, and ends the server
+    when its input does.
+    """
     for name in (*LIBRARIES, *(f"jobs.{job}" for job in JOBS)):
         importlib.import_module(name)
     wanted, waiting = b"", True
     while waiting:
         with suppress(ChildProcessError):
             while (over := os.waitpid(-1, os.WNOHANG))[0]:
-                print(json.dumps({"pid": over[0], "code": os.waitstatus_to_exitcode(over[1])}), flush=True)
+                print(
+                    json.dumps({"pid": over[0], "code": os.waitstatus_to_exitcode(over[1])}),
+                    flush=True,
+                )
         if not select.select([0], [], [], 0.01)[0]:
             continue
         more = os.read(0, 1 << 16)
@@ -150,7 +176,8 @@ def become(order: dict[str, Any]) -> None:
         code = asked.code
     except BaseException:
         sys.excepthook(*sys.exc_info())
-    # As Python ends, but for taking every imported module apart, which costs seconds where all of its memory is shared.
+    # As Python ends, but for taking every imported module apart, which costs seconds where all of
+    # its memory is shared.
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()
     sys.stdout.flush()

@@ -1,4 +1,5 @@
-"""The processes of a job and of a Ray cluster on this machine: which there are, and how a cluster of our own is begun.
+"""The processes of a job and of a Ray cluster on this machine: which there are, and how a cluster
+of our own is begun.
 
 Linux's /proc is read; psutil would be one more dependency for three lines.
 """
@@ -17,7 +18,13 @@ from pathlib import Path
 def named(pid: int) -> str:
     """A process's command line; empty when it is gone."""
     try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+        return (
+            Path(f"/proc/{pid}/cmdline")
+            .read_bytes()
+            .replace(b"\0", b" ")
+            .decode(errors="replace")
+            .strip()
+        )
     except OSError:
         return ""
 
@@ -39,14 +46,24 @@ def below(pid: int) -> list[int]:
 
 
 def working(pid: int) -> list[int]:
-    """Ray's workers below a process that have something to do; its agents, whose death takes the node along, are none."""
+    """Ray's workers below a process that have something to do; its agents, whose death takes the
+    node along, are none.
+    """
     passed_over = ("ray::IDLE", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
-    return [one for one in below(pid) if (name := named(one)).startswith("ray::") and not name.startswith(passed_over)]
+    return [
+        one
+        for one in below(pid)
+        if (name := named(one)).startswith("ray::") and not name.startswith(passed_over)
+    ]
 
 
 def daemons(pid: int) -> list[int]:
     """Ray's own processes below a process: without the raylet or the GCS there is no cluster."""
-    return [one for one in below(pid) if any(word in named(one) for word in ("raylet/raylet", "gcs/gcs_server"))]
+    return [
+        one
+        for one in below(pid)
+        if any(word in named(one) for word in ("raylet/raylet", "gcs/gcs_server"))
+    ]
 
 
 def strike(pid: int, kind: signal.Signals) -> bool:
@@ -64,13 +81,17 @@ def cluster(cpus: int, environment: dict[str, str]) -> Iterator[tuple[int, str]]
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    # With its dashboard: Ray Train asks it whether a controller lives, and keeps a dead one's places where there is none.
+    # With its dashboard: Ray Train asks it whether a controller lives, and keeps a dead one's
+    # places where there is none.
     words = ["start", "--head", "--block", f"--port={port}", f"--num-cpus={cpus}"]
     ray = Path(sys.executable).with_name("ray")
     head = subprocess.Popen(
-        [str(ray), *words, "--disable-usage-stats", "--node-ip-address=127.0.0.1"], env=os.environ | environment,
-        start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+        [str(ray), *words, "--disable-usage-stats", "--node-ip-address=127.0.0.1"],
+        env=os.environ | environment,
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     try:
         deadline = time.monotonic() + 60
         while not any("raylet/raylet" in named(one) for one in below(head.pid)):

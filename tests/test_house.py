@@ -1,7 +1,12 @@
-"""The rules of the house, read off the source: who may import whom, and that the README's tree is the real one."""
+"""The layout, checked on the source: who may import whom, and how large files, lines and names are.
+
+Rooms are folders of `pipeline/`. A room may import itself, the rooms below all others (`core`,
+`images`, `camera`), and what `MAY_IMPORT` lists for it.
+"""
 
 import ast
 import re
+from collections import Counter
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -11,9 +16,37 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("pipeline", "model", "jobs")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-ALLOWED = {"pipeline": {"pipeline"}, "model": {"model"}, "jobs": {"jobs", "pipeline", "model"}}
+TESTS = sorted((ROOT / "tests").rglob("*.py"))
+ALL = [*SOURCES, *TESTS, *sorted((ROOT / "benchmarks").rglob("*.py"))]
+TOP = {"pipeline": {"pipeline"}, "model": {"model"}, "jobs": {"jobs", "pipeline", "model"}}
 FOREIGN_TO_MODEL = {"ray", "webdataset", "pyarrow", "faiss", "fsspec"}
-LONGEST = 300
+
+BELOW_ALL = {"core", "images", "camera"}
+MAY_IMPORT: dict[str, set[str]] = {
+    "core": set(),
+    "images": {"core"},
+    "camera": {"core"},
+    "sources": BELOW_ALL,
+    "simulation": BELOW_ALL | {"sources"},
+    "shards": BELOW_ALL | {"sources"},
+    "batches": BELOW_ALL | {"shards"},
+    "features": BELOW_ALL | {"shards", "batches"},
+    "index": BELOW_ALL | {"features"},
+    "matching": BELOW_ALL,
+    "locate": BELOW_ALL | {"index", "matching"},
+    "service": BELOW_ALL | {"locate", "index"},
+    "retrieval": BELOW_ALL | {"features"},
+    "report": BELOW_ALL | {"retrieval"},
+    "evaluation": BELOW_ALL | {"report", "retrieval", "features", "shards"},
+}
+ONLY_FROM = {
+    ("shards", "sources"): {"pack", "writer", "extend", "repair"},
+    ("features", "shards"): {"embed", "embed_worker"},
+    ("features", "batches"): {"embed", "embed_worker"},
+}
+"(room, room it imports) -> the only modules that may."
+
+MOST_LINES, MOST_COLUMNS, MOST_FILES, LONGEST_TEST_NAME = 300, 100, 16, 60
 
 
 def module_of(path: Path) -> str:
@@ -30,37 +63,108 @@ def imports_of(path: Path) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def named(module: str) -> str:
-    """The longest prefix of a dotted name that is a module of ours."""
+def own_module(name: str) -> str:
+    """The longest prefix of a dotted name that is a module of this project, else ""."""
     known = {module_of(path) for path in SOURCES}
+    parts = name.split(".")
+    prefixes = (".".join(parts[:end]) for end in range(len(parts), 0, -1))
+    return next((prefix for prefix in prefixes if prefix in known), "")
+
+
+def room_of(module: str) -> str:
+    """The room of a module of `pipeline`, else ""."""
     parts = module.split(".")
-    return next((name for end in range(len(parts), 0, -1) if (name := ".".join(parts[:end])) in known), "")
+    return parts[1] if parts[0] == "pipeline" and len(parts) > 1 else ""
+
+
+def public_names(path: Path) -> list[str]:
+    """The names without an underscore that a module defines at its top."""
+    names: list[str] = []
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            names.append(node.name)
+        elif isinstance(node, ast.Assign):
+            targets = [part for target in node.targets for part in ast.walk(target)]
+            names += [part.id for part in targets if isinstance(part, ast.Name)]
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            names.append(node.target.id)
+    return [name for name in names if not name.startswith("_")]
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=module_of)
-def test_arrows_run_from_jobs_to_pipeline_and_model_and_nowhere_else(path: Path) -> None:
+def test_packages_import_in_one_direction(path: Path) -> None:
     own = path.relative_to(ROOT).parts[0]
     reached = {name.split(".")[0] for name in imports_of(path)}
-    assert reached & set(PACKAGES) <= ALLOWED[own]
+    assert reached & set(PACKAGES) <= TOP[own]
     if own == "model":
         assert not reached & FOREIGN_TO_MODEL
 
 
+@pytest.mark.parametrize("path", SOURCES, ids=module_of)
+def test_rooms_import_by_the_table(path: Path) -> None:
+    own = room_of(module_of(path))
+    if not own:
+        assert path.parts[-2] != "pipeline" or path.name == "__init__.py", "a module outside rooms"
+        return
+    reached = {room_of(own_module(name)) for name in imports_of(path)} - {"", own}
+    assert reached <= MAY_IMPORT[own]
+    for room in reached:
+        assert path.stem in ONLY_FROM.get((own, room), {path.stem})
+
+
 def test_there_is_no_import_cycle() -> None:
-    graph = {module_of(path): {named(name) for name in imports_of(path)} - {"", module_of(path)} for path in SOURCES}
-    # A package's own __init__ stands for its modules where names are taken from it.
+    graph = {
+        module_of(path): {own_module(name) for name in imports_of(path)} - {"", module_of(path)}
+        for path in SOURCES
+    }
+    # A package's own __init__ stands for its modules where names are imported from it.
     assert list(TopologicalSorter(graph).static_order())
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=module_of)
-def test_a_file_fits_one_sitting_and_says_what_it_is(path: Path) -> None:
+def test_rooms_depend_on_each_other_without_a_cycle() -> None:
+    assert list(TopologicalSorter(MAY_IMPORT).static_order())
+
+
+@pytest.mark.parametrize("path", ALL, ids=module_of)
+def test_a_file_fits_one_sitting(path: Path) -> None:
     text = path.read_text()
-    assert text.count("\n") <= LONGEST
+    assert text.count("\n") <= MOST_LINES
+    assert max(map(len, text.split("\n"))) <= MOST_COLUMNS
     assert path.name not in {"utils.py", "common.py", "helpers.py"}
-    assert ast.get_docstring(ast.parse(text)), "no module docstring"
+    if path.name != "__init__.py" or path in SOURCES:
+        assert ast.get_docstring(ast.parse(text)), "no module docstring"
 
 
-@pytest.mark.parametrize("path", [path for path in SOURCES if path.parts[-2] == "jobs"], ids=module_of)
+@pytest.mark.parametrize(
+    "room", sorted({path.parent for path in SOURCES}), ids=lambda path: path.name
+)
+def test_a_room_has_a_door_and_no_crowd(room: Path) -> None:
+    files = [path for path in room.glob("*.py") if path.name != "__init__.py"]
+    assert len(files) <= MOST_FILES
+    door = ast.get_docstring(ast.parse((room / "__init__.py").read_text())) or ""
+    assert len(door.splitlines()) >= (5 if room.parent.name == "pipeline" else 1)
+
+
+@pytest.mark.parametrize(
+    "room", sorted({path.parent for path in SOURCES}), ids=lambda path: path.name
+)
+def test_a_public_name_is_unique_within_its_room(room: Path) -> None:
+    if room.name == "jobs":  # each entry script has its own main and Settings
+        return
+    names = Counter(name for path in sorted(room.glob("*.py")) for name in set(public_names(path)))
+    assert not [name for name, count in names.items() if count > 1]
+
+
+@pytest.mark.parametrize("path", TESTS, ids=module_of)
+def test_a_test_name_is_short(path: Path) -> None:
+    names = [name for name in public_names(path) if name.startswith("test_")]
+    assert not [name for name in names if len(name) > LONGEST_TEST_NAME]
+    assert len(names) == len(set(names)), "a test hides another of the same name"
+
+
+@pytest.mark.parametrize(
+    "path", [path for path in SOURCES if path.parts[-2] == "jobs"], ids=module_of
+)
 def test_importing_a_job_does_nothing(path: Path) -> None:
     """At a module's top stand imports, definitions, constants and the guard: no bare call."""
     calls = [
@@ -71,45 +175,18 @@ def test_importing_a_job_does_nothing(path: Path) -> None:
     assert not calls
 
 
-def tree_of_readme() -> dict[str, str]:
-    """Path -> its line in the README's file tree, folders with a slash at the end."""
-    block = re.search(r"```tree\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert block, "README.md has no ```tree block"
-    folders: list[str] = []
-    listed = {}
-    for line in block[1].splitlines():
-        if not line.strip():
-            continue
-        depth = (len(line) - len(line.lstrip())) // 2
-        name, _, what = line.strip().partition(" ")
-        folders[depth:] = [name]
-        listed["".join(folders[: depth + 1])] = what.strip()
-    return listed
-
-
-def test_the_readmes_tree_is_the_real_one() -> None:
-    listed = tree_of_readme()
-    folders = ("benchmarks", "docs")
-    real = {path for path in SOURCES if path.name != "__init__.py"}
-    real |= {path for folder in folders for path in (ROOT / folder).iterdir() if path.is_file()}
-    said = {ROOT / path for path in listed if not path.endswith("/")}
-    assert said - real == set(), "the README lists what is not there"
-    assert real - said == set(), "the README leaves out what is there"
-    assert all(listed.values()), "each line says what the file is"
-
-
 def test_every_dependency_says_why() -> None:
     text = (ROOT / "pyproject.toml").read_text()
-    lines = [line for line in text.splitlines() if re.match(r'\s+"[a-z0-9-]+(\[[a-z,]+\])?>=', line)]
+    lines = [
+        line for line in text.splitlines() if re.match(r'\s+"[a-z0-9-]+(\[[a-z,]+\])?>=', line)
+    ]
     assert len(lines) > 10
     assert all("#" in line for line in lines)
 
 
 def test_every_dependency_is_pinned() -> None:
-    pinned = {
-        line.split("==")[0].lower() for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line
-    }
-    wanted = set(
-        re.findall(r'^\s+"([a-z0-9-]+)(?:\[[a-z,]+\])?>=', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
-    )
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pinned = {line.split("==")[0].lower() for line in lines if "==" in line}
+    text = (ROOT / "pyproject.toml").read_text()
+    wanted = set(re.findall(r'^\s+"([a-z0-9-]+)(?:\[[a-z,]+\])?>=', text, re.MULTILINE))
     assert wanted - {"setuptools"} <= pinned

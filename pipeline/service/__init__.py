@@ -1,1 +1,3 @@
-"""An index that answers over HTTP: the door, the queue behind it, and the replicas that compute. Knows Ray, not the network."""
+"""An index that answers over HTTP: the door, the queue behind it, and the replicas that compute.
+Knows Ray, not the network.
+"""

@@ -1,19 +1,20 @@
 """Questions -> answers: what a replica does with a batch.
 
-In: questions whose photos were judged. Out: for each an Answer, or why its photo cannot be decoded after all.
-Shapes: Q photos that can be decoded, D dimensions.
+In: questions whose photos were judged. Out: for each an Answer, or why its photo cannot be decoded
+after all. Shapes: Q photos that can be decoded, D dimensions.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from pipeline.features import Floats
-from pipeline.locate import Answer, locate
-from pipeline.records import Rejection
+from pipeline.core.geo import Near
+from pipeline.core.records import Rejection
+from pipeline.features.table import Floats
+from pipeline.index.filters import Where
+from pipeline.locate.locate import Answer, locate
 from pipeline.service.live_index import LiveIndex
 from pipeline.service.question import Question
-from pipeline.where import Near, Where
 
 Outcome = Answer | Rejection
 
@@ -22,7 +23,9 @@ class Encoder(Protocol):
     """What turns photos into embeddings as those of the index were made."""
 
     def encode(self, photos: Sequence[bytes]) -> tuple[Floats, list[Rejection | None]]:
-        """Unit embeddings (Q, D) of the photos that can be decoded, in order; per photo None or why it has no row."""
+        """Unit embeddings (Q, D) of the photos that can be decoded, in order; per photo None or why
+        it has no row.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +48,9 @@ class Answerer:
     """The network and the index, loaded."""
 
     def __init__(self, index: str, encoder_for: Callable[[dict[str, Any]], Encoder]) -> None:
-        """`encoder_for` makes the encoder that fits an index of these facts. Raises InputError when either is unusable."""
+        """`encoder_for` makes the encoder that fits an index of these facts. Raises InputError when
+        either is unusable.
+        """
         self.live = LiveIndex(index)
         self._encoder = encoder_for(self.live.current.index.facts)
 
@@ -53,14 +58,28 @@ class Answerer:
         """One outcome per question, in order. The whole batch asks one index, and the network once."""
         opened = self.live.current
         embeddings_QD, rejected = self._encoder.encode([question.photo for question in questions])
-        outcomes: dict[int, Outcome] = {number: why for number, why in enumerate(rejected) if why is not None}
-        alike: dict[tuple[Near | None, int], list[tuple[int, int]]] = {}  # question and row of those of one search
+        outcomes: dict[int, Outcome] = {
+            number: why for number, why in enumerate(rejected) if why is not None
+        }
+        alike: dict[
+            tuple[Near | None, int], list[tuple[int, int]]
+        ] = {}  # question and row of those of one search
         for row, number in enumerate(number for number, why in enumerate(rejected) if why is None):
-            alike.setdefault((questions[number].near, questions[number].top), []).append((number, row))
+            alike.setdefault((questions[number].near, questions[number].top), []).append(
+                (number, row)
+            )
         for (near, top), members in alike.items():
             where = None if near is None else Where(near=near)
-            answers = locate(opened.index, embeddings_QD[[row for _, row in members]], top, where, opened.confidence)
-            outcomes |= {number: answer for (number, _), answer in zip(members, answers, strict=True)}
+            answers = locate(
+                opened.index,
+                embeddings_QD[[row for _, row in members]],
+                top,
+                where,
+                opened.confidence,
+            )
+            outcomes |= {
+                number: answer for (number, _), answer in zip(members, answers, strict=True)
+            }
         return [outcomes[number] for number in range(len(questions))]
 
     def status(self) -> Status:

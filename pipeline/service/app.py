@@ -1,4 +1,5 @@
-"""The service as HTTP: routes, limits, one sentence for whatever is not answered. Who computes is handed in.
+"""The service as HTTP: routes, limits, one sentence for whatever is not answered. Who computes is
+handed in.
 
 Nothing here knows Ray or the network; `engine` may be anything that answers batches of questions.
 """
@@ -13,8 +14,8 @@ from collections.abc import Awaitable, Callable
 
 from aiohttp import web
 
-from pipeline.progress import console
-from pipeline.records import Rejection
+from pipeline.core.progress import console
+from pipeline.core.records import Rejection
 from pipeline.service.answerer import Outcome
 from pipeline.service.batcher import Alone, Batcher, Gone
 from pipeline.service.engine import Engine, NotReady
@@ -25,12 +26,13 @@ from pipeline.service.settings import LOOPBACK, ServiceSettings
 from pipeline.service.uploads import read_upload, refuse_by_head
 
 OPEN = {*PATHS, "/health"}
-"Paths that need no token: the pages, which say nothing of the index, and what a load balancer asks."
+"""Paths that need no token: the pages, which say nothing of the index, and what a load balancer
+asks."""
 KEPT_S = 30
 "Seconds that a connection may be idle between two requests."
 LINGERING_S = 5
-"""Seconds that the rest of a refused upload is read and dropped: a client cut off while it sends sees a broken connection
-in place of the sentence."""
+"""Seconds that the rest of a refused upload is read and dropped: a client cut off while it sends
+sees a broken connection in place of the sentence."""
 GRACE_S = 5
 "Seconds that requests in flight have to end when the service is told to stop."
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -39,7 +41,9 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 class Service:
     """The application and what it keeps: the queue, the counters, the token."""
 
-    def __init__(self, settings: ServiceSettings, engine: Engine, token: str | None = None, abreast: int = 1) -> None:
+    def __init__(
+        self, settings: ServiceSettings, engine: Engine, token: str | None = None, abreast: int = 1
+    ) -> None:
         """`abreast` is how many batches the engine computes at a time."""
         self._settings, self._engine, self._token = settings, engine, token
         self.metrics = Metrics(lambda: self._batcher.waiting)
@@ -56,7 +60,8 @@ class Service:
 
     def runner(self) -> web.AppRunner:
         """What listens for this application."""
-        # aiohttp's own would print a traceback over each malformed request, and fill the disk of whoever keeps them.
+        # aiohttp's own would print a traceback over each malformed request, and fill the disk of
+        # whoever keeps them.
         quiet = logging.getLogger(f"{__name__}.malformed")
         quiet.setLevel(logging.CRITICAL)
         return web.AppRunner(
@@ -81,15 +86,23 @@ class Service:
         except web.HTTPException as error:
             if error.status < 400:
                 raise
-            allowed = f"; expected {error.headers['Allow']}" if "Allow" in error.headers else "; see /api"
+            allowed = (
+                f"; expected {error.headers['Allow']}" if "Allow" in error.headers else "; see /api"
+            )
             sentence = f"{request.method} {request.path[:80]}: {error.reason.lower()}{allowed}"
             response = _refused(Refusal(error.status, sentence))
-            response.headers.extend({name: error.headers[name] for name in ("Allow",) if name in error.headers})
+            response.headers.extend(
+                {name: error.headers[name] for name in ("Allow",) if name in error.headers}
+            )
         except web.RequestPayloadError:
-            response = _refused(Refusal(400, "the body ends or breaks off before its end; send the photo again"))
+            response = _refused(
+                Refusal(400, "the body ends or breaks off before its end; send the photo again")
+            )
         except Exception:
             console.print(traceback.format_exc(), style="red")
-            response = _refused(Refusal(500, "the service failed over this request; it has noted why; send another"))
+            response = _refused(
+                Refusal(500, "the service failed over this request; it has noted why; send another")
+            )
         for name, value in HEADERS.items():
             response.headers.setdefault(name, value)
         path = "other" if request.match_info.route.resource is None else request.path
@@ -98,25 +111,36 @@ class Service:
 
     def _admit(self, request: web.BaseRequest) -> None:
         """Raise Refusal where this request is nobody's business, whatever it asks."""
-        # A page whose name was made to lead to this machine is not another site's in its browser's eyes.
+        # A page whose name was made to lead to this machine is not another site's in its browser's
+        # eyes.
         host = request.host.rsplit(":", 1)[0].strip("[]")
         if self._token is None and host not in LOOPBACK:
             raise Refusal(
-                403, f"the host is {host[:60]!r}, expected localhost; ask by that name, or start it with --token-file"
+                403,
+                f"the host is {host[:60]!r}, expected localhost; ask by that name, or start it with --token-file",
             )
         if request.headers.get("Sec-Fetch-Site") == "cross-site" and request.path not in OPEN:
-            raise Refusal(403, "another site's page asks, expected the service's own; open the service itself")
+            raise Refusal(
+                403, "another site's page asks, expected the service's own; open the service itself"
+            )
         if request.path not in OPEN and not self._trusted(request):
             found = "another token" if "Authorization" in request.headers else "no token"
-            raise Refusal(401, f"found {found}, expected the header Authorization: Bearer with the service's token")
+            raise Refusal(
+                401,
+                f"found {found}, expected the header Authorization: Bearer with the service's token",
+            )
 
     def _trusted(self, request: web.BaseRequest) -> bool:
-        """Whether a request brings the token, where there is one; compared in a time that tells nothing of it."""
+        """Whether a request brings the token, where there is one; compared in a time that tells
+        nothing of it.
+        """
         given = request.headers.get("Authorization", "").encode("utf-8", "surrogateescape")
         return self._token is None or hmac.compare_digest(given, f"Bearer {self._token}".encode())
 
     async def _expect(self, request: web.Request) -> None:
-        """A client that asks before it sends (`Expect: 100-continue`) is told to; one that will be refused is not."""
+        """A client that asks before it sends (`Expect: 100-continue`) is told to; one that will be
+        refused is not.
+        """
         try:
             self._admit(request)
             self._refuse_early(request)
@@ -126,9 +150,15 @@ class Service:
             request.transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
 
     def _refuse_early(self, request: web.Request) -> None:
-        """Raise Refusal for what can be refused before the body is read; so what waits is bounded in number and in bytes."""
+        """Raise Refusal for what can be refused before the body is read; so what waits is bounded
+        in number and in bytes.
+        """
         if self._taken >= self._places or self._batcher.queue_s > self._settings.timeout_s:
-            raise Refusal(503, f"{self._taken} photos are before it; send this one again later", self._batcher.wait_s)
+            raise Refusal(
+                503,
+                f"{self._taken} photos are before it; send this one again later",
+                self._batcher.wait_s,
+            )
         refuse_by_head(request, self._settings.most_bytes)
 
     async def _locate(self, request: web.Request) -> web.Response:
@@ -137,7 +167,9 @@ class Service:
         self._taken += 1
         try:
             settings = self._settings
-            photo, fields = await read_upload(request, settings.most_bytes, settings.upload_timeout_s)
+            photo, fields = await read_upload(
+                request, settings.most_bytes, settings.upload_timeout_s
+            )
             question = await asyncio.to_thread(question_of, photo, fields, settings.most_pixels)
             outcome = await self._ask(question)
         finally:
@@ -153,13 +185,15 @@ class Service:
                 return await self._batcher.ask(question)
         except TimeoutError:
             raise Refusal(
-                504, f"there was no answer within {self._settings.timeout_s:g} s; send the photo again"
+                504,
+                f"there was no answer within {self._settings.timeout_s:g} s; send the photo again",
             ) from None
         except NotReady as error:
             raise Refusal(503, f"not ready: {error}; send the photo again later", 5) from None
         except Alone:
             raise Refusal(
-                422, "computing stopped twice over this photo; save it as a plain JPEG and send that"
+                422,
+                "computing stopped twice over this photo; save it as a plain JPEG and send that",
             ) from None
 
     async def _health(self, request: web.Request) -> web.Response:
@@ -170,7 +204,9 @@ class Service:
             why = str(error) or "no answer from the replicas"
             body = {"ready": False} | ({"why": why} if self._trusted(request) else {})
             return web.json_response(body, status=503, headers={"Retry-After": "5"})
-        details = dataclasses.asdict(status) if self._trusted(request) else {}  # they name paths of this machine
+        details = (
+            dataclasses.asdict(status) if self._trusted(request) else {}
+        )  # they name paths of this machine
         return web.json_response({"ready": True} | details)
 
     async def _metrics(self, request: web.Request) -> web.Response:

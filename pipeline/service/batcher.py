@@ -1,6 +1,8 @@
-"""Requests that arrive one by one -> batches for whoever computes: what arrives during one batch is the next one.
+"""Requests that arrive one by one -> batches for whoever computes: what arrives during one batch is
+the next one.
 
-Nothing waits for company: a lone request is computed at once, and under load the batches fill by themselves.
+Nothing waits for company: a lone request is computed at once, and under load the batches fill by
+themselves.
 """
 
 import asyncio
@@ -19,11 +21,14 @@ class Gone(Exception):
 
 
 class Alone(Exception):
-    """An item that was in the hands of two who are gone: of a batch first, then alone. It is not tried again."""
+    """An item that was in the hands of two who are gone: of a batch first, then alone. It is not
+    tried again.
+    """
 
 
 class Batcher(Generic[Item, Result]):
-    """Asks `work` for the results of up to `largest` items at once, with `abreast` batches at work at a time.
+    """Asks `work` for the results of up to `largest` items at once, with `abreast` batches at work
+    at a time.
 
     `work` gives one result per item, in order. A batch that raises Gone is tried again item by item, so that one that kills
     is told from those beside it.
@@ -73,7 +78,10 @@ class Batcher(Generic[Item, Result]):
 
     def _begin(self) -> None:
         while self._waiting and len(self._at_work) < self._abreast:
-            batch = {future: self._waiting.pop(future) for future in list(islice(self._waiting, self._largest))}
+            batch = {
+                future: self._waiting.pop(future)
+                for future in list(islice(self._waiting, self._largest))
+            }
             self._on_batch(len(batch))
             task = asyncio.create_task(self._run(batch))
             self._at_work.add(task)

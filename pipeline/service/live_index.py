@@ -1,7 +1,8 @@
-"""An index on disk that may be replaced while it is searched: the new one is taken over when it is whole, else refused.
+"""An index on disk that may be replaced while it is searched: the new one is taken over when it is
+whole, else refused.
 
-In: the path of an index. Out: the opened index with its calibration, in use until another has proved itself. Who searches
-holds a reference, so nothing is taken from under a search.
+In: the path of an index. Out: the opened index with its calibration, in use until another has
+proved itself. Who searches holds a reference, so nothing is taken from under a search.
 """
 
 import threading
@@ -10,22 +11,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import confidence, storage
-from pipeline.confidence import Confidence, find_confidence
-from pipeline.gallery_map import gallery_map
-from pipeline.index import Index
-from pipeline.index_facts import FACTS
-from pipeline.records import InputError
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.index.metadata import FACTS
+from pipeline.index.searcher import Index
+from pipeline.locate import confidence
+from pipeline.locate.confidence import Confidence, find_confidence
+from pipeline.locate.gallery_map import gallery_map
 
 LOOK_EVERY_S = 2.0
 "Between two looks at what is at the path."
 RETRY_S = 10.0
-"""After which a refused index is tried again though its index.json is the same: whoever copies a folder file by file may copy
-that one first."""
+"""After which a refused index is tried again though its index.json is the same: whoever copies a
+folder file by file may copy that one first."""
 
 
 Said = tuple[bytes | None, ...]
-"What the files hold by which an index is known, index.json and calibration.json; None for one that is not there."
+"""What the files hold by which an index is known, index.json and calibration.json; None for one
+that is not there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,12 +51,16 @@ def open_whole(path: str) -> Opened:
 
 
 class LiveIndex:
-    """`current` is the index in use; `refused` says why the newest one at the path is not it, or is None."""
+    """`current` is the index in use; `refused` says why the newest one at the path is not it, or is
+    None.
+    """
 
     def __init__(self, path: str) -> None:
         """Raises InputError when there is no index at `path` that can be used."""
         self._path = path
-        self._taken = self._seen = self._said()  # before it is opened: a change meanwhile is found by the next look
+        self._taken = self._seen = (
+            self._said()
+        )  # before it is opened: a change meanwhile is found by the next look
         self.current = open_whole(path)
         self.refused: str | None = None
         self._refused_at = 0.0
@@ -62,9 +69,13 @@ class LiveIndex:
         return tuple(_read(storage.join(self._path, name)) for name in (FACTS, confidence.FILE))
 
     def look(self) -> None:
-        """Take over what is new at the path. Whatever is wrong with it, the old index stays; nothing is raised."""
+        """Take over what is new at the path. Whatever is wrong with it, the old index stays;
+        nothing is raised.
+        """
         said = self._said()
-        if said == self._seen and (self.refused is None or time.monotonic() < self._refused_at + RETRY_S):
+        if said == self._seen and (
+            self.refused is None or time.monotonic() < self._refused_at + RETRY_S
+        ):
             return
         if said == self._taken:  # it is back as it was
             self._seen, self.refused = said, None
@@ -72,7 +83,9 @@ class LiveIndex:
         try:
             fresh = open_whole(self._path)
             prove(fresh.index, self.current.index)
-        except Exception as error:  # FAISS, Arrow, JSON and file systems each raise their own over broken files
+        except (
+            Exception
+        ) as error:  # FAISS, Arrow, JSON and file systems each raise their own over broken files
             self._refuse(said, error)
             return
         if self._said() != said:  # written once more meanwhile: what was opened may be half of each
@@ -99,7 +112,9 @@ def _read(path: str) -> bytes | None:
 
 
 def prove(fresh: Index, old: Index) -> None:
-    """Raises InputError where an index cannot stand in for the old one, and whatever a trial search raises."""
+    """Raises InputError where an index cannot stand in for the old one, and whatever a trial search
+    raises.
+    """
     made_by, expected = fresh.told.fingerprint, old.told.fingerprint
     if made_by != expected:
         raise InputError(

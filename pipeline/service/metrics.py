@@ -2,7 +2,14 @@
 
 from collections.abc import Callable
 
-from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from prometheus_client import (
+    CONTENT_TYPE_LATEST,
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    generate_latest,
+)
 
 SECONDS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 SIZES = (1, 2, 4, 8, 16, 32, 64)
@@ -16,15 +23,24 @@ class Metrics:
         """`waiting` says how many photos wait for a batch, when it is asked."""
         self._registry = CollectorRegistry()
         self._requests = Counter(
-            "pvda_requests", "Requests by path and HTTP status.", ["path", "status"], registry=self._registry
+            "pvda_requests",
+            "Requests by path and HTTP status.",
+            ["path", "status"],
+            registry=self._registry,
         )
         self._seconds = Histogram(
-            "pvda_request_seconds", "From a request's head to its answer.", ["path"], buckets=SECONDS, registry=self._registry
-        )  # fmt: skip
+            "pvda_request_seconds",
+            "From a request's head to its answer.",
+            ["path"],
+            buckets=SECONDS,
+            registry=self._registry,
+        )
         self._batches = Histogram(
             "pvda_batch_photos", "Photos computed at once.", buckets=SIZES, registry=self._registry
         )
-        queue = Gauge("pvda_waiting_photos", "Photos that wait for a batch.", registry=self._registry)
+        queue = Gauge(
+            "pvda_waiting_photos", "Photos that wait for a batch.", registry=self._registry
+        )
         queue.set_function(waiting)
 
     def request(self, path: str, status: int, seconds: float) -> None:

@@ -1,4 +1,6 @@
-"""What the service offers, as OpenAPI 3.1 and as a page that says the same. Both are made here, from the settings in force."""
+"""What the service offers, as OpenAPI 3.1 and as a page that says the same. Both are made here,
+from the settings in force.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -28,13 +30,26 @@ REASONS = {
 def describe(settings: ServiceSettings) -> dict[str, Any]:
     """The OpenAPI document of a service with these settings."""
     fields = {
-        "lat": {"type": "number", "minimum": -90, "maximum": 90, "description": "Rough position, degrees north, WGS84."},
-        "lon": {"type": "number", "minimum": -180, "maximum": 180, "description": "Degrees east."},
-        "radius_m": {"type": "number", "exclusiveMinimum": 0, "description": "How rough, metres; none beyond is a candidate."},
-        "top": {
-            "type": "integer", "minimum": 1, "maximum": MOST_TOP, "default": TOP, "description": "Candidates in the answer.",
+        "lat": {
+            "type": "number",
+            "minimum": -90,
+            "maximum": 90,
+            "description": "Rough position, degrees north, WGS84.",
         },
-    }  # fmt: skip
+        "lon": {"type": "number", "minimum": -180, "maximum": 180, "description": "Degrees east."},
+        "radius_m": {
+            "type": "number",
+            "exclusiveMinimum": 0,
+            "description": "How rough, metres; none beyond is a candidate.",
+        },
+        "top": {
+            "type": "integer",
+            "minimum": 1,
+            "maximum": MOST_TOP,
+            "default": TOP,
+            "description": "Candidates in the answer.",
+        },
+    }
     photo = {"type": "string", "format": "binary", "description": "The photo."}
     kinds = ("image/jpeg", "image/png", "image/webp", "application/octet-stream")
     locate = {
@@ -43,18 +58,31 @@ def describe(settings: ServiceSettings) -> dict[str, Any]:
         f"others beside it. JPEG, PNG or WebP, at most {settings.max_megabytes:g} MB and {settings.max_megapixels:g} "
         "megapixels. Rough position: all of lat, lon and radius_m or none.",
         "parameters": [
-            {"name": name, "in": "query", "required": False, "description": schema["description"],
-             "schema": {key: value for key, value in schema.items() if key != "description"}}
+            {
+                "name": name,
+                "in": "query",
+                "required": False,
+                "description": schema["description"],
+                "schema": {key: value for key, value in schema.items() if key != "description"},
+            }
             for name, schema in fields.items()
         ],
-        "requestBody": {"required": True, "content": {
-            "multipart/form-data": {
-                "schema": {"type": "object", "required": ["photo"], "properties": {"photo": photo} | fields},
-            },
-        } | {kind: {"schema": photo} for kind in kinds}},
+        "requestBody": {
+            "required": True,
+            "content": {
+                "multipart/form-data": {
+                    "schema": {
+                        "type": "object",
+                        "required": ["photo"],
+                        "properties": {"photo": photo} | fields,
+                    },
+                },
+            }
+            | {kind: {"schema": photo} for kind in kinds},
+        },
         "responses": {"200": _answers("The answer.", "Answer")}
         | {status: {"description": why, "content": ERROR} for status, why in REASONS.items()},
-    }  # fmt: skip
+    }
     health = {
         "summary": "Is it ready?",
         "description": "Ready when network and index are loaded. Where there is a token, only who brings it is told more.",
@@ -67,7 +95,12 @@ def describe(settings: ServiceSettings) -> dict[str, Any]:
     metrics = {
         "summary": "What it counts",
         "description": "Requests by status, latency, sizes of batches, photos waiting.",
-        "responses": {"200": {"description": "Prometheus' text format.", "content": {"text/plain": {"schema": TEXT}}}},
+        "responses": {
+            "200": {
+                "description": "Prometheus' text format.",
+                "content": {"text/plain": {"schema": TEXT}},
+            }
+        },
     }
     document: dict[str, Any] = {
         "openapi": "3.1.0",
@@ -76,7 +109,11 @@ def describe(settings: ServiceSettings) -> dict[str, Any]:
             "version": "1",
             "description": "An index of images of known places.",
         },
-        "paths": {"/locate": {"post": locate}, "/health": {"get": health}, "/metrics": {"get": metrics}},
+        "paths": {
+            "/locate": {"post": locate},
+            "/health": {"get": health},
+            "/metrics": {"get": metrics},
+        },
         "components": {"schemas": _schemas()},
     }
     if settings.token_file is not None:
@@ -93,7 +130,9 @@ def _answers(description: str, schema: str) -> dict[str, Any]:
 
 
 def _object(required: bool = True, **properties: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "object", "properties": properties} | ({"required": list(properties)} if required else {})
+    return {"type": "object", "properties": properties} | (
+        {"required": list(properties)} if required else {}
+    )
 
 
 def _says(schema: dict[str, Any], description: str) -> dict[str, Any]:
@@ -116,24 +155,40 @@ def _schemas() -> dict[str, Any]:
         location=_says({"type": ["string", "null"]}, "The place's name."),
         probability=_says(MAYBE, "That the place is right; null without a calibration."),
         known=_says({"type": "boolean"}, "False: none of the gallery's places fits."),
-        candidates=_says({"type": "array", "items": {"$ref": "#/components/schemas/Candidate"}}, "Best first."),
-        agreeing=_says({"type": "integer"}, "How many of the candidates considered lie at the place."),
+        candidates=_says(
+            {"type": "array", "items": {"$ref": "#/components/schemas/Candidate"}}, "Best first."
+        ),
+        agreeing=_says(
+            {"type": "integer"}, "How many of the candidates considered lie at the place."
+        ),
         seconds=_says(NUMBER, "Within the service, from head to answer."),
     )
     health = _object(
         required=False,
-        ready={"type": "boolean"}, why=_says(TEXT, "Why it is not."),
+        ready={"type": "boolean"},
+        why=_says(TEXT, "Why it is not."),
         fingerprint=_says(TEXT, "Of network, settings and preprocessing."),
-        rows=_says({"type": "integer"}, "Of the index in use."), factory=_says(TEXT, "How FAISS holds them."),
+        rows=_says({"type": "integer"}, "Of the index in use."),
+        factory=_says(TEXT, "How FAISS holds them."),
         calibrated=_says({"type": "boolean"}, "Whether answers have a probability."),
         refused=_says({"type": ["string", "null"]}, "Why the newest index is not in use."),
-    )  # fmt: skip
-    error = _object(error=_says(TEXT, "One sentence: what was found, what was expected, what to do."))
-    return {"Position": position, "Candidate": candidate, "Answer": answer, "Health": health, "Error": error}
+    )
+    error = _object(
+        error=_says(TEXT, "One sentence: what was found, what was expected, what to do.")
+    )
+    return {
+        "Position": position,
+        "Candidate": candidate,
+        "Answer": answer,
+        "Health": health,
+        "Error": error,
+    }
 
 
 def reference(settings: ServiceSettings) -> str:
     """The same as a page."""
     template = (Path(__file__).parent / "web" / "api.html").read_text()
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     return environment.from_string(template).render(api=describe(settings), port=settings.port)

@@ -1,4 +1,6 @@
-"""What the service shows: the page for people, the one for programs, and the headers that keep both to themselves."""
+"""What the service shows: the page for people, the one for programs, and the headers that keep both
+to themselves.
+"""
 
 import json
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""What a request asks: a photo and where to look; or why it is refused, in one sentence, before anything is decoded.
+"""What a request asks: a photo and where to look; or why it is refused, in one sentence, before
+anything is decoded.
 
 In: an upload's bytes and its fields as text. Out: a Question, or a Refusal with its HTTP status.
 """
@@ -7,25 +8,28 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from pipeline.inspection import inspect
-from pipeline.records import InputError
-from pipeline.transforms import DecodeError
-from pipeline.where import Near
+from pipeline.core.errors import InputError
+from pipeline.core.geo import Near
+from pipeline.images.decode import DecodeError
+from pipeline.images.inspect import inspect
 
 JPEG = b"\xff\xd8\xff"
 SIGNATURES = ((JPEG, b""), (b"\x89PNG\r\n\x1a\n", b""), (b"RIFF", b"WEBP"))
-"""How a file begins, and what stands in bytes 8 to 12. Formats whose size is known without decoding; Pillow knows some 40 more,
-and the decoder of each would be a stranger's to try."""
+"""How a file begins, and what stands in bytes 8 to 12. Formats whose size is known without
+decoding; Pillow knows some 40 more, and the decoder of each would be a stranger's to try."""
 SCAN, MOST_SCANS = b"\xff\xda", 100
-"""Where a scan of a JPEG begins, and how many are believed: progressive files have about ten. Thousands of empty ones in a few
-kilobytes would each cost a pass over all pixels. A preview within a header may hold the same two bytes by chance."""
+"""Where a scan of a JPEG begins, and how many are believed: progressive files have about ten.
+Thousands of empty ones in a few kilobytes would each cost a pass over all pixels. A preview within
+a header may hold the same two bytes by chance."""
 TOP, MOST_TOP = 5, 50
 "Candidates in an answer: by default, and at most."
 FIELDS = ("lat", "lon", "radius_m", "top")
 
 
 class Refusal(Exception):
-    """A request that is not answered; `sentence` says what was found, what was expected and what to do."""
+    """A request that is not answered; `sentence` says what was found, what was expected and what to
+    do.
+    """
 
     def __init__(self, status: int, sentence: str, retry_after_s: int | None = None) -> None:
         super().__init__(sentence)
@@ -45,7 +49,8 @@ class Question:
 
 
 def question_of(photo: bytes, fields: Mapping[str, str], most_pixels: int) -> Question:
-    """An upload judged by its structure: no pixel is decoded but those of a CMYK JPEG, whose size is known by then.
+    """An upload judged by its structure: no pixel is decoded but those of a CMYK JPEG, whose size
+    is known by then.
 
     Raises Refusal.
     """
@@ -55,12 +60,15 @@ def question_of(photo: bytes, fields: Mapping[str, str], most_pixels: int) -> Qu
 
 
 def _near(fields: Mapping[str, str]) -> Near | None:
-    given = {name: fields[name] for name in ("lat", "lon", "radius_m") if fields.get(name, "").strip()}
+    given = {
+        name: fields[name] for name in ("lat", "lon", "radius_m") if fields.get(name, "").strip()
+    }
     if not given:
         return None
     if len(given) < 3:
         raise Refusal(
-            400, f"found only {' and '.join(given)}, expected all of lat, lon and radius_m or none; give the others too"
+            400,
+            f"found only {' and '.join(given)}, expected all of lat, lon and radius_m or none; give the others too",
         )
     try:
         return Near(**{name: _number(name, text) for name, text in given.items()})
@@ -92,10 +100,14 @@ def _judge(photo: bytes, most_pixels: int) -> None:
         raise Refusal(400, "the photo is empty, expected the bytes of a JPEG, PNG or WebP file")
     if not any(photo.startswith(begin) and photo.startswith(then, 8) for begin, then in SIGNATURES):
         raise Refusal(
-            415, f"the photo begins with {photo[:8]!r}, expected a JPEG, PNG or WebP file; save it as one of these"
+            415,
+            f"the photo begins with {photo[:8]!r}, expected a JPEG, PNG or WebP file; save it as one of these",
         )
     if photo.startswith(JPEG) and (scans := photo.count(SCAN)) > MOST_SCANS:
-        raise Refusal(422, f"the photo has {scans} scans, expected at most {MOST_SCANS}; save it as a plain JPEG")
+        raise Refusal(
+            422,
+            f"the photo has {scans} scans, expected at most {MOST_SCANS}; save it as a plain JPEG",
+        )
     try:
         inspect(photo, most_pixels)
     except DecodeError as error:
@@ -105,4 +117,7 @@ def _judge(photo: bytes, most_pixels: int) -> None:
 def refusal_of(reason: str, found: str) -> Refusal:
     """What is said of a photo that cannot be decoded."""
     status = 413 if reason == "too many pixels" else 422
-    return Refusal(status, f"the photo cannot be used: {reason}, {found}; send it whole, or a smaller copy of it")
+    return Refusal(
+        status,
+        f"the photo cannot be used: {reason}, {found}; send it whole, or a smaller copy of it",
+    )

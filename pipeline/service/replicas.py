@@ -1,6 +1,8 @@
-"""Answerers as Ray Serve's replicas, and the handle that asks them. One that dies is replaced; its batch raises Gone.
+"""Answerers as Ray Serve's replicas, and the handle that asks them. One that dies is replaced; its
+batch raises Gone.
 
-HTTP does not pass through Serve: its proxy takes in a request's whole body before anyone can object (docs/decisions.md).
+HTTP does not pass through Serve: its proxy takes in a request's whole body before anyone can object
+(docs/decisions.md).
 """
 
 import asyncio
@@ -15,9 +17,9 @@ import ray
 from ray import serve
 from ray.serve.exceptions import DeploymentUnavailableError
 
-from pipeline import cluster
-from pipeline.placement import Placement
-from pipeline.records import InputError
+from pipeline.core import cluster
+from pipeline.core.cluster import Placement
+from pipeline.core.errors import InputError
 from pipeline.service.answerer import Answerer, Outcome, Status
 from pipeline.service.batcher import Gone
 from pipeline.service.engine import NotReady
@@ -31,7 +33,9 @@ CALLS = 16
 
 
 class Replica:
-    """One process with the network and the index. Batches are computed one after the other, by one thread."""
+    """One process with the network and the index. Batches are computed one after the other, by one
+    thread.
+    """
 
     def __init__(self, make: Callable[[], Answerer]) -> None:
         self._make = make
@@ -45,18 +49,23 @@ class Replica:
     def _load(self) -> None:
         try:
             self._answerer = self._make()
-        except InputError as error:  # raised from the constructor it would come back from Serve as a page of traceback
+        # raised from the constructor it would come back from Serve as a page of traceback
+        except InputError as error:
             self._unusable = str(error)
 
     def _follow(self) -> None:
-        """Take over new indexes for ever; before, where network or index were unusable, try until they are mended."""
+        """Take over new indexes for ever; before, where network or index were unusable, try until
+        they are mended.
+        """
         while self._answerer is None:
             time.sleep(RETRY_S)
             self._load()
         self._answerer.live.follow(threading.Event())
 
     async def answer(self, questions: Sequence[Question]) -> list[Outcome]:
-        return await asyncio.get_running_loop().run_in_executor(self._thread, self._answer, questions)
+        return await asyncio.get_running_loop().run_in_executor(
+            self._thread, self._answer, questions
+        )
 
     def _answer(self, questions: Sequence[Question]) -> list[Outcome]:
         self._began = time.monotonic()
@@ -84,7 +93,9 @@ class Replicas:
     """The replicas of one service, from the process that asks them."""
 
     def __init__(self, name: str, placement: Placement, make: Callable[[], Answerer]) -> None:
-        """Nothing is started yet. `name` is no other application's on this cluster; `make` is called on each replica."""
+        """Nothing is started yet. `name` is no other application's on this cluster; `make` is
+        called on each replica.
+        """
         self._name, self._placement, self._make = name, placement, make
         self._handle: Any = None
         self._started = False
@@ -95,12 +106,15 @@ class Replicas:
         Raises InputError when the network or the index cannot be used.
         """
         cluster.connect()
-        logging.getLogger("ray.serve").setLevel(logging.ERROR)  # it warns at length of what is told here in a sentence
+        logging.getLogger("ray.serve").setLevel(
+            logging.ERROR
+        )  # it warns at length of what is told here in a sentence
         deployment: serve.Deployment = serve.deployment(
             num_replicas=self._placement.workers,
             max_ongoing_requests=CALLS,
             ray_actor_options={"num_cpus": self._placement.cpus, "num_gpus": self._placement.gpus},
-            health_check_period_s=1,  # who asks while a replica is dead waits for so long besides the loading
+            # who asks while a replica is dead waits for so long besides the loading
+            health_check_period_s=1,
             graceful_shutdown_wait_loop_s=0.2,
             graceful_shutdown_timeout_s=5,
         )(Replica)

@@ -3,8 +3,8 @@
 import math
 from dataclasses import dataclass
 
-from pipeline import storage
-from pipeline.records import InputError
+from pipeline.core import storage
+from pipeline.core.errors import InputError
 
 LOOPBACK = {"127.0.0.1", "::1", "localhost"}
 SHORTEST_TOKEN = 16
@@ -20,7 +20,8 @@ class ServiceSettings:
     port: int = 8000
     "Port to listen on; 0 for any that is free."
     token_file: str | None = None
-    "File whose first line a request must bring as `Authorization: Bearer ...`; not a flag, which other users could read."
+    """File whose first line a request must bring as `Authorization: Bearer ...`; not a flag, which
+    other users could read."""
     max_megabytes: float = 32.0
     "Of a photo as a file; more is refused before it is read."
     max_megapixels: float = 64.0
@@ -28,7 +29,8 @@ class ServiceSettings:
     batch: int = 8
     "Photos computed at once."
     waiting: int = 32
-    "Photos that may wait beyond those being computed; more are answered 503 with the seconds to wait."
+    """Photos that may wait beyond those being computed; more are answered 503 with the seconds to
+    wait."""
     timeout_s: float = 30.0
     "Seconds from a photo's arrival to its answer."
     upload_timeout_s: float = 20.0
@@ -37,7 +39,9 @@ class ServiceSettings:
     def __post_init__(self) -> None:
         for name in ("max_megabytes", "max_megapixels", "timeout_s", "upload_timeout_s"):
             if not 0 < (value := getattr(self, name)) < math.inf:
-                raise InputError(f"--{name.replace('_', '-')} is {value}, expected a number above 0")
+                raise InputError(
+                    f"--{name.replace('_', '-')} is {value}, expected a number above 0"
+                )
         for name in ("batch", "waiting"):
             if (count := getattr(self, name)) < 1:
                 raise InputError(f"--{name} is {count}, expected at least 1")
@@ -68,8 +72,18 @@ class ServiceSettings:
             raise InputError(
                 f"no file at {self.token_file}, expected one whose first line is the token; check --token-file"
             )
-        token = storage.read_bytes(self.token_file).decode("ascii", "replace").partition("\n")[0].strip()
-        if len(token) < SHORTEST_TOKEN or not token.isascii() or not token.isprintable() or " " in token:
+        token = (
+            storage.read_bytes(self.token_file)
+            .decode("ascii", "replace")
+            .partition("\n")[0]
+            .strip()
+        )
+        if (
+            len(token) < SHORTEST_TOKEN
+            or not token.isascii()
+            or not token.isprintable()
+            or " " in token
+        ):
             raise InputError(
                 f"the first line of {self.token_file} has {len(token)} characters, expected a token of at least "
                 f"{SHORTEST_TOKEN}, ASCII without blanks; `openssl rand -hex 16` makes one"

@@ -1,6 +1,8 @@
-"""A request's body -> photo and fields, with a limit on its size and on its time that holds while it is read.
+"""A request's body -> photo and fields, with a limit on its size and on its time that holds while
+it is read.
 
-Two forms: the photo alone as the body, fields in the query; or multipart/form-data with the photo in the field `photo`.
+Two forms: the photo alone as the body, fields in the query; or multipart/form-data with the photo
+in the field `photo`.
 """
 
 import asyncio
@@ -20,7 +22,9 @@ FORM_ROOM = 65_536
 "Bytes of a form beyond those of its photo: boundaries, headers, fields."
 
 
-async def read_upload(request: web.Request, most_bytes: int, most_seconds: float) -> tuple[bytes, dict[str, str]]:
+async def read_upload(
+    request: web.Request, most_bytes: int, most_seconds: float
+) -> tuple[bytes, dict[str, str]]:
     """The photo and what of FIELDS is given; fields of the form stand before those of the query.
 
     Raises Refusal.
@@ -34,28 +38,36 @@ async def read_upload(request: web.Request, most_bytes: int, most_seconds: float
             return await _bounded(request.content, most_bytes), fields
     except TimeoutError:
         raise Refusal(
-            408, f"the photo was not there after {most_seconds:.0f} s; send it again, or a smaller one"
+            408,
+            f"the photo was not there after {most_seconds:.0f} s; send it again, or a smaller one",
         ) from None
 
 
 def refuse_by_head(request: web.BaseRequest, most_bytes: int) -> None:
     """Raise Refusal where the headers alone say that the body will not be taken."""
     kind = request.content_type
-    if not (kind in ("multipart/form-data", "application/octet-stream") or kind.startswith("image/")):
+    if not (
+        kind in ("multipart/form-data", "application/octet-stream") or kind.startswith("image/")
+    ):
         raise Refusal(
             415,
             f"the content type is {kind[:60]}, expected image/jpeg, image/png, image/webp, application/octet-stream or "
             f"multipart/form-data with the photo in the field {PHOTO}; say which it is",
         )
     if request.headers.get("Content-Encoding", "identity") != "identity":
-        raise Refusal(415, "the body is compressed, expected the photo as it is; send it without Content-Encoding")
+        raise Refusal(
+            415,
+            "the body is compressed, expected the photo as it is; send it without Content-Encoding",
+        )
     room = FORM_ROOM if kind == "multipart/form-data" else 0
     if (said := request.content_length) is not None and said > most_bytes + room:
         raise too_large(most_bytes)
 
 
 def too_large(most_bytes: int) -> Refusal:
-    return Refusal(413, f"the photo is larger than {most_bytes / 1e6:g} MB; send a smaller copy of it")
+    return Refusal(
+        413, f"the photo is larger than {most_bytes / 1e6:g} MB; send a smaller copy of it"
+    )
 
 
 async def _bounded(stream: Any, most_bytes: int) -> bytes:
@@ -78,7 +90,10 @@ async def _form(request: web.Request, most_bytes: int) -> tuple[bytes, dict[str,
             if part is None:
                 break
             if not isinstance(part, BodyPartReader):
-                raise Refusal(400, "the form holds another form, expected fields only; send the photo by itself")
+                raise Refusal(
+                    400,
+                    "the form holds another form, expected fields only; send the photo by itself",
+                )
             data = await _part(part, most_bytes if part.name == PHOTO else LONGEST_FIELD)
             if part.name == PHOTO:
                 photo = data
@@ -86,9 +101,15 @@ async def _form(request: web.Request, most_bytes: int) -> tuple[bytes, dict[str,
                 fields[part.name] = data.decode("utf-8", "replace")
         else:
             raise Refusal(
-                400, f"the form has more than {MOST_PARTS - 1} fields; send the photo and {', '.join(FIELDS)}"
+                400,
+                f"the form has more than {MOST_PARTS - 1} fields; send the photo and {', '.join(FIELDS)}",
             )
-    except (ValueError, AssertionError, RuntimeError, HttpProcessingError) as error:  # aiohttp's, over damaged forms
+    except (
+        ValueError,
+        AssertionError,
+        RuntimeError,
+        HttpProcessingError,
+    ) as error:  # aiohttp's, over damaged forms
         why = " ".join(str(error).split())[:120]
         raise Refusal(400, f"the form cannot be read: {why}; send it as a browser does") from None
     if photo is None:
@@ -104,6 +125,7 @@ async def _part(part: BodyPartReader, most_bytes: int) -> bytes:
             if part.name == PHOTO:
                 raise too_large(most_bytes)
             raise Refusal(
-                400, f"the form's field {str(part.name)[:40]} is longer than {most_bytes} bytes; leave it out"
+                400,
+                f"the form's field {str(part.name)[:40]} is longer than {most_bytes} bytes; leave it out",
             )
     return bytes(body)

@@ -5,20 +5,21 @@ three heights, and the satellite images that go with them, `H80.tif` and the old
 `Dense_GPS_test.txt` and `Dense_GPS_ALL.txt` at the root say where: `path E120.38 N30.32 94.6`, or latitude before longitude
 where there are no letters.
 
-A table names some images of a location only, and its official evaluation takes one position for all of them; so an
-image without a line has its location's position. A drone image's height is that of its own line, else the nominal one
-of its name.
+A table names some images of a location only, and its official evaluation takes one position for all
+of them; so an image without a line has its location's position. A drone image's height is that of
+its own line, else the nominal one of its name.
 """
 
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from pipeline import storage
-from pipeline.records import GeoTag, ImageRecord, InputError, Rejection, View
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.core.records import GeoTag, ImageRecord, Rejection, View
+from pipeline.sources.base import Source
 from pipeline.sources.folders import PlacedImage, SplitFolder, checked, images_by_split
-from pipeline.sources.source import Source
-from pipeline.sources.tables import Unreadable, number, place, read_lines, unreadable_tag
+from pipeline.sources.text_tables import Unreadable, number, place, read_lines, unreadable_tag
 
 LAYOUT = (
     "DenseUAV's root, which holds train/{drone,satellite}/<location>/ and "
@@ -27,7 +28,8 @@ LAYOUT = (
 TABLES = ("Dense_GPS_train.txt", "Dense_GPS_test.txt", "Dense_GPS_ALL.txt")
 VALUE = r"[NSEW]?[-+\d.]\S*"
 LINE = re.compile(
-    rf"(?P<path>\S.*\.(?:jpe?g|png|tiff?))\s+(?P<first>{VALUE})\s+(?P<second>{VALUE})\s+(?P<height>\S+)", re.IGNORECASE
+    rf"(?P<path>\S.*\.(?:jpe?g|png|tiff?))\s+(?P<first>{VALUE})\s+(?P<second>{VALUE})\s+(?P<height>\S+)",
+    re.IGNORECASE,
 )
 HEIGHT = re.compile(r"H(\d+)", re.IGNORECASE)
 
@@ -42,7 +44,9 @@ class DenseUAV(Source):
     def _scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
         tags, rejected = read_geotags(root)
         yield from rejected
-        yield from images_by_split(root, (View.DRONE, View.SATELLITE), lambda folder, image: _tag(image, folder, tags))
+        yield from images_by_split(
+            root, (View.DRONE, View.SATELLITE), lambda folder, image: _tag(image, folder, tags)
+        )
 
 
 def _tag(image: PlacedImage, folder: SplitFolder, tags: dict[str, GeoTag]) -> GeoTag | None:
@@ -51,13 +55,16 @@ def _tag(image: PlacedImage, folder: SplitFolder, tags: dict[str, GeoTag]) -> Ge
     if tag is None:
         return None
     nominal = HEIGHT.match(image.name)
-    if folder.view != View.DRONE:  # the tables give the drone's height with the satellite image's name
+    if (
+        folder.view != View.DRONE
+    ):  # the tables give the drone's height with the satellite image's name
         return replace(tag, altitude_m=None)
     return tag if own else replace(tag, altitude_m=float(nominal[1]) if nominal else None)
 
 
 def read_geotags(root: str) -> tuple[dict[str, GeoTag], list[Rejection]]:
-    """Geotags by path below the root, by phase and location, and by location; the first line that names one counts.
+    """Geotags by path below the root, by phase and location, and by location; the first line that
+    names one counts.
 
     Raises InputError when not one line of a table can be read.
     """
@@ -91,23 +98,30 @@ def read_geotags(root: str) -> tuple[dict[str, GeoTag], list[Rejection]]:
 
 
 def parse_line(line: str) -> tuple[str, GeoTag]:
-    """`train/satellite/000001/H80.tif E120.387 N30.32 94.6` -> path and geotag; the letters, where there are some, say which
-    is which and which half of the earth.
+    """`train/satellite/000001/H80.tif E120.387 N30.32 94.6` -> path and geotag; the letters, where
+    there are some, say which is which and which half of the earth.
 
     Raises Unreadable.
     """
     match = LINE.fullmatch(line.strip())
     if match is None:
         raise Unreadable("expected path, longitude, latitude and height")
-    named = {value[0].upper() if value[0].isalpha() else "": value for value in (match["first"], match["second"])}
+    named = {
+        value[0].upper() if value[0].isalpha() else "": value
+        for value in (match["first"], match["second"])
+    }
     lat = named.get("N") or named.get("S")
     lon = named.get("E") or named.get("W")
     if lat is None and lon is None and set(named) == {""}:
         lat, lon = match["first"], match["second"]
     if lat is None or lon is None:
-        raise Unreadable("expected one latitude with N or S and one longitude with E or W, or no letters")
+        raise Unreadable(
+            "expected one latitude with N or S and one longitude with E or W, or no letters"
+        )
     north, east = place(lat.lstrip("NSns"), lon.lstrip("EWew"))
     altitude = number(match["height"])
     return match["path"], GeoTag(
-        lat=-north if lat[0] in "Ss" else north, lon=-east if lon[0] in "Ww" else east, altitude_m=altitude
+        lat=-north if lat[0] in "Ss" else north,
+        lon=-east if lon[0] in "Ww" else east,
+        altitude_m=altitude,
     )

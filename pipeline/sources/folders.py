@@ -1,15 +1,17 @@
 """Folders that hold one folder of images per location -> what is in them.
 
-In: a folder on some storage. Out: its images with the location that each lies in, and a Rejection for whatever lies
-elsewhere or is no image by its name.
+In: a folder on some storage. Out: its images with the location that each lies in, and a Rejection
+for whatever lies elsewhere or is no image by its name.
 """
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-from pipeline import storage
-from pipeline.records import GeoTag, ImageRecord, InputError, Rejection, Split, View
-from pipeline.sources.source import is_image, not_an_image
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View
+from pipeline.images.inspect import is_image
+from pipeline.sources.base import not_an_image
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,9 +35,17 @@ class PlacedImage:
     bytes: int
 
 
-def split_folders(views: Iterable[View], train: str = "train", test: str = "test") -> list[SplitFolder]:
-    """Folders as University-1652 names them and others after it: `train/drone`, `test/query_drone`, `test/gallery_drone`."""
-    phases = ((train, Split.TRAIN, ""), (test, Split.QUERY, "query_"), (test, Split.GALLERY, "gallery_"))
+def split_folders(
+    views: Iterable[View], train: str = "train", test: str = "test"
+) -> list[SplitFolder]:
+    """Folders as University-1652 names them and others after it: `train/drone`, `test/query_drone`,
+    `test/gallery_drone`.
+    """
+    phases = (
+        (train, Split.TRAIN, ""),
+        (test, Split.QUERY, "query_"),
+        (test, Split.GALLERY, "gallery_"),
+    )
     return [
         SplitFolder(phase=phase, folder=f"{prefix}{view}", split=split, view=view)
         for phase, split, prefix in phases
@@ -61,7 +71,9 @@ def images_by_location(folder: str) -> Iterator[PlacedImage | Rejection]:
 def images_by_split(
     root: str, views: Iterable[View], tag: Callable[[SplitFolder, PlacedImage], GeoTag | None]
 ) -> Iterator[ImageRecord | Rejection]:
-    """All images of a data set whose folders are named as University-1652's, with the geotag that `tag` knows of each."""
+    """All images of a data set whose folders are named as University-1652's, with the geotag that
+    `tag` knows of each.
+    """
     for folder in split_folders(views):
         for item in images_by_location(storage.join(root, folder.phase, folder.folder)):
             if isinstance(item, Rejection):
@@ -78,7 +90,9 @@ def wrong_folder(path: str, found: str) -> Rejection:
     return Rejection(path=path, reason="wrong folder", found=found)
 
 
-def checked(found: Iterable[ImageRecord | Rejection], root: str, layout: str) -> Iterator[ImageRecord | Rejection]:
+def checked(
+    found: Iterable[ImageRecord | Rejection], root: str, layout: str
+) -> Iterator[ImageRecord | Rejection]:
     """What a scan found, passed on. `layout` says in words what was expected at `root`.
 
     Raises InputError when `root` is no folder, and at the end when not one image was found.

@@ -1,16 +1,17 @@
 """KML files, one per location -> geotags by location.
 
-In: a folder in which, however deep, `<location>.kml` lies. Out: one GeoTag each, and a Rejection for each file that tells no
-place. Files come from elsewhere, so they are bounded in size and may not declare a document type, which is where XML
-keeps its entities.
+In: a folder in which, however deep, `<location>.kml` lies. Out: one GeoTag each, and a Rejection
+for each file that tells no place. Files come from elsewhere, so they are bounded in size and may
+not declare a document type, which is where XML keeps its entities.
 """
 
 from collections.abc import Iterator
 from xml.etree import ElementTree
 
-from pipeline import storage
-from pipeline.records import GeoTag, InputError, Rejection
-from pipeline.sources.tables import Unreadable, place
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.core.records import GeoTag, Rejection
+from pipeline.sources.text_tables import Unreadable, place
 
 LARGEST = 1 << 20
 "Bytes. A KML of one placemark has one or two thousand."
@@ -19,7 +20,9 @@ DEEPEST = 64
 
 
 class _Bounded(ElementTree.TreeBuilder):
-    """A tree without a document type, and no deeper than DEEPEST: searching it costs what its size says."""
+    """A tree without a document type, and no deeper than DEEPEST: searching it costs what its size
+    says.
+    """
 
     _depth = 0
 
@@ -44,7 +47,9 @@ def read_kmls(folder: str) -> tuple[dict[str, GeoTag], list[Rejection]]:
     """
     files = {path: size for path, size in _walk(folder) if path.lower().endswith(".kml")}
     if not files:
-        raise InputError(f"no KML files below {folder}; expected <location>.kml for each location; check --kml")
+        raise InputError(
+            f"no KML files below {folder}; expected <location>.kml for each location; check --kml"
+        )
     tags, rejected = {}, []
     for path, size in files.items():
         whole = storage.join(folder, path)
@@ -59,7 +64,8 @@ def read_kmls(folder: str) -> tuple[dict[str, GeoTag], list[Rejection]]:
 
 
 def place_of_kml(data: bytes) -> tuple[float, float]:
-    """Latitude and longitude of the first Point; without one, of the first LookAt; without one, of the first coordinate.
+    """Latitude and longitude of the first Point; without one, of the first LookAt; without one, of
+    the first coordinate.
 
     Raises Unreadable.
     """
@@ -67,9 +73,15 @@ def place_of_kml(data: bytes) -> tuple[float, float]:
         root = ElementTree.fromstring(data, ElementTree.XMLParser(target=_Bounded()))
     except Unreadable:
         raise
-    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the last two: an encoding that nobody knows
+    except (
+        ElementTree.ParseError,
+        LookupError,
+        ValueError,
+    ) as error:  # the last two: an encoding that nobody knows
         raise Unreadable(f"not XML ({error})") from None
-    point = next((inner for outer in _all(root, "Point") for inner in _all(outer, "coordinates")), None)
+    point = next(
+        (inner for outer in _all(root, "Point") for inner in _all(outer, "coordinates")), None
+    )
     if point is not None:
         return _of_coordinates(point)
     for look in _all(root, "LookAt"):
@@ -80,7 +92,9 @@ def place_of_kml(data: bytes) -> tuple[float, float]:
 
 
 def _of_coordinates(element: ElementTree.Element) -> tuple[float, float]:
-    """The first of an element's coordinates, which KML writes `longitude,latitude[,altitude]`, separated by blanks."""
+    """The first of an element's coordinates, which KML writes `longitude,latitude[,altitude]`,
+    separated by blanks.
+    """
     first = ((element.text or "").split() or [""])[0].split(",")
     if len(first) < 2:
         raise Unreadable(f"coordinates {element.text!r}, expected longitude,latitude")

@@ -9,10 +9,18 @@ queries are all others, and the gallery is all 200. There are no positions, so n
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from pipeline import storage
-from pipeline.records import ImageRecord, InputError, Rejection, Split, View
-from pipeline.sources.folders import PlacedImage, checked, images_by_location, split_folders, wrong_folder
-from pipeline.sources.source import Source, is_image, not_an_image
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.core.records import ImageRecord, Rejection, Split, View
+from pipeline.images.inspect import is_image
+from pipeline.sources.base import Source, not_an_image
+from pipeline.sources.folders import (
+    PlacedImage,
+    checked,
+    images_by_location,
+    split_folders,
+    wrong_folder,
+)
 
 LAYOUT = (
     "SUES-200's root, which holds {Training,Testing}/<height>/, or drone_view_512/<location>/<height>/ and "
@@ -20,13 +28,129 @@ LAYOUT = (
 )
 HEIGHTS = (150, 200, 250, 300)
 TRAIN_NUMBERS = (
-    1, 2, 3, 4, 5, 6, 7, 9, 10, 11, 13, 15, 16, 20, 21, 24, 25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 36, 37, 39, 43,
-    44, 45, 51, 55, 56, 57, 58, 60, 64, 66, 67, 69, 70, 73, 74, 76, 77, 80, 81, 82, 84, 85, 86, 87, 88, 89, 90, 91,
-    94, 96, 97, 100, 101, 102, 103, 104, 105, 106, 113, 116, 118, 119, 120, 123, 125, 126, 127, 129, 132, 134, 137,
-    139, 141, 142, 145, 146, 147, 148, 149, 151, 152, 155, 156, 157, 158, 159, 160, 163, 166, 167, 168, 169, 171,
-    174, 179, 180, 182, 183, 184, 185, 186, 187, 191, 192, 193, 196, 197, 198, 199, 200,
-)  # fmt: skip
-"The benchmark's 120, from script/indexs.yaml of github.com/Reza-Zhu/SUES-200-Benchmark; the other 80 are for testing."
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    7,
+    9,
+    10,
+    11,
+    13,
+    15,
+    16,
+    20,
+    21,
+    24,
+    25,
+    26,
+    27,
+    28,
+    29,
+    30,
+    31,
+    32,
+    33,
+    34,
+    36,
+    37,
+    39,
+    43,
+    44,
+    45,
+    51,
+    55,
+    56,
+    57,
+    58,
+    60,
+    64,
+    66,
+    67,
+    69,
+    70,
+    73,
+    74,
+    76,
+    77,
+    80,
+    81,
+    82,
+    84,
+    85,
+    86,
+    87,
+    88,
+    89,
+    90,
+    91,
+    94,
+    96,
+    97,
+    100,
+    101,
+    102,
+    103,
+    104,
+    105,
+    106,
+    113,
+    116,
+    118,
+    119,
+    120,
+    123,
+    125,
+    126,
+    127,
+    129,
+    132,
+    134,
+    137,
+    139,
+    141,
+    142,
+    145,
+    146,
+    147,
+    148,
+    149,
+    151,
+    152,
+    155,
+    156,
+    157,
+    158,
+    159,
+    160,
+    163,
+    166,
+    167,
+    168,
+    169,
+    171,
+    174,
+    179,
+    180,
+    182,
+    183,
+    184,
+    185,
+    186,
+    187,
+    191,
+    192,
+    193,
+    196,
+    197,
+    198,
+    199,
+    200,
+)
+"""The benchmark's 120, from script/indexs.yaml of github.com/Reza-Zhu/SUES-200-Benchmark; the other
+80 are for testing."""
 TRAIN_LOCATIONS = frozenset(f"{number:04d}" for number in TRAIN_NUMBERS)
 
 
@@ -35,12 +159,15 @@ class Sues200(Source):
     """SUES-200, prepared for training and testing or as downloaded."""
 
     heights: tuple[int, ...] = HEIGHTS
-    "Heights of flight whose drone images are taken, metres. The paper's figures are for one height at a time."
+    """Heights of flight whose drone images are taken, metres. The paper's figures are for one
+    height at a time."""
 
     def __post_init__(self) -> None:
         if not self.heights or not set(self.heights) <= set(HEIGHTS):
             said = " ".join(map(str, self.heights)) or "nothing"
-            raise InputError(f"--heights is {said}, expected one or more of {' '.join(map(str, HEIGHTS))}")
+            raise InputError(
+                f"--heights is {said}, expected one or more of {' '.join(map(str, HEIGHTS))}"
+            )
 
     def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
         return checked(self._scan(root), root, LAYOUT)
@@ -55,7 +182,9 @@ class Sues200(Source):
         taken = set()
         for place in split_folders((View.DRONE, View.SATELLITE), "Training", "Testing"):
             for height in sorted(self.heights):
-                for item in images_by_location(storage.join(root, place.phase, str(height), place.folder)):
+                for item in images_by_location(
+                    storage.join(root, place.phase, str(height), place.folder)
+                ):
                     if isinstance(item, Rejection):
                         yield item
                     elif place.view == View.DRONE:
@@ -92,7 +221,10 @@ class Sues200(Source):
             elif not is_image(parts[2]):
                 yield not_an_image(whole)
             else:
-                yield PlacedImage(path=whole, name=parts[2], location=parts[0], bytes=size), int(parts[1])
+                yield (
+                    PlacedImage(path=whole, name=parts[2], location=parts[0], bytes=size),
+                    int(parts[1]),
+                )
 
 
 def _splits(location: str) -> tuple[Split, ...]:
@@ -102,5 +234,10 @@ def _splits(location: str) -> tuple[Split, ...]:
 def _record(image: PlacedImage, split: Split, view: View, height: int | None = None) -> ImageRecord:
     variant = "" if height is None else str(height)
     return ImageRecord(
-        path=image.path, split=split, view=view, location=image.location, variant=variant, bytes=image.bytes
+        path=image.path,
+        split=split,
+        view=view,
+        location=image.location,
+        variant=variant,
+        bytes=image.bytes,
     )

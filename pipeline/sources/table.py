@@ -1,7 +1,8 @@
-"""A table of images -> ImageRecords: for imagery that lies as it lies, and whose facts somebody has already.
+"""A table of images -> ImageRecords: for imagery that lies as it lies, and whose facts somebody has
+already.
 
-In: a CSV, Parquet or GeoJSON file. Out: a record per row, in the table's order; a Rejection with the row's number for each row
-that cannot be one.
+In: a CSV, Parquet or GeoJSON file. Out: a record per row, in the table's order; a Rejection with
+the row's number for each row that cannot be one.
 """
 
 import math
@@ -11,12 +12,14 @@ from dataclasses import dataclass
 from datetime import date, datetime
 from typing import Any
 
-from pipeline import storage
-from pipeline.records import GeoTag, ImageRecord, InputError, Rejection, Split, View
-from pipeline.sources.camera_tags import checked, number
-from pipeline.sources.geojson_shapes import Shape, as_footprint
-from pipeline.sources.image_blocks import UnreadableTag
-from pipeline.sources.source import Source, is_image
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View
+from pipeline.images.camera_tags import checked, number
+from pipeline.images.image_blocks import UnreadableTag
+from pipeline.images.inspect import is_image
+from pipeline.sources.base import Source
+from pipeline.sources.maps.geojson_shapes import Shape, as_footprint
 from pipeline.sources.table_rows import BROKEN, SHAPE, Row, read_rows
 
 
@@ -40,7 +43,9 @@ class Table(Source):
                 yield self._record(row, path, whole)
             except BadRow as bad:
                 said = whole if path else root
-                yield Rejection(path=said, reason=bad.reason, found=f"row {row_number}: {bad.found}")
+                yield Rejection(
+                    path=said, reason=bad.reason, found=f"row {row_number}: {bad.found}"
+                )
         if empty:
             raise InputError(f"{root} has no rows; expected one per image")
 
@@ -53,15 +58,23 @@ class Table(Source):
         name = path.rpartition("/")[2]
         if not is_image(name):
             raise BadRow("not an image's name", name)
-        view, split = _text(row, "view").lower() or self.view, _text(row, "split").lower() or self.split
+        view, split = (
+            _text(row, "view").lower() or self.view,
+            _text(row, "split").lower() or self.split,
+        )
         if view not in set(View):
             raise BadRow("unknown view", f"{view}, not one of {', '.join(View)}")
         if split not in set(Split):
             raise BadRow("unknown split", f"{split}, not one of {', '.join(Split)}")
         return ImageRecord(
-            path=whole, view=View(view), split=Split(split), location=_text(row, "location") or name.rpartition(".")[0],
-            geotag=geotag_of(row), taken_at=_taken_at(row), bytes=_size(whole),
-        )  # fmt: skip
+            path=whole,
+            view=View(view),
+            split=Split(split),
+            location=_text(row, "location") or name.rpartition(".")[0],
+            geotag=geotag_of(row),
+            taken_at=_taken_at(row),
+            bytes=_size(whole),
+        )
 
 
 class BadRow(ValueError):
@@ -75,8 +88,9 @@ class BadRow(ValueError):
 def geotag_of(row: Row) -> GeoTag | None:
     """The geotag of a row; None where it has no position, or exactly 0, 0.
 
-    Of a polygon the position is its centroid, and with four corners they are the footprint of an image whose top looks in the
-    direction of the row's heading, north where it has none. Raises BadRow.
+    Of a polygon the position is its centroid, and with four corners they are the footprint of an
+    image whose top looks in the direction of the row's heading, north where it has none. Raises
+    BadRow.
     """
     shape: Shape | None = row.get(SHAPE)
     if shape is None:
@@ -85,7 +99,9 @@ def geotag_of(row: Row) -> GeoTag | None:
     else:
         said, place = shape.found, shape.middle or (None, None)
     lat, lon = place
-    altitude, heading, pitch = (_number(row, name) for name in ("altitude_m", "heading_deg", "pitch_deg"))
+    altitude, heading, pitch = (
+        _number(row, name) for name in ("altitude_m", "heading_deg", "pitch_deg")
+    )
     if pitch is not None and abs(pitch) > 90:
         raise BadRow("unreadable tag", f"pitch_deg {pitch}, not from -90 to 90")
     if shape is None and lat is None and lon is None:
@@ -99,15 +115,25 @@ def geotag_of(row: Row) -> GeoTag | None:
             checked(*corner, "corner of a polygon")
     except UnreadableTag as error:
         raise BadRow("unreadable tag", str(error)) from None
-    return None if found is None else GeoTag(
-        lat=found[0], lon=found[1], altitude_m=altitude, heading_deg=None if heading is None else heading % 360,
-        pitch_deg=pitch, footprint=as_footprint(corners, heading or 0.0) if corners else None,
-    )  # fmt: skip
+    return (
+        None
+        if found is None
+        else GeoTag(
+            lat=found[0],
+            lon=found[1],
+            altitude_m=altitude,
+            heading_deg=None if heading is None else heading % 360,
+            pitch_deg=pitch,
+            footprint=as_footprint(corners, heading or 0.0) if corners else None,
+        )
+    )
 
 
 def _text(row: Row, name: str) -> str:
     value = row.get(name)
-    return "" if value is None or value != value else str(value).strip()  # NaN: how pandas writes nothing
+    return (
+        "" if value is None or value != value else str(value).strip()
+    )  # NaN: how pandas writes nothing
 
 
 def _number(row: Row, name: str) -> float | None:
@@ -133,7 +159,9 @@ def _taken_at(row: Row) -> str | None:
 
 
 def _size(path: str) -> int | None:
-    """Bytes of a file on this machine; None elsewhere, where asking takes a request each. Raises BadRow."""
+    """Bytes of a file on this machine; None elsewhere, where asking takes a request each. Raises
+    BadRow.
+    """
     if "://" in path and not path.startswith("file://"):
         try:
             storage.locate(path)

@@ -1,7 +1,8 @@
-"""A CSV, Parquet or GeoJSON file -> numbered rows with our column names, values as they stand there.
+"""A CSV, Parquet or GeoJSON file -> numbered rows with our column names, values as they stand
+there.
 
-In: a file on any storage. Out: (row number from 1, {column: value}) in the file's order. Cells are not judged here, only the
-file and its columns are.
+In: a file on any storage. Out: (row number from 1, {column: value}) in the file's order. Cells are
+not judged here, only the file and its columns are.
 """
 
 import csv
@@ -13,12 +14,23 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline import storage
-from pipeline.records import InputError
-from pipeline.sources.geojson_shapes import shape_of
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.sources.maps.geojson_shapes import shape_of
 
 REQUIRED = "path"
-COLUMNS = (REQUIRED, "view", "split", "location", "lat", "lon", "altitude_m", "heading_deg", "pitch_deg", "taken_at")
+COLUMNS = (
+    REQUIRED,
+    "view",
+    "split",
+    "location",
+    "lat",
+    "lon",
+    "altitude_m",
+    "heading_deg",
+    "pitch_deg",
+    "taken_at",
+)
 ALIASES = {"latitude": "lat", "longitude": "lon", "lng": "lon"}
 NUMBERS = ("lat", "lon", "altitude_m", "heading_deg", "pitch_deg")
 SHAPE = "shape"
@@ -36,26 +48,35 @@ Row = dict[str, Any]
 def read_rows(path: str) -> Iterator[tuple[int, Row]]:
     """The rows of a table. Row 1 is the first below a CSV's header.
 
-    Columns besides ours are left out; names are matched without regard to case. Raises InputError where the file is no table of
-    images.
+    Columns besides ours are left out; names are matched without regard to case. Raises InputError
+    where the file is no table of images.
     """
     readers = {"csv": _csv, "tsv": _csv, "parquet": _parquet, "geojson": _geojson, "json": _geojson}
     kinds = f".{', .'.join(readers)}"
     if storage.is_folder(path):
-        raise InputError(f"{path} is a folder, expected a table of images ({kinds}); give --root the file itself")
+        raise InputError(
+            f"{path} is a folder, expected a table of images ({kinds}); give --root the file itself"
+        )
     if not storage.exists(path):
         raise InputError(f"no file {path}; expected a table of images ({kinds}); check --root")
     ending = path.rpartition("/")[2].rpartition(".")[2].lower()
     if ending not in readers:
-        raise InputError(f"{path} is no table by its name, expected {kinds}; write the table as one of these")
+        raise InputError(
+            f"{path} is no table by its name, expected {kinds}; write the table as one of these"
+        )
     return enumerate(map(_bounded, readers[ending](path)), 1)
 
 
 def _bounded(row: Row) -> Row:
-    """The row without cells longer than any value of ours: what is held and told of a hostile one stays small."""
+    """The row without cells longer than any value of ours: what is held and told of a hostile one
+    stays small.
+    """
     for name, value in row.items():
         if isinstance(value, str | bytes) and len(value) > LONGEST_CELL:
-            return row | {name: value[:LONGEST_CELL], BROKEN: ("cell too long", f"{name} of {len(value)} characters")}
+            return row | {
+                name: value[:LONGEST_CELL],
+                BROKEN: ("cell too long", f"{name} of {len(value)} characters"),
+            }
     return row
 
 
@@ -69,10 +90,16 @@ def _columns(path: str, found: Iterable[str]) -> dict[str, str]:
         if column not in COLUMNS:
             continue
         if column in ours.values():
-            raise InputError(f"{path} has two columns for {column}: {', '.join(names)}; expected one; take one away")
+            raise InputError(
+                f"{path} has two columns for {column}: {', '.join(names)}; expected one; take one away"
+            )
         ours[name] = column
     half = {"lat", "lon"} & set(ours.values())
-    missing = [name for name in (REQUIRED, *({"lat", "lon"} if len(half) == 1 else ())) if name not in ours.values()]
+    missing = [
+        name
+        for name in (REQUIRED, *({"lat", "lon"} if len(half) == 1 else ()))
+        if name not in ours.values()
+    ]
     if missing:
         raise InputError(
             f"{path} has no column {missing[0]} but {', '.join(names) or 'none'}; expected {REQUIRED} and any of "
@@ -83,19 +110,31 @@ def _columns(path: str, found: Iterable[str]) -> dict[str, str]:
 
 def _csv(path: str) -> Iterator[Row]:
     """Every cell as text: a location called 0001 stays so."""
-    with storage.open_read(path) as stream, io.TextIOWrapper(stream, "utf-8-sig", newline="") as text:
+    with (
+        storage.open_read(path) as stream,
+        io.TextIOWrapper(stream, "utf-8-sig", newline="") as text,
+    ):
         try:
             header = text.readline()
-            delimiter = max(DELIMITERS, key=header.count)  # the first of them in a table of one column
+            delimiter = max(
+                DELIMITERS, key=header.count
+            )  # the first of them in a table of one column
             lines = csv.reader(text, delimiter=delimiter)
             names = next(csv.reader([header], delimiter=delimiter), [])
             ours = _columns(path, names)
             for cells in lines:
                 if not cells:
                     continue  # an empty line
-                row: Row = {ours[name]: cell for name, cell in zip(names, cells, strict=False) if name in ours}
+                row: Row = {
+                    ours[name]: cell
+                    for name, cell in zip(names, cells, strict=False)
+                    if name in ours
+                }
                 if len(cells) != len(names):  # an unquoted comma in a name shifts all that follows
-                    row[BROKEN] = ("wrong number of cells", f"{len(cells)} cells below {len(names)} columns")
+                    row[BROKEN] = (
+                        "wrong number of cells",
+                        f"{len(cells)} cells below {len(names)} columns",
+                    )
                 if delimiter != ",":  # a spreadsheet of half of the world: 50,1
                     row |= {name: row[name].replace(",", ".") for name in NUMBERS if name in row}
                 yield row
@@ -105,7 +144,9 @@ def _csv(path: str) -> Iterator[Row]:
                 "again as UTF-8, or `iconv -f latin1 -t utf8` it"
             ) from None
         except csv.Error as error:
-            raise InputError(f"{path} cannot be read as CSV ({error}); expected a header and a row per image") from None
+            raise InputError(
+                f"{path} cannot be read as CSV ({error}); expected a header and a row per image"
+            ) from None
 
 
 def _parquet(path: str) -> Iterator[Row]:
@@ -119,7 +160,8 @@ def _parquet(path: str) -> Iterator[Row]:
                     raise InputError(
                         f"{path} has a column {name} of {kind}, expected text, numbers or times; write it as these"
                     )
-            # As dictionaries: a text that stands there once, and is named by ten thousand rows, is held once.
+            # As dictionaries: a text that stands there once, and is named by ten thousand rows, is
+            # held once.
             table = pq.ParquetFile(stream, read_dictionary=list(ours))
             for batch in table.iter_batches(BATCH, columns=list(ours)):
                 columns = {ours[name]: _values(batch.column(name)) for name in batch.schema.names}
@@ -148,28 +190,48 @@ def _is_plain(kind: Any) -> bool:
     if of.is_dictionary(kind):
         return _is_plain(kind.value_type)
     tests = (
-        of.is_string, of.is_large_string, of.is_integer, of.is_floating, of.is_boolean, of.is_decimal, of.is_null, of.is_date,
+        of.is_string,
+        of.is_large_string,
+        of.is_integer,
+        of.is_floating,
+        of.is_boolean,
+        of.is_decimal,
+        of.is_null,
+        of.is_date,
         of.is_timestamp,
-    )  # fmt: skip
+    )
     return any(test(kind) for test in tests)
 
 
 def _geojson(path: str) -> Iterator[Row]:
-    """Features' properties and, under SHAPE, what their geometries say; a geometry goes before properties lat and lon."""
+    """Features' properties and, under SHAPE, what their geometries say; a geometry goes before
+    properties lat and lon.
+    """
     try:
         said = json.loads(storage.read_bytes(path).decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"{path} cannot be read as JSON ({error}); expected GeoJSON in UTF-8; write it again"
         ) from None
-    features = said.get("features") if isinstance(said, dict) and said.get("type") == "FeatureCollection" else None
+    features = (
+        said.get("features")
+        if isinstance(said, dict) and said.get("type") == "FeatureCollection"
+        else None
+    )
     if not isinstance(features, list):
-        raise InputError(f"{path} holds no FeatureCollection; expected GeoJSON with a feature per image")
+        raise InputError(
+            f"{path} holds no FeatureCollection; expected GeoJSON with a feature per image"
+        )
     system = str(said.get("crs") or "CRS84")
     if "CRS84" not in system and "4326" not in system:
-        raise InputError(f"{path} has coordinates in {system}; expected longitude and latitude, WGS84; reproject it")
+        raise InputError(
+            f"{path} has coordinates in {system}; expected longitude and latitude, WGS84; reproject it"
+        )
     features = [feature if isinstance(feature, dict) else {} for feature in features]
-    told = [given if isinstance(given := feature.get("properties"), dict) else {} for feature in features]
+    told = [
+        given if isinstance(given := feature.get("properties"), dict) else {}
+        for feature in features
+    ]
     names = dict.fromkeys(name for properties in told for name in properties)
     ours = _columns(path, names) if features else {}
     for feature, properties in zip(features, told, strict=True):

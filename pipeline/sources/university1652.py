@@ -1,4 +1,5 @@
-"""University-1652 as its authors lay it out on disk -> ImageRecords. The simulator writes the same layout.
+"""University-1652 as its authors lay it out on disk -> ImageRecords. The simulator writes the same
+layout.
 
 `train/{satellite,drone,street,google}/<location>/` and `test/{query,gallery}_{satellite,drone,street}/<location>/`.
 Geotags come apart from the images: the authors give out one `<location>.kml` per building, which `kml` takes, and where
@@ -8,12 +9,12 @@ Geotags come apart from the images: the authors give out one `<location>.kml` pe
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from pipeline import storage
-from pipeline.records import GeoTag, ImageRecord, Rejection, View
+from pipeline.core import storage
+from pipeline.core.records import GeoTag, ImageRecord, Rejection, View
+from pipeline.sources.base import Source
 from pipeline.sources.folders import PlacedImage, SplitFolder, checked, images_by_split
 from pipeline.sources.kml import read_kmls
-from pipeline.sources.source import Source
-from pipeline.sources.tables import Unreadable, number, place, read_rows, unreadable_tag
+from pipeline.sources.text_tables import Unreadable, number, place, read_rows, unreadable_tag
 
 LAYOUT = (
     "University-1652's root, which holds train/{satellite,drone}/<location>/ and "
@@ -27,9 +28,11 @@ class University1652(Source):
     """University-1652, official layout."""
 
     views: tuple[View, ...] = (View.DRONE, View.SATELLITE)
-    "Views that are taken. PVDA is trained and tested on these two; street and google are there for who asks for them."
+    """Views that are taken. PVDA is trained and tested on these two; street and google are there
+    for who asks for them."""
     kml: str = ""
-    "Folder with the buildings' KML files, `<location>.kml`, as its authors give them out; empty: no geotags from there."
+    """Folder with the buildings' KML files, `<location>.kml`, as its authors give them out; empty:
+    no geotags from there."""
 
     def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
         return checked(self._scan(root), root, LAYOUT)
@@ -50,13 +53,17 @@ class University1652(Source):
 
 
 def read_geotags(root: str) -> tuple[dict[str, GeoTag], list[Rejection]]:
-    """Geotags by location, and with the camera's pose by path, from the two tables at the root, where they are.
+    """Geotags by location, and with the camera's pose by path, from the two tables at the root,
+    where they are.
 
     Raises InputError when one of them is no such table.
     """
     tags: dict[str, GeoTag] = {}
     rejected = []
-    for table, columns in (("locations.csv", ("location", "lat", "lon")), ("poses.csv", ("path", "location", *POSE))):
+    for table, columns in (
+        ("locations.csv", ("location", "lat", "lon")),
+        ("poses.csv", ("path", "location", *POSE)),
+    ):
         path = storage.join(root, table)
         if not storage.exists(path):
             continue
@@ -69,7 +76,11 @@ def read_geotags(root: str) -> tuple[dict[str, GeoTag], list[Rejection]]:
                     altitude, heading, pitch = (number(row[name]) for name in POSE)
                     where = tags[row["location"]]
                     tags[row["path"]] = GeoTag(
-                        lat=where.lat, lon=where.lon, altitude_m=altitude, heading_deg=heading, pitch_deg=pitch
+                        lat=where.lat,
+                        lon=where.lon,
+                        altitude_m=altitude,
+                        heading_deg=heading,
+                        pitch_deg=pitch,
                     )
                 else:
                     raise Unreadable(f"location {row['location']!r} has no line in locations.csv")

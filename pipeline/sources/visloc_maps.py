@@ -9,11 +9,12 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from pipeline import storage
-from pipeline.records import GeoTag, InputError, Rejection
-from pipeline.sources.mosaic import opened
-from pipeline.sources.tables import Unreadable, place, read_rows, unreadable_tag
-from pipeline.sources.tiles import Window, plan_tiles
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.core.records import GeoTag, Rejection
+from pipeline.sources.maps.mosaic import opened
+from pipeline.sources.maps.tiles import Window, plan_tiles
+from pipeline.sources.text_tables import Unreadable, place, read_rows, unreadable_tag
 
 RANGE_TABLES = ("satellite_coordinates_range.csv", "satellite_ coordinates_range.csv")
 "The second, with a blank, is how the authors' archive spells it."
@@ -52,9 +53,12 @@ class Corners:
             lat=(self.top + self.bottom) / 2,
             lon=(self.left + self.right) / 2,
             footprint=(
-                (self.top, self.left), (self.top, self.right), (self.bottom, self.right), (self.bottom, self.left)
+                (self.top, self.left),
+                (self.top, self.right),
+                (self.bottom, self.right),
+                (self.bottom, self.left),
             ),
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,21 +91,29 @@ def read_corners(root: str) -> tuple[dict[str, Corners], list[Rejection]]:
 
     Raises InputError when there is no such table.
     """
-    path = next((path for table in RANGE_TABLES if storage.exists(path := storage.join(root, table))), None)
+    path = next(
+        (path for table in RANGE_TABLES if storage.exists(path := storage.join(root, table))), None
+    )
     if path is None:
-        raise InputError(f"no {RANGE_TABLES[0]} in {root}; expected UAV-VisLoc's root, which holds it; check --root")
+        raise InputError(
+            f"no {RANGE_TABLES[0]} in {root}; expected UAV-VisLoc's root, which holds it; check --root"
+        )
     corners, rejected = {}, []
     for line, row in read_rows(path, ("mapname", *CORNERS)):
         try:
             top, left = place(row["LT_lat_map"], row["LT_lon_map"])
             bottom, right = place(row["RB_lat_map"], row["RB_lon_map"])
-            corners[map_name(row["mapname"])] = Corners(top=top, left=left, bottom=bottom, right=right)
+            corners[map_name(row["mapname"])] = Corners(
+                top=top, left=left, bottom=bottom, right=right
+            )
         except Unreadable as error:
             rejected.append(unreadable_tag(path, line, ",".join(row.values()), error))
     return corners, rejected
 
 
-def read_maps(folder: str, corners: dict[str, Corners]) -> tuple[list[SatelliteMap], list[Rejection]]:
+def read_maps(
+    folder: str, corners: dict[str, Corners]
+) -> tuple[list[SatelliteMap], list[Rejection]]:
     """The maps in a flight's folder, ordered by name."""
     maps: list[SatelliteMap] = []
     parts: dict[str, dict[tuple[int, int], tuple[str, int, int]]] = {}
@@ -112,7 +124,11 @@ def read_maps(folder: str, corners: dict[str, Corners]) -> tuple[list[SatelliteM
         path, name = storage.join(folder, file), map_name(file)
         part = PART_OF_MAP.fullmatch(name)
         if name not in corners and not (part and part["whole"] in corners):
-            rejected.append(Rejection(path=path, reason="map without corners", found=f"no readable line names {file}"))
+            rejected.append(
+                Rejection(
+                    path=path, reason="map without corners", found=f"no readable line names {file}"
+                )
+            )
             continue
         try:
             width, height = opened(path).shape[::-1]
@@ -120,7 +136,11 @@ def read_maps(folder: str, corners: dict[str, Corners]) -> tuple[list[SatelliteM
             rejected.append(Rejection(path=path, reason="unreadable map", found=str(error)))
             continue
         if name in corners:
-            maps.append(SatelliteMap(path=path, name=name, width=width, height=height, corners=corners[name]))
+            maps.append(
+                SatelliteMap(
+                    path=path, name=name, width=width, height=height, corners=corners[name]
+                )
+            )
         elif part:
             cell = int(part["row"]), int(part["column"])
             parts.setdefault(part["whole"], {})[cell] = (path, width, height)
@@ -129,7 +149,8 @@ def read_maps(folder: str, corners: dict[str, Corners]) -> tuple[list[SatelliteM
             maps += _placed_parts(whole, cells, corners[whole])
         except Unreadable as error:
             rejected += [
-                Rejection(path=path, reason="incomplete map", found=str(error)) for path, _, _ in cells.values()
+                Rejection(path=path, reason="incomplete map", found=str(error))
+                for path, _, _ in cells.values()
             ]
     return sorted(maps, key=lambda found: found.name), rejected
 
@@ -137,14 +158,20 @@ def read_maps(folder: str, corners: dict[str, Corners]) -> tuple[list[SatelliteM
 def _placed_parts(
     whole: str, cells: dict[tuple[int, int], tuple[str, int, int]], corners: Corners
 ) -> Iterator[SatelliteMap]:
-    """Parts by row and column, from 1, each at its place in the whole. Raises Unreadable where they do not fill it."""
+    """Parts by row and column, from 1, each at its place in the whole. Raises Unreadable where they
+    do not fill it.
+    """
     rows, columns = max(row for row, _ in cells), max(column for _, column in cells)
     # Counted first: a name may number as many parts as it likes.
     if len(cells) != rows * columns or not all(row and column for row, column in cells):
-        raise Unreadable(f"{len(cells)} parts in {rows} rows and {columns} columns, expected one for each")
+        raise Unreadable(
+            f"{len(cells)} parts in {rows} rows and {columns} columns, expected one for each"
+        )
     heights = [cells[row, 1][2] for row in range(1, rows + 1)]
     widths = [cells[1, column][1] for column in range(1, columns + 1)]
-    if any(cells[row, column][1:] != (widths[column - 1], heights[row - 1]) for row, column in cells):
+    if any(
+        cells[row, column][1:] != (widths[column - 1], heights[row - 1]) for row, column in cells
+    ):
         raise Unreadable("parts of one row differ in height, or parts of one column in width")
     tall, wide = sum(heights), sum(widths)
     for row, column in sorted(cells):

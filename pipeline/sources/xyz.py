@@ -1,4 +1,5 @@
-"""Tiles of web maps -> ImageRecords. In: folders `<zoom>/<x>/<y>.png` (jpg, webp), or an MBTiles file. Out: a record per tile.
+"""Tiles of web maps -> ImageRecords. In: folders `<zoom>/<x>/<y>.png` (jpg, webp), or an MBTiles
+file. Out: a record per tile.
 
 Each record carries where its tile lies, and the tile's own bytes are packed as they are.
 """
@@ -7,12 +8,14 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from pipeline import storage
-from pipeline.progress import console
-from pipeline.records import ImageRecord, InputError, Rejection, Split, View
-from pipeline.sources import mbtiles
-from pipeline.sources.source import Source, is_image, not_an_image
-from pipeline.sources.web_mercator import DEEPEST, flipped, geotag, is_on_grid
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.core.progress import console
+from pipeline.core.records import ImageRecord, Rejection, Split, View
+from pipeline.images.inspect import is_image
+from pipeline.sources.base import Source, not_an_image
+from pipeline.sources.maps import mbtiles
+from pipeline.sources.maps.web_mercator import DEEPEST, flipped, geotag, is_on_grid
 
 TILE = re.compile(r"(\d{1,2})/(\d{1,10})/(\d{1,10})\.(png|jpe?g|webp)", re.IGNORECASE | re.ASCII)
 LAYOUT = "<zoom>/<x>/<y>.png, .jpg or .webp"
@@ -36,18 +39,32 @@ class Xyz(Source):
             raise InputError(f"--zoom is {self.zoom}, expected a number from 0 to {DEEPEST}")
 
     def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
-        if root.lower().endswith(".mbtiles") and storage.exists(root) and not storage.is_folder(root):
+        if (
+            root.lower().endswith(".mbtiles")
+            and storage.exists(root)
+            and not storage.is_folder(root)
+        ):
             return self._scan_file(root)
         if storage.is_folder(root):
             return self._scan_folder(root)
-        raise InputError(f"no folder and no .mbtiles file at {root}; expected {LAYOUT} or MBTiles; check --root")
+        raise InputError(
+            f"no folder and no .mbtiles file at {root}; expected {LAYOUT} or MBTiles; check --root"
+        )
 
     def read(self, record: ImageRecord) -> bytes:
         """The tile's own bytes. Raises OSError."""
-        return mbtiles.tile_bytes(record.path, *_numbers(record.part)) if record.part else super().read(record)
+        return (
+            mbtiles.tile_bytes(record.path, *_numbers(record.part))
+            if record.part
+            else super().read(record)
+        )
 
     def ending(self, record: ImageRecord) -> str:
-        return mbtiles.tile_kind(record.path, *_numbers(record.part)) if record.part else super().ending(record)
+        return (
+            mbtiles.tile_kind(record.path, *_numbers(record.part))
+            if record.part
+            else super().ending(record)
+        )
 
     def _scan_file(self, root: str) -> Iterator[ImageRecord | Rejection]:
         zoom = self._choose(root, mbtiles.zooms(root))
@@ -75,7 +92,9 @@ class Xyz(Source):
             said, whole = found[path], storage.join(root, path)
             if not said or int(said[1]) > DEEPEST:
                 if is_image(path):
-                    yield Rejection(path=whole, reason="wrong folder", found=f"{path} is not {LAYOUT}")
+                    yield Rejection(
+                        path=whole, reason="wrong folder", found=f"{path} is not {LAYOUT}"
+                    )
                 elif "/" in path:  # beside the zooms lie a viewer's pages and descriptions
                     yield not_an_image(whole)
                 continue
@@ -98,15 +117,25 @@ class Xyz(Source):
             )
         if self.zoom is None and len(there) > 1:
             others = ", ".join(map(str, there[:-1]))
-            console.print(f"{root}: taking zoom {zoom}, the deepest; --zoom takes another of {others}", markup=False)
+            console.print(
+                f"{root}: taking zoom {zoom}, the deepest; --zoom takes another of {others}",
+                markup=False,
+            )
         return zoom
 
-    def _record(self, path: str, part: str, zoom: int, x: int, y: int, size: int | None) -> ImageRecord:
+    def _record(
+        self, path: str, part: str, zoom: int, x: int, y: int, size: int | None
+    ) -> ImageRecord:
         """`y` from the north: a place has one name whatever its file counts from."""
         return ImageRecord(
-            path=path, part=part, split=self.split, view=self.view,
-            location=f"{zoom}-{x}-{y}", geotag=geotag(zoom, x, y), bytes=size,
-        )  # fmt: skip
+            path=path,
+            part=part,
+            split=self.split,
+            view=self.view,
+            location=f"{zoom}-{x}-{y}",
+            geotag=geotag(zoom, x, y),
+            bytes=size,
+        )
 
 
 def _numbers(part: str) -> tuple[int, int, int]:
@@ -115,4 +144,8 @@ def _numbers(part: str) -> tuple[int, int, int]:
 
 
 def _outside(path: str, zoom: int, x: int, y: int) -> Rejection:
-    return Rejection(path=path, reason="outside of the map", found=f"{x}, {y}; zoom {zoom} has 0 to {2**zoom - 1}")
+    return Rejection(
+        path=path,
+        reason="outside of the map",
+        found=f"{x}, {y}; zoom {zoom} has 0 to {2**zoom - 1}",
+    )

@@ -1,8 +1,9 @@
-"""The campaign: a stage runs, meets faults, is run again by the same command, and its content is compared.
+"""The campaign: a stage runs, meets faults, is run again by the same command, and its content is
+compared.
 
-A trial's verdict is by content: what the stage has written in the end equals what an undisturbed run wrote. Where a run
-refuses, what its sentence asks for is done: a damaged input is put back (the stage before it makes it again), a damaged
-output that it names is deleted.
+A trial's verdict is by content: what the stage has written in the end equals what an undisturbed
+run wrote. Where a run refuses, what its sentence asks for is done: a damaged input is put back (the
+stage before it makes it again), a damaged output that it names is deleted.
 """
 
 import random
@@ -13,9 +14,9 @@ from dataclasses import dataclass, field
 
 from tests.chaos.faults import DAMAGE, KILLS, PLACES, STORAGE, Damaged, damage
 from tests.chaos.grounds import Ground, Undisturbed
+from tests.chaos.stages import Stage
 from tests.launcher import Ended
 from tests.processes import strike
-from tests.chaos.stages import Stage
 
 TRIES = 6
 "Runs after the faults in which the stage has to come to its end."
@@ -66,19 +67,31 @@ class Verdict:
 def cases(stage: Stage, seed: int) -> list[Case]:
     """One trial of every fault that the stage can meet."""
     kills = [Case(stage=stage, kind=kind, seed=seed) for kind in KILLS]
-    storage = [Case(stage=stage, kind=kind, seed=seed) for kind in STORAGE if stage.reads or STORAGE[kind] == "write"]
+    storage = [
+        Case(stage=stage, kind=kind, seed=seed)
+        for kind in STORAGE
+        if stage.reads or STORAGE[kind] == "write"
+    ]
     damages = [
         Case(stage=stage, kind=kind, place=place, seed=seed)
         for place in PLACES
         if stage.reads or place != "input"
         for kind in DAMAGE
     ]
-    return [case for case in kills + storage + damages if not any(word in case.name for word in stage.blind)]
+    return [
+        case
+        for case in kills + storage + damages
+        if not any(word in case.name for word in stage.blind)
+    ]
 
 
 def trial(ground: Ground, case: Case) -> Verdict:
     """Let a stage meet a fault, bring it to its end, and judge."""
-    stage, rng, verdict = case.stage, random.Random(repr((case.stage.name, case.name, case.seed))), Verdict(case)
+    stage, rng, verdict = (
+        case.stage,
+        random.Random(repr((case.stage.name, case.name, case.seed))),
+        Verdict(case),
+    )
     usual = ground.undisturbed(stage)
     damaged: list[Damaged] = []
     if case.kind in KILLS:
@@ -112,7 +125,9 @@ def _kill(ground: Ground, case: Case, rng: random.Random, verdict: Verdict) -> N
         for moment in sorted(rng.uniform(0, extent) for _ in range(kills)):
             if job.wait(moment):
                 break
-            while not (victims := ground.victims(job, case.kind)) and not job.wait(job.seconds + 0.02):
+            while not (victims := ground.victims(job, case.kind)) and not job.wait(
+                job.seconds + 0.02
+            ):
                 pass
             verdict.faults += bool(victims) and strike(rng.choice(victims), KILLS[case.kind])
         ended = job.end(ground.patience(case.stage))
@@ -122,7 +137,9 @@ def _kill(ground: Ground, case: Case, rng: random.Random, verdict: Verdict) -> N
         extent = min(extent, ended.seconds)
 
 
-def _spoil_operation(ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, verdict: Verdict) -> None:
+def _spoil_operation(
+    ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, verdict: Verdict
+) -> None:
     count = max(1, usual.operations[STORAGE[case.kind]])
     at = rng.randrange(count)
     ground.arm(case.kind, at)
@@ -132,7 +149,9 @@ def _spoil_operation(ground: Ground, case: Case, rng: random.Random, usual: Undi
 
 
 def _damage(ground: Ground, case: Case, rng: random.Random, verdict: Verdict) -> list[Damaged]:
-    """Spoil a file: of the input, before a run or during it; of the finished output; of what a killed run left."""
+    """Spoil a file: of the input, before a run or during it; of the finished output; of what a
+    killed run left.
+    """
     stage = case.stage
     ground.prepare(stage, without=case.place != "output")
     if case.place == "input":
@@ -142,7 +161,11 @@ def _damage(ground: Ground, case: Case, rng: random.Random, verdict: Verdict) ->
         if job is not None:
             job.wait(rng.uniform(0, ground.seconds(stage, False)))
         spoilt = damage(folder, case.kind, rng, PASSED_OVER)
-        ended = job.end(ground.patience(case.stage)) if job is not None else ground.run(stage, spread=False)
+        ended = (
+            job.end(ground.patience(case.stage))
+            if job is not None
+            else ground.run(stage, spread=False)
+        )
         _judge_run(verdict, ended)
         verdict.found = "by default" if ended.code else ""
     else:
@@ -156,7 +179,9 @@ def _damage(ground: Ground, case: Case, rng: random.Random, verdict: Verdict) ->
     return [spoilt] if spoilt is not None else []
 
 
-def _bring_to_its_end(ground: Ground, case: Case, usual: Undisturbed, verdict: Verdict, damaged: list[Damaged]) -> None:
+def _bring_to_its_end(
+    ground: Ground, case: Case, usual: Undisturbed, verdict: Verdict, damaged: list[Damaged]
+) -> None:
     """Run the same command until it succeeds, doing what its sentences ask for, and compare."""
     stage = case.stage
     for _ in range(TRIES):
@@ -183,7 +208,8 @@ def _bring_to_its_end(ground: Ground, case: Case, usual: Undisturbed, verdict: V
 
 
 def _look_closely(ground: Ground, case: Case, damaged: list[Damaged]) -> Ended | None:
-    """What the check of every byte says of damage that made a difference and went unseen; None where there is no such check.
+    """What the check of every byte says of damage that made a difference and went unseen; None
+    where there is no such check.
 
     Of an input, the stage is begun anew on the same damage and told to look first.
     """

@@ -32,7 +32,10 @@ def bit_flipped(data: bytes, rng: random.Random) -> bytes:
     return data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1 :]
 
 
-SPOIL: dict[str, Callable[[bytes, random.Random], bytes]] = {"truncated": truncated, "bit flipped": bit_flipped}
+SPOIL: dict[str, Callable[[bytes, random.Random], bytes]] = {
+    "truncated": truncated,
+    "bit flipped": bit_flipped,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,12 +59,17 @@ class Damaged:
             self.path.write_bytes(self.after)
 
 
-def damage(folder: Path, kind: str, rng: random.Random, passed_over: tuple[str, ...] = ()) -> Damaged | None:
-    """Spoil one file of a folder; None where it has none. Its time is kept, as a failing disk would."""
+def damage(
+    folder: Path, kind: str, rng: random.Random, passed_over: tuple[str, ...] = ()
+) -> Damaged | None:
+    """Spoil one file of a folder; None where it has none. Its time is kept, as a failing disk
+    would.
+    """
     files = sorted(
         path
         for path in folder.rglob("*")
-        if path.is_file() and not any(part in passed_over for part in path.relative_to(folder).parts)
+        if path.is_file()
+        and not any(part in passed_over for part in path.relative_to(folder).parts)
     )
     if not files:
         return None

@@ -1,4 +1,6 @@
-"""Where the stages of a campaign run: their folders as they should be, the one that is spoilt, and a Ray cluster of its own."""
+"""Where the stages of a campaign run: their folders as they should be, the one that is spoilt, and
+a Ray cluster of its own.
+"""
 
 import json
 import os
@@ -9,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.chaos.faults import STORAGE
+from tests.chaos.stages import Content, Stage
 from tests.launcher import PATH, Ended, Job, Launcher
 from tests.processes import cluster, daemons, working
-from tests.chaos.stages import Content, Stage
 
 PATIENCE = 180.0
 "Seconds, and ten times as long as an undisturbed run, after which a run counts as hung."
@@ -30,9 +32,16 @@ class Ground:
     """Where the stages run: the folders as they should be, and the one that is spoilt."""
 
     def __init__(
-        self, scratch: Path, environment: Mapping[str, str], head: int, address: str, quick: bool = False
+        self,
+        scratch: Path,
+        environment: Mapping[str, str],
+        head: int,
+        address: str,
+        quick: bool = False,
     ) -> None:
-        """`head`: process above the Ray cluster at `address`. `quick`: one process does what one can do."""
+        """`head`: process above the Ray cluster at `address`. `quick`: one process does what one
+        can do.
+        """
         self.quick = quick
         self.here, self._pristine = scratch / "here", scratch / "pristine"
         self._spec, self._counter = scratch / "fault.json", scratch / "operations"
@@ -52,9 +61,13 @@ class Ground:
         for name in (*stage.reads, *([] if without else [stage.writes])):
             shutil.copytree(self._pristine / name, self.here / name)
 
-    def start(self, stage: Stage, spread: bool, own_cluster: bool = False, guarded: bool = False) -> Job:
+    def start(
+        self, stage: Stage, spread: bool, own_cluster: bool = False, guarded: bool = False
+    ) -> Job:
         address = "local" if own_cluster else self._address
-        return self._launcher.start(stage.job, stage.command(self.here, spread, guarded), RAY_ADDRESS=address)
+        return self._launcher.start(
+            stage.job, stage.command(self.here, spread, guarded), RAY_ADDRESS=address
+        )
 
     def run(self, stage: Stage, spread: bool, guarded: bool = False) -> Ended:
         return self.start(stage, spread, guarded=guarded).end(self.patience(stage))
@@ -67,13 +80,19 @@ class Ground:
         """The stage's own check of every byte that it wrote."""
         assert stage.verify
         words = stage.verify.format(here=self.here).split()
-        return self._launcher.start(stage.job, words, RAY_ADDRESS=self._address).end(self.patience(stage))
+        return self._launcher.start(stage.job, words, RAY_ADDRESS=self._address).end(
+            self.patience(stage)
+        )
 
     def victims(self, job: Job, kind: str) -> list[int]:
         """Who may be killed."""
         if kind.startswith("driver"):
             return [job.pid]
-        return daemons(job.pid) if kind.startswith("cluster") else working(self._head) + working(job.pid)
+        return (
+            daemons(job.pid)
+            if kind.startswith("cluster")
+            else working(self._head) + working(job.pid)
+        )
 
     def arm(self, kind: str, at: int) -> None:
         """The operation on files with this number meets a fault."""
@@ -81,15 +100,24 @@ class Ground:
         for counter in self._counter.parent.glob(f"{self._counter.name}.*"):
             counter.unlink()
         said = {
-            "kind": kind, "operation": STORAGE[kind], "at": at, "under": str(self.here), "counter": str(self._counter),
-        }  # fmt: skip
+            "kind": kind,
+            "operation": STORAGE[kind],
+            "at": at,
+            "under": str(self.here),
+            "counter": str(self._counter),
+        }
         self._spec.write_text(json.dumps(said))
 
     def disarm(self) -> dict[str, int]:
         """No more faults; how many operations there were, by their kind."""
         self._spec.unlink(missing_ok=True)
-        counters = {name: self._counter.with_name(f"{self._counter.name}.{name}") for name in ("read", "write")}
-        return {name: path.stat().st_size if path.exists() else 0 for name, path in counters.items()}
+        counters = {
+            name: self._counter.with_name(f"{self._counter.name}.{name}")
+            for name in ("read", "write")
+        }
+        return {
+            name: path.stat().st_size if path.exists() else 0 for name, path in counters.items()
+        }
 
     def seconds(self, stage: Stage, spread: bool) -> float:
         """How long the stage takes undisturbed; measured when first asked."""
@@ -120,7 +148,8 @@ class Ground:
 
 ENVIRONMENT = {
     "RAY_AUTH_MODE": "disabled", "RAY_USAGE_STATS_ENABLED": "0", "OMP_WAIT_POLICY": "PASSIVE",
-    "RAY_gcs_rpc_server_reconnect_timeout_s": "5",  # a lost cluster is given up after a minute otherwise
+    # a lost cluster is given up after a minute otherwise
+    "RAY_gcs_rpc_server_reconnect_timeout_s": "5",
 }  # fmt: skip
 
 

@@ -1,4 +1,5 @@
-"""The road survives what machines do to it: a short fault campaign over every stage, judged by content.
+"""The road survives what machines do to it: a short fault campaign over every stage, judged by
+content.
 
 benchmarks/chaos.py is the long one. What that found stands here first, by its seed.
 """
@@ -6,6 +7,7 @@ benchmarks/chaos.py is the long one. What that found stands here first, by its s
 from collections.abc import Iterator
 
 import pytest
+
 from tests.chaos.campaign import Case, Verdict, cases, trial
 from tests.chaos.grounds import Ground, ground
 from tests.chaos.stages import STAGES, Stage
@@ -24,7 +26,8 @@ HARMED = {
 }
 "Stage and fault -> seed."
 QUICK = ("worker", "driver", "read", "disk", "output", "input", "unfinished")
-"The faults of the short campaign, in their order. A lost cluster takes longest, and Ray Train nearly so."
+"""The faults of the short campaign, in their order. A lost cluster takes longest, and Ray Train
+nearly so."""
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +53,9 @@ def chosen(stage: Stage) -> list[Case]:
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.name)
-def test_a_stage_that_meets_faults_ends_with_what_an_undisturbed_one_writes(here: Ground, stage: Stage) -> None:
+def test_a_stage_that_meets_faults_ends_with_what_an_undisturbed_one_writes(
+    here: Ground, stage: Stage
+) -> None:
     here.undisturbed(stage)
     verdicts = list[Verdict]()
     for case in chosen(stage):

@@ -1,1 +1,3 @@
-"""Hostile input at every border where data comes in: what is answered, what is refused, and never anything else."""
+"""Hostile input at every border where data comes in: what is answered, what is refused, and never
+anything else.
+"""

@@ -1,4 +1,5 @@
-"""What a reader may do with hostile input: answer, or say no in a sentence, within bounded time and memory.
+"""What a reader may do with hostile input: answer, or say no in a sentence, within bounded time and
+memory.
 
 `PVDA_FUZZ_EXAMPLES=1000` tries that many examples per test, others each time; without it there are few, always the same.
 """
@@ -12,7 +13,7 @@ from types import FrameType
 
 from hypothesis import HealthCheck, settings
 
-from pipeline.records import InputError
+from pipeline.core.errors import InputError
 
 EXAMPLES = int(os.environ.get("PVDA_FUZZ_EXAMPLES", "0"))
 SECONDS, MEGABYTES = 10, 400
@@ -20,11 +21,14 @@ SECONDS, MEGABYTES = 10, 400
 LONGEST_SENTENCE = 6_000
 "Characters: a sentence that names a path or two."
 ADDRESSES = 6 << 30
-"Bytes of address space that an example may ask for: what asks for more meets a MemoryError, and is found out."
+"""Bytes of address space that an example may ask for: what asks for more meets a MemoryError, and
+is found out."""
 
 
 def examples(quick: int, share: float = 1.0) -> settings:
-    """Few fixed examples in a normal run; in a long one `share` of PVDA_FUZZ_EXAMPLES, for tests that are slow."""
+    """Few fixed examples in a normal run; in a long one `share` of PVDA_FUZZ_EXAMPLES, for tests
+    that are slow.
+    """
     return settings(
         max_examples=max(1, round(EXAMPLES * share)) if EXAMPLES else quick,
         derandomize=not EXAMPLES,
@@ -40,8 +44,12 @@ class TooLong(BaseException):
 
 
 @contextmanager
-def bounded(*refusals: type[Exception], seconds: float = SECONDS, megabytes: float = MEGABYTES) -> Iterator[None]:
-    """Run the block: it may raise `refusals` with a sentence; anything else, and whatever takes too much, fails the test."""
+def bounded(
+    *refusals: type[Exception], seconds: float = SECONDS, megabytes: float = MEGABYTES
+) -> Iterator[None]:
+    """Run the block: it may raise `refusals` with a sentence; anything else, and whatever takes too
+    much, fails the test.
+    """
     held, peak = resource.getrlimit(resource.RLIMIT_AS), _peak()
     with open("/proc/self/statm") as stream:
         mapped = int(stream.read().split()[0]) * resource.getpagesize()
@@ -51,9 +59,12 @@ def bounded(*refusals: type[Exception], seconds: float = SECONDS, megabytes: flo
     try:
         yield
     except refusals as error:
-        assert str(error).strip(), f"{type(error).__name__} without a word"  # noqa: PT017  # any of several
+        told = str(error).strip()
+        assert told, "an error without a word"  # noqa: PT017  # any of several exceptions
         if isinstance(error, InputError):  # others become a Rejection, which cuts them
-            assert len(str(error)) <= LONGEST_SENTENCE, f"a sentence of {len(str(error))} characters"  # noqa: PT017
+            assert len(str(error)) <= LONGEST_SENTENCE, (
+                f"a sentence of {len(str(error))} characters"
+            )
     finally:
         resource.setrlimit(resource.RLIMIT_AS, held)
         signal.setitimer(signal.ITIMER_REAL, 0)

@@ -1,4 +1,6 @@
-"""Strategies that begin with something valid and damage it: bytes, JSON values, names, numbers as text."""
+"""Strategies that begin with something valid and damage it: bytes, JSON values, names, numbers as
+text.
+"""
 
 import struct
 from typing import Any
@@ -8,27 +10,111 @@ from hypothesis import strategies as st
 WORDS = [0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF]
 "Numbers at which lengths and offsets turn into something else."
 NAMES = [
-    "", ".", "..", "../../escaped", "/etc/passwd", "a/b", "a\\b", "C:\\x", "a\nb", "a\rb", "\x1b[2J", "\x00",
-    "a\x07b", "[bold]",
-    "[/]", "[link=file:///etc/passwd]x[/link]", "{0}", "%s", "~", "~root", "*", "?", "[a-z]", "a::b", "http://x/y", "file:x",
-    "memory://x", "-rf", "--help", "'", '"', "`id`", "$(id)", ";id", "\ud800", "\udcff", "\ufeff", "\u202eabc",
-    "é" * 200, "x" * 5000,
-]  # fmt: skip
-"That mean something to a shell, a terminal, a file system, a template, an encoding, fsspec or rich."
+    "",
+    ".",
+    "..",
+    "../../escaped",
+    "/etc/passwd",
+    "a/b",
+    "a\\b",
+    "C:\\x",
+    "a\nb",
+    "a\rb",
+    "\x1b[2J",
+    "\x00",
+    "a\x07b",
+    "[bold]",
+    "[/]",
+    "[link=file:///etc/passwd]x[/link]",
+    "{0}",
+    "%s",
+    "~",
+    "~root",
+    "*",
+    "?",
+    "[a-z]",
+    "a::b",
+    "http://x/y",
+    "file:x",
+    "memory://x",
+    "-rf",
+    "--help",
+    "'",
+    '"',
+    "`id`",
+    "$(id)",
+    ";id",
+    "\ud800",
+    "\udcff",
+    "\ufeff",
+    "\u202eabc",
+    "é" * 200,
+    "x" * 5000,
+]
+"""That mean something to a shell, a terminal, a file system, a template, an encoding, fsspec or
+rich."""
 TEXTS = [
-    "nan", "inf", "-inf", "1e999", "-1e999", "-1", "0", "91", "-91", "181", "1,5", "1e5", "0x10", "١٢", "²", "1_000",
-    " 1 ", "+1",
-    "9" * 400, "1" * 3_000 + "x", "NaN", "None", "null", "true", "<script>", "=1+1", "\x00", "\ufffe", *NAMES,
-]  # fmt: skip
+    "nan",
+    "inf",
+    "-inf",
+    "1e999",
+    "-1e999",
+    "-1",
+    "0",
+    "91",
+    "-91",
+    "181",
+    "1,5",
+    "1e5",
+    "0x10",
+    "١٢",
+    "²",
+    "1_000",
+    " 1 ",
+    "+1",
+    "9" * 400,
+    "1" * 3_000 + "x",
+    "NaN",
+    "None",
+    "null",
+    "true",
+    "<script>",
+    "=1+1",
+    "\x00",
+    "\ufffe",
+    *NAMES,
+]
 "Cells of a table."
 DEEP: Any = []
 for _ in range(400):
     DEEP = [DEEP]
 VALUES: list[Any] = [
-    None, True, False, 0, 1, -1, 2**31, 2**63, 2**64, 10**30, 0.5, -0.5, 1e308, float("nan"), float("inf"),
-    float("-inf"), [], {},
-    [[]], {"": None}, [None], {"a": 1}, DEEP, "1", *NAMES,
-]  # fmt: skip
+    None,
+    True,
+    False,
+    0,
+    1,
+    -1,
+    2**31,
+    2**63,
+    2**64,
+    10**30,
+    0.5,
+    -0.5,
+    1e308,
+    float("nan"),
+    float("inf"),
+    float("-inf"),
+    [],
+    {},
+    [[]],
+    {"": None},
+    [None],
+    {"a": 1},
+    DEEP,
+    "1",
+    *NAMES,
+]
 "Whatever JSON can say in place of something else."
 
 numbers = st.sampled_from(TEXTS) | st.floats().map(str) | st.integers().map(str)
@@ -47,7 +133,10 @@ def damaged(draw: st.DrawFn, data: bytes, most: int = 6, head: int = 0) -> bytes
         if kind == 0 and found:
             found[at] ^= 1 << draw(st.integers(0, 7))
         elif kind == 1:
-            word, form = draw(st.sampled_from(WORDS)), draw(st.sampled_from(["<H", ">H", "<I", ">I", "<Q", ">Q"]))
+            word, form = (
+                draw(st.sampled_from(WORDS)),
+                draw(st.sampled_from(["<H", ">H", "<I", ">I", "<Q", ">Q"])),
+            )
             packed = struct.pack(form, word & (1 << 8 * struct.calcsize(form)) - 1)
             found[at : at + len(packed)] = packed
         elif kind == 2:

@@ -14,26 +14,34 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.core.json_files import is_file_name
+from pipeline.core.records import Rejection, Split, View
+from pipeline.features.part import PartFooter, PartRows, read_rejected, write_part
+from pipeline.features.row_reader import RowReader
+from pipeline.features.table import open_table, verify
+from pipeline.index.metadata import Effort, IndexFacts, PartFacts, as_said, read_facts
+from pipeline.locate.confidence import FEATURES, Confidence, read_confidence, write_confidence
+from pipeline.locate.logistic import Logistic
+from pipeline.locate.reliability import Bin
+from pipeline.report.inputs import read_findings, read_training
+from pipeline.shards.manifest import Manifest, Shard, read_manifest
+from pipeline.shards.pack import PackingSettings, finished
+from pipeline.shards.record_table import Packed, read_packed, read_part
+from pipeline.shards.record_table import write_part as write_records
+from pipeline.simulation.simulate import SimulationSettings, simulate
 from tests.fuzz.bounds import bounded, examples
 from tests.fuzz.hostile import damaged, twisted
-from pipeline import storage
-from pipeline.confidence import FEATURES, Confidence, read_confidence, write_confidence
-from pipeline.feature_parts import PartFooter, PartRows, read_rejected, write_part
-from pipeline.feature_rows import RowReader
-from pipeline.features import open_table, verify
-from pipeline.index_facts import Effort, IndexFacts, PartFacts, as_said, read_facts
-from pipeline.logistic import Logistic
-from pipeline.packing import PackingSettings, finished
-from pipeline.records import InputError, Rejection, Split, View
-from pipeline.reliability import Bin
-from pipeline.report_inputs import read_findings, read_training
-from pipeline.shard_records import Packed, read_packed, read_part
-from pipeline.shard_records import write_part as write_records
-from pipeline.shards import Manifest, Shard, read_manifest
-from pipeline.simulate import SimulationSettings, simulate
-from pipeline.told import is_file_name
 
-SHARD = Shard(name="query-drone-000000", split=Split.QUERY, view=View.DRONE, samples=2, bytes=10240, sha256="0" * 64)
+SHARD = Shard(
+    name="query-drone-000000",
+    split=Split.QUERY,
+    view=View.DRONE,
+    samples=2,
+    bytes=10240,
+    sha256="0" * 64,
+)
 MANIFEST = Manifest(
     shards=(SHARD, dataclasses.replace(SHARD, name="query-drone-000001")),
     classes=("0001",),
@@ -42,22 +50,58 @@ MANIFEST = Manifest(
 )
 FILE = {"bytes": 10, "sha256": "0" * 64}
 FACTS = IndexFacts(
-    factory="Flat", metric="inner product", rows=2, dimension=4, fingerprint="0" * 64, table="/nowhere",
-    asked={"split": None}, why="small",
-    refine="none", on_disk=False, effort=Effort(breadth=1), target_recall=0.95, unit_rows=2, part_rows=2, training_sample=0,
-    build_seconds=0.1, bytes_per_vector=16.0, expected_bytes=None, measured={"recall_at_1": 1.0},
-    parts=(PartFacts(faiss="index.faiss", ids="ids.arrow", first_row=0, rows=2,
-    table_parts={"query-drone-000000.parquet": "0" * 64}, files={"index.faiss": FILE, "ids.arrow": FILE}),),
+    factory="Flat",
+    metric="inner product",
+    rows=2,
+    dimension=4,
+    fingerprint="0" * 64,
+    table="/nowhere",
+    asked={"split": None},
+    why="small",
+    refine="none",
+    on_disk=False,
+    effort=Effort(breadth=1),
+    target_recall=0.95,
+    unit_rows=2,
+    part_rows=2,
+    training_sample=0,
+    build_seconds=0.1,
+    bytes_per_vector=16.0,
+    expected_bytes=None,
+    measured={"recall_at_1": 1.0},
+    parts=(
+        PartFacts(
+            faiss="index.faiss",
+            ids="ids.arrow",
+            first_row=0,
+            rows=2,
+            table_parts={"query-drone-000000.parquet": "0" * 64},
+            files={"index.faiss": FILE, "ids.arrow": FILE},
+        ),
+    ),
     trained={"trained.faiss": FILE},
-)  # fmt: skip
+)
 NUMBERS = (0.1,) * len(FEATURES)
 CONFIDENCE = Confidence(
-    fingerprint="0" * 64, gallery=2, asked="photos", spacing_m=20.0, within_m=50.0, tolerance_m=25.0, outside=0.5,
-    model=Logistic(mean_F=NUMBERS, scale_F=NUMBERS, coefficient_F=NUMBERS, intercept=0.0), threshold=0.5,
-    sharpness=1.0, elsewhere=0.0,
-    photos=10, locations=5, right=0.5, right_kept=0.5, outside_unknown=0.5, calibration_error=0.1,
+    fingerprint="0" * 64,
+    gallery=2,
+    asked="photos",
+    spacing_m=20.0,
+    within_m=50.0,
+    tolerance_m=25.0,
+    outside=0.5,
+    model=Logistic(mean_F=NUMBERS, scale_F=NUMBERS, coefficient_F=NUMBERS, intercept=0.0),
+    threshold=0.5,
+    sharpness=1.0,
+    elsewhere=0.0,
+    photos=10,
+    locations=5,
+    right=0.5,
+    right_kept=0.5,
+    outside_unknown=0.5,
+    calibration_error=0.1,
     bins=(Bin(said=0.5, seen=0.5, share=1.0),),
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="module")
@@ -82,10 +126,15 @@ def test_a_manifest(folder: Path, data: st.DataObject) -> None:
         assert all(isinstance(name, str) for name in found.classes)
     for extend in (False, True):
         with bounded(InputError):
-            finished(PackingSettings(root="x", out=str(folder / "set"), extend=extend), {"source": "photos"})
+            finished(
+                PackingSettings(root="x", out=str(folder / "set"), extend=extend),
+                {"source": "photos"},
+            )
 
 
-@pytest.mark.parametrize("name", ["../../evil", "/etc/passwd", "a/b", "..", "", ".hidden", "a\\b", "a\0b", "\ud800"])
+@pytest.mark.parametrize(
+    "name", ["../../evil", "/etc/passwd", "a/b", "..", "", ".hidden", "a\\b", "a\0b", "\ud800"]
+)
 def test_a_shards_name_that_leads_elsewhere_is_refused(name: str, folder: Path) -> None:
     (folder / "set").mkdir(exist_ok=True)
     said = dataclasses.asdict(MANIFEST)
@@ -121,9 +170,14 @@ def part() -> bytes:
     vectors = rng.normal(size=(50, 8)).astype(np.float32)
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     rows = PartRows(
-        keys=[f"k{n}" for n in range(50)], locations=["a"] * 50, views=["drone"] * 50, splits=["query"] * 50, lats=[1.0] * 50,
-        lons=[None] * 50, embeddings_BD=vectors,
-    )  # fmt: skip
+        keys=[f"k{n}" for n in range(50)],
+        locations=["a"] * 50,
+        views=["drone"] * 50,
+        splits=["query"] * 50,
+        lats=[1.0] * 50,
+        lons=[None] * 50,
+        embeddings_BD=vectors,
+    )
     rejected = (Rejection(path="k", reason="r", found="f"),)
     write_part(
         "memory://fuzz/part.parquet",
@@ -136,10 +190,24 @@ def part() -> bytes:
 @cache
 def records() -> bytes:
     row = dict.fromkeys(
-        ("key", "location", "view", "split", "variant", "shard", "source", "path", "part", "sha256"), "x"
+        (
+            "key",
+            "location",
+            "view",
+            "split",
+            "variant",
+            "shard",
+            "source",
+            "path",
+            "part",
+            "sha256",
+        ),
+        "x",
     )
     write_records(
-        "memory://fuzz", Packed(shard=SHARD, plan="0", rejected=()), [row | {"bytes": 1, "width": 1, "height": 1}] * 20
+        "memory://fuzz",
+        Packed(shard=SHARD, plan="0", rejected=()),
+        [row | {"bytes": 1, "width": 1, "height": 1}] * 20,
     )
     return storage.read_bytes("memory://fuzz/records/query-drone-000000.parquet")
 
@@ -150,7 +218,11 @@ def test_a_part_of_a_feature_table(folder: Path, data: st.DataObject) -> None:
     """Mostly the footer: pyarrow reads it in C++, and believes its lengths."""
     whole = part()
     at = len(whole) - 8 - int.from_bytes(whole[-8:-4], "little")
-    told = whole[:at] + data.draw(damaged(whole[at:])) if data.draw(st.integers(0, 3)) else data.draw(damaged(whole))
+    told = (
+        whole[:at] + data.draw(damaged(whole[at:]))
+        if data.draw(st.integers(0, 3))
+        else data.draw(damaged(whole))
+    )
     (folder / "table").mkdir(exist_ok=True)
     (folder / "table" / "part.parquet").write_bytes(told)
     with bounded(InputError):
@@ -167,7 +239,9 @@ def test_a_part_of_the_record_table(folder: Path, data: st.DataObject) -> None:
     (folder / "records").mkdir(exist_ok=True)
     whole = records()
     at = len(whole) - 8 - int.from_bytes(whole[-8:-4], "little")
-    (folder / "records" / "query-drone-000000.parquet").write_bytes(whole[:at] + data.draw(damaged(whole[at:])))
+    (folder / "records" / "query-drone-000000.parquet").write_bytes(
+        whole[:at] + data.draw(damaged(whole[at:]))
+    )
     with bounded():
         read_packed(str(folder), "query-drone-000000")
     with bounded(InputError):
@@ -178,7 +252,9 @@ def test_a_part_of_the_record_table(folder: Path, data: st.DataObject) -> None:
 @examples(40)
 def test_a_list_of_refused_images(folder: Path, data: st.DataObject) -> None:
     (folder / "refused" / "_rejected").mkdir(parents=True, exist_ok=True)
-    (folder / "refused" / "_rejected" / "rejected.parquet").write_bytes(data.draw(damaged(records())))
+    (folder / "refused" / "_rejected" / "rejected.parquet").write_bytes(
+        data.draw(damaged(records()))
+    )
     with bounded(InputError):
         read_rejected(str(folder / "refused"))
 
@@ -186,8 +262,14 @@ def test_a_list_of_refused_images(folder: Path, data: st.DataObject) -> None:
 @given(st.data())
 @examples(40)
 def test_a_simulation_that_was_begun(folder: Path, data: st.DataObject) -> None:
-    settings = SimulationSettings(out=str(folder / "flights"), train_locations=1, test_locations=0, distractors=0)
-    said = {name: value for name, value in dataclasses.asdict(settings).items() if name not in ("out", "textures")}
+    settings = SimulationSettings(
+        out=str(folder / "flights"), train_locations=1, test_locations=0, distractors=0
+    )
+    said = {
+        name: value
+        for name, value in dataclasses.asdict(settings).items()
+        if name not in ("out", "textures")
+    }
     put(data, folder / "flights" / "simulation.json", said | {"views": 55})
     with bounded(InputError):
         simulate(settings)

@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from pipeline.images.camera_tags import read_tags
+from pipeline.images.image_blocks import Blocks, UnreadableTag, find_blocks
+from pipeline.sources.kml import place_of_kml
+from pipeline.sources.text_tables import Unreadable
 from tests.fuzz.bounds import bounded, examples
 from tests.fuzz.hostile import damaged, numbers
-from pipeline.sources.camera_tags import read_tags
-from pipeline.sources.image_blocks import Blocks, UnreadableTag, find_blocks
-from pipeline.sources.kml import place_of_kml
-from pipeline.sources.tables import Unreadable
 
 XMP = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">
 <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/"
@@ -27,11 +27,31 @@ OUTSIDE = "<!DOCTYPE k [<!ENTITY a SYSTEM 'file:///etc/passwd'><!ENTITY % p SYST
 KML = """{head}<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><{kind}><coordinates> {0},{1},{2} {3}
 </coordinates></{kind}><LookAt><latitude>{1}</latitude><longitude>{0}</longitude></LookAt></Placemark></Document></kml>"""
 HEADS = [
-    "", "\ufeff", '<?xml version="1.0"?>', *(f'<?xml version="1.0" encoding="{name}"?>' for name in (
-        "utf-8", "latin-1", "utf-16", "utf-7", "gb2312", "shift_jis", "big5", "cp037", "idna", "rot13", "hex", "zip",
-        "x", "undefined",
-    )), LAUGHS, OUTSIDE,
-]  # fmt: skip
+    "",
+    "\ufeff",
+    '<?xml version="1.0"?>',
+    *(
+        f'<?xml version="1.0" encoding="{name}"?>'
+        for name in (
+            "utf-8",
+            "latin-1",
+            "utf-16",
+            "utf-7",
+            "gb2312",
+            "shift_jis",
+            "big5",
+            "cp037",
+            "idna",
+            "rot13",
+            "hex",
+            "zip",
+            "x",
+            "undefined",
+        )
+    ),
+    LAUGHS,
+    OUTSIDE,
+]
 ENCODINGS = ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-32", "latin-1", "cp037"]
 
 
@@ -40,7 +60,16 @@ def photo(form: str) -> bytes:
     """A small image with a position and XMP."""
     exif = Image.Exif()
     exif[0x8769] = {0x9003: "2024:05:06 07:08:09", 0x9011: "+02:00", 0x9291: "123"}
-    exif[0x8825] = {1: "N", 2: (47.0, 30.0, 1.5), 3: "E", 4: (8.0, 30.0, 2.5), 5: b"\0", 6: 500.0, 16: "T", 17: 12.0}
+    exif[0x8825] = {
+        1: "N",
+        2: (47.0, 30.0, 1.5),
+        3: "E",
+        4: (8.0, 30.0, 2.5),
+        5: b"\0",
+        6: 500.0,
+        16: "T",
+        17: 12.0,
+    }
     stream = io.BytesIO()
     extra: dict[str, Any] = {} if form == "TIFF" else {"exif": exif.tobytes()}
     if form in ("JPEG", "WEBP"):
@@ -65,12 +94,19 @@ def test_directories_that_point_anywhere(data: st.DataObject, order: str) -> Non
     tag = st.sampled_from([1, 2, 3, 4, 5, 6, 16, 17, 0x02BC, 0x8769, 0x8825, 0x9003, 0x9011])
     entries = data.draw(st.lists(st.tuples(tag, st.integers(0, 13), word, word), max_size=12))
     block = {"<": b"II*\0", ">": b"MM\0*"}[order] + struct.pack(order + "IH", 8, len(entries))
-    block += b"".join(struct.pack(order + "HHII", *entry) for entry in entries) + data.draw(st.binary(max_size=64))
+    block += b"".join(struct.pack(order + "HHII", *entry) for entry in entries) + data.draw(
+        st.binary(max_size=64)
+    )
     with bounded(UnreadableTag):
         read_tags(Blocks(exif=block))
 
 
-@given(st.lists(numbers, min_size=5, max_size=5), st.sampled_from(HEADS), st.sampled_from(ENCODINGS), st.data())
+@given(
+    st.lists(numbers, min_size=5, max_size=5),
+    st.sampled_from(HEADS),
+    st.sampled_from(ENCODINGS),
+    st.data(),
+)
 @examples(60)
 def test_an_xmp_packet(cells: list[str], head: str, encoding: str, data: st.DataObject) -> None:
     packet = (head + XMP.format(*cells)).encode(encoding, "replace")

@@ -1,6 +1,8 @@
-"""Command lines from anybody: each job ends with 0, 1 or 2 and one sentence, and writes nothing beside its output.
+"""Command lines from anybody: each job ends with 0, 1 or 2 and one sentence, and writes nothing
+beside its output.
 
-The inputs are such that no job gets to its work: missing, empty, files for folders, folders for files, junk of the right name.
+The inputs are such that no job gets to its work: missing, empty, files for folders, folders for
+files, junk of the right name.
 """
 
 import importlib
@@ -13,8 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jobs.command_line import cli
 from tests.fuzz.bounds import bounded, examples
-from jobs import cli
 
 NUMBERS = [
     "0",
@@ -82,36 +84,127 @@ PATHS = [
     "link",
     "fifo",
 ]
-INSIDE = ["empty", "junk", "file", "new", "new/deep", "file/below", "", "foo://x", "link", "x" * 300, "loop"]
-"Where output may go: never to a place that would survive the test, nor to the storage of another process."
+INSIDE = [
+    "empty",
+    "junk",
+    "file",
+    "new",
+    "new/deep",
+    "file/below",
+    "",
+    "foo://x",
+    "link",
+    "x" * 300,
+    "loop",
+]
+"""Where output may go: never to a place that would survive the test, nor to the storage of another
+process."""
 
-JOBS: dict[str, tuple[list[str], list[str], list[str], list[str]]] = {  # inputs, outputs, numbers, texts
-    "simulate": (["textures"], ["out"], ["train-locations", "test-locations", "distractors", "views", "size", "seed",
-    "texture-metres-per-pixel"], []),
-    "make_shards": (["root"], ["out"], ["samples-per-shard", "megabytes-per-shard", "max-bad-fraction", "workers"], ["check"]),
-    "train": (["shards", "weights"], ["out"], ["workers", "keep", "checkpoint-minutes", "probe-epochs",
-    "gpus-per-worker", "max-failures"], []),
-    "embed_gallery": (["shards", "checkpoint"], ["out"], ["batch-size", "workers", "cpus-per-worker",
-    "gpus-per-worker", "patience"], ["split", "view", "dtype"]),
-    "build_index": (["table"], ["out"], ["target-recall", "parts", "workers"], ["memory-budget", "factory", "split"]),
-    "calibrate": (["checkpoint", "shards", "index"], ["out"], ["tolerance", "outside", "photos"], ["view"]),
-    "locate": (["checkpoint", "index", "times", "calibration", "shards"], ["out", "csv", "page"], ["top",
-    "max-speed", "elsewhere", "interval"], []),
-    "serve": (["checkpoint", "index", "token-file"], [], ["port", "max-megabytes", "max-megapixels", "batch",
-    "waiting", "timeout-s", "replicas", "threads"], ["host"]),
-    "evaluate": (["table", "shards", "run", "beside"], ["out"], ["panels", "workers"], ["protocol", "query-view",
-    "title", "by"]),
+# inputs, outputs, numbers, texts
+JOBS: dict[str, tuple[list[str], list[str], list[str], list[str]]] = {
+    "simulate": (
+        ["textures"],
+        ["out"],
+        [
+            "train-locations",
+            "test-locations",
+            "distractors",
+            "views",
+            "size",
+            "seed",
+            "texture-metres-per-pixel",
+        ],
+        [],
+    ),
+    "make_shards": (
+        ["root"],
+        ["out"],
+        ["samples-per-shard", "megabytes-per-shard", "max-bad-fraction", "workers"],
+        ["check"],
+    ),
+    "train": (
+        ["shards", "weights"],
+        ["out"],
+        [
+            "workers",
+            "keep",
+            "checkpoint-minutes",
+            "probe-epochs",
+            "gpus-per-worker",
+            "max-failures",
+        ],
+        [],
+    ),
+    "embed_gallery": (
+        ["shards", "checkpoint"],
+        ["out"],
+        ["batch-size", "workers", "cpus-per-worker", "gpus-per-worker", "patience"],
+        ["split", "view", "dtype"],
+    ),
+    "build_index": (
+        ["table"],
+        ["out"],
+        ["target-recall", "parts", "workers"],
+        ["memory-budget", "factory", "split"],
+    ),
+    "calibrate": (
+        ["checkpoint", "shards", "index"],
+        ["out"],
+        ["tolerance", "outside", "photos"],
+        ["view"],
+    ),
+    "locate": (
+        ["checkpoint", "index", "times", "calibration", "shards"],
+        ["out", "csv", "page"],
+        ["top", "max-speed", "elsewhere", "interval"],
+        [],
+    ),
+    "serve": (
+        ["checkpoint", "index", "token-file"],
+        [],
+        [
+            "port",
+            "max-megabytes",
+            "max-megapixels",
+            "batch",
+            "waiting",
+            "timeout-s",
+            "replicas",
+            "threads",
+        ],
+        ["host"],
+    ),
+    "evaluate": (
+        ["table", "shards", "run", "beside"],
+        ["out"],
+        ["panels", "workers"],
+        ["protocol", "query-view", "title", "by"],
+    ),
     "compare": ([], ["out"], [], []),
     "import_features": (["mat"], ["out"], [], ["query-view"]),
     "import_weights": (["torchvision", "lpn"], ["out"], ["image-size"], []),
-}  # fmt: skip
+}
 SOURCES = {
-    "university1652": ["kml", "views"], "sues200": ["heights"], "denseuav": [], "gta-uav": ["division", "pairs"],
-    "visloc": ["tile-pixels", "overlap", "train-flights"], "photos": ["view", "split", "location", "geotags"],
-    "geotiff": ["tile-m", "tile-pixels", "overlap", "output-pixels", "max-nodata", "crs", "resampling"],
-    "xyz": ["zoom", "view"], "table": ["view", "split"],
-    "nothing": [], "": [],
-}  # fmt: skip
+    "university1652": ["kml", "views"],
+    "sues200": ["heights"],
+    "denseuav": [],
+    "gta-uav": ["division", "pairs"],
+    "visloc": ["tile-pixels", "overlap", "train-flights"],
+    "photos": ["view", "split", "location", "geotags"],
+    "geotiff": [
+        "tile-m",
+        "tile-pixels",
+        "overlap",
+        "output-pixels",
+        "max-nodata",
+        "crs",
+        "resampling",
+    ],
+    "xyz": ["zoom", "view"],
+    "table": ["view", "split"],
+    "nothing": [],
+    "": [],
+}
 RECIPES = ["smoke", "paper", "lpn", "nothing", "", "--help", "-x"]
 OVERRIDES = [
     "batch-size",
@@ -138,7 +231,10 @@ def job_of(name: str) -> tuple[Callable[..., Any], Callable[[list[str]], list[st
 
 
 def call(
-    name: str, arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    name: str,
+    arguments: list[str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> tuple[int, str]:
     """Exit code, and what was said on the error stream."""
     job, reword = job_of(name)
@@ -213,8 +309,14 @@ def line(draw: st.DrawFn) -> tuple[str, list[str]]:
         if not draw(st.integers(0, 4)):
             told += [f"--{flag}", draw(st.sampled_from(TEXTS))]
     if name == "simulate":
-        told += ["--size", "31"] if draw(st.booleans()) else ["--textures", "empty"]  # it makes towns of anything else
-        told += ["--train-locations", "1", "--test-locations", "1", "--distractors", "1"] if draw(st.booleans()) else []
+        told += (
+            ["--size", "31"] if draw(st.booleans()) else ["--textures", "empty"]
+        )  # it makes towns of anything else
+        told += (
+            ["--train-locations", "1", "--test-locations", "1", "--distractors", "1"]
+            if draw(st.booleans())
+            else []
+        )
     if name in ("locate", "compare"):
         told += draw(st.lists(st.sampled_from(PATHS[:-1]), max_size=2))
         if not draw(st.integers(0, 4)):

@@ -1,4 +1,6 @@
-"""GeoTIFFs from anybody: tiles, or a reason why there are none, whatever the header says of sizes, places and directories."""
+"""GeoTIFFs from anybody: tiles, or a reason why there are none, whatever the header says of sizes,
+places and directories.
+"""
 
 import io
 import struct
@@ -15,27 +17,41 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rasterio.transform import Affine
 
+from pipeline.core.errors import InputError
+from pipeline.core.records import ImageRecord, Rejection
+from pipeline.images.decode import DecodeError
+from pipeline.sources.geotiff import GeoTiff
 from tests.fuzz.bounds import bounded, examples
 from tests.fuzz.hostile import damaged
-from pipeline.records import ImageRecord, InputError, Rejection
-from pipeline.sources.geotiff import GeoTiff
-from pipeline.transforms import DecodeError
 
 KINDS: dict[str, dict[str, Any]] = {
-    "grey": {"count": 1, "dtype": "uint8"}, "rgb": {"count": 3, "dtype": "uint8"}, "rgba": {"count": 4, "dtype": "uint8"},
-    "float with nodata": {"count": 1, "dtype": "float32", "nodata": -1}, "16 bits": {"count": 1, "dtype": "uint16"},
-    "complex": {"count": 1, "dtype": "complex64"}, "double": {"count": 3, "dtype": "float64"}, "int8": {"count": 1,
-    "dtype": "int8"},
+    "grey": {"count": 1, "dtype": "uint8"},
+    "rgb": {"count": 3, "dtype": "uint8"},
+    "rgba": {"count": 4, "dtype": "uint8"},
+    "float with nodata": {"count": 1, "dtype": "float32", "nodata": -1},
+    "16 bits": {"count": 1, "dtype": "uint16"},
+    "complex": {"count": 1, "dtype": "complex64"},
+    "double": {"count": 3, "dtype": "float64"},
+    "int8": {"count": 1, "dtype": "int8"},
     "complex of whole numbers": {"count": 1, "dtype": "complex_int16"},
-    "tiled": {"count": 3, "dtype": "uint8", "tiled": True, "blockxsize": 16, "blockysize": 16, "compress": "deflate"},
-    "jpeg": {"count": 3, "dtype": "uint8", "compress": "jpeg", "photometric": "ycbcr"}, "lzw": {"count": 1,
-    "dtype": "uint8", "compress": "lzw"},
+    "tiled": {
+        "count": 3,
+        "dtype": "uint8",
+        "tiled": True,
+        "blockxsize": 16,
+        "blockysize": 16,
+        "compress": "deflate",
+    },
+    "jpeg": {"count": 3, "dtype": "uint8", "compress": "jpeg", "photometric": "ycbcr"},
+    "lzw": {"count": 1, "dtype": "uint8", "compress": "lzw"},
     "palette": {"count": 1, "dtype": "uint8", "photometric": "palette"},
-}  # fmt: skip
+}
 WGS84 = Affine(1e-5, 0, 8.5, 0, -1e-5, 47.5)
 
 
-def mosaic(path: Path, transform: Affine = WGS84, crs: Any = "EPSG:4326", side: int = 48, **kind: Any) -> None:
+def mosaic(
+    path: Path, transform: Affine = WGS84, crs: Any = "EPSG:4326", side: int = 48, **kind: Any
+) -> None:
     path.unlink(missing_ok=True)  # a hostile one of this name would be looked at first
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -87,7 +103,9 @@ SOURCES = [
 
 @given(st.data(), st.sampled_from(list(KINDS)), st.sampled_from(SOURCES))
 @examples(120)
-def test_a_damaged_mosaic(folder: Path, data: st.DataObject, kind: str, source: dict[str, Any]) -> None:
+def test_a_damaged_mosaic(
+    folder: Path, data: st.DataObject, kind: str, source: dict[str, Any]
+) -> None:
     told = data.draw(damaged(valid(kind, folder), head=400))
     for path in (folder / "damaged.tif", folder / "damaged.tif.aux.xml"):
         path.unlink(missing_ok=True)
@@ -95,7 +113,9 @@ def test_a_damaged_mosaic(folder: Path, data: st.DataObject, kind: str, source: 
     tiles(folder / "damaged.tif", GeoTiff(**source))
 
 
-word = st.sampled_from([0, 1, 2, 3, 4, 8, 16, 255, 256, 65535, 65536, 100_000, 2**31 - 1, 2**31, 2**32 - 1])
+word = st.sampled_from(
+    [0, 1, 2, 3, 4, 8, 16, 255, 256, 65535, 65536, 100_000, 2**31 - 1, 2**31, 2**32 - 1]
+)
 
 
 @given(
@@ -158,7 +178,9 @@ def test_a_header_written_entry_by_entry(
         struct.pack("<HHII", tag, *value) for tag, value in sorted(told.items())
     )
     following = data.draw(st.sampled_from([0, 8, 9, 1 << 31, 8 + len(directory)]))
-    block = (b"II*\0" + struct.pack("<I", 8) + directory + struct.pack("<I", following)).ljust(1000, b"\0")
+    block = (b"II*\0" + struct.pack("<I", 8) + directory + struct.pack("<I", following)).ljust(
+        1000, b"\0"
+    )
     block += struct.pack("<9d", 1.0, 1.0, 0, 0, 0, 0, 8.5, 47.5, 0) + bytes(4000)
     (folder / "made.tif").write_bytes(block)
     tiles(folder / "made.tif", GeoTiff(tile_pixels=data.draw(st.sampled_from([16, 512, 10**6]))))
@@ -170,12 +192,23 @@ NUMBERS = [0.0, 1e-300, -1e-300, 1e-9, 1.0, -1.0, 1e9, 1e300, float("inf"), floa
 @given(
     st.lists(st.sampled_from(NUMBERS), min_size=6, max_size=6),
     st.sampled_from(
-        ["EPSG:4326", "EPSG:32632", "EPSG:3857", "EPSG:4978", "EPSG:5703", None, 'LOCAL_CS["x"]', "EPSG:2180"]
+        [
+            "EPSG:4326",
+            "EPSG:32632",
+            "EPSG:3857",
+            "EPSG:4978",
+            "EPSG:5703",
+            None,
+            'LOCAL_CS["x"]',
+            "EPSG:2180",
+        ]
     ),
     st.sampled_from(SOURCES),
 )
 @examples(80)
-def test_a_mosaic_that_lies_anywhere(folder: Path, six: list[float], crs: str | None, source: dict[str, Any]) -> None:
+def test_a_mosaic_that_lies_anywhere(
+    folder: Path, six: list[float], crs: str | None, source: dict[str, Any]
+) -> None:
     path = folder / "anywhere.tif"
     for old in (path, folder / "anywhere.tif.aux.xml"):
         old.unlink(missing_ok=True)

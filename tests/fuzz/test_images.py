@@ -1,4 +1,6 @@
-"""Images from anybody: a size or pixels, or a reason that can be counted. Nothing is started, and no size is believed."""
+"""Images from anybody: a size or pixels, or a reason that can be counted. Nothing is started, and
+no size is believed.
+"""
 
 import io
 import struct
@@ -10,10 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from pipeline.images.decode import DecodeError, decode
+from pipeline.images.inspect import inspect
+from pipeline.images.transforms import resize
 from tests.fuzz.bounds import bounded, examples
 from tests.fuzz.hostile import damaged
-from pipeline.inspection import inspect
-from pipeline.transforms import DecodeError, decode, resize
 
 FORMS = [
     "JPEG",
@@ -43,7 +46,11 @@ def picture(form: str, mode: str, frames: int = 1) -> bytes:
     image = Image.effect_noise((24, 16), 40).convert("RGB")
     try:
         image = Image.new(mode, (24, 16)) if mode in ("I;16", "LAB") else image.convert(mode)
-        more = {"save_all": True, "append_images": [image.rotate(90)] * (frames - 1)} if frames > 1 else {}
+        more = (
+            {"save_all": True, "append_images": [image.rotate(90)] * (frames - 1)}
+            if frames > 1
+            else {}
+        )
         image.save(stream, form, **more)
     except (OSError, KeyError, ValueError, SystemError):
         return b""
@@ -63,20 +70,47 @@ def judge(data: bytes) -> None:
 @pytest.mark.filterwarnings(
     "ignore"
 )  # Pillow warns of what it then reads or refuses; packing is a process that shows none
-@given(st.data(), st.sampled_from(FORMS), st.sampled_from(MODES), st.sampled_from([1, 1, 3]), st.booleans())
+@given(
+    st.data(),
+    st.sampled_from(FORMS),
+    st.sampled_from(MODES),
+    st.sampled_from([1, 1, 3]),
+    st.booleans(),
+)
 @examples(250)
-def test_an_image_of_any_kind_and_damage(data: st.DataObject, form: str, mode: str, frames: int, whole: bool) -> None:
+def test_an_image_of_any_kind_and_damage(
+    data: st.DataObject, form: str, mode: str, frames: int, whole: bool
+) -> None:
     told = picture(form, mode, frames)
     if told:
         judge(told if whole else data.draw(damaged(told, head=64)))
 
 
-def png(width: int, height: int, *, depth: int = 8, colour: int = 2, more: bytes = b"", data: bytes = b"") -> bytes:
+def png(
+    width: int,
+    height: int,
+    *,
+    depth: int = 8,
+    colour: int = 2,
+    more: bytes = b"",
+    data: bytes = b"",
+) -> bytes:
     def chunk(kind: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        return (
+            struct.pack(">I", len(content))
+            + kind
+            + content
+            + struct.pack(">I", zlib.crc32(kind + content))
+        )
 
     header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + more + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + more
+        + chunk(b"IDAT", data)
+        + chunk(b"IEND", b"")
+    )
 
 
 @cache
@@ -96,16 +130,21 @@ def bombs() -> dict[str, bytes]:
     bmp = bytearray(picture("BMP", "RGB"))
     bmp[18:26] = struct.pack("<ii", 2**31 - 1, -(2**31))
     return {
-        "png of pixels": png(30_000, 30_000, data=zeros), "png just below the limit": png(13_000, 13_000, colour=0,
-        data=zeros[:100]),
+        "png of pixels": png(30_000, 30_000, data=zeros),
+        "png just below the limit": png(13_000, 13_000, colour=0, data=zeros[:100]),
         "png of text": png(16, 16, more=chunk, data=zlib.compress(bytes(16 * 49))),
         "png of xmp": png(16, 16, more=itxt, data=zlib.compress(bytes(16 * 49))),
-        "png that is cut": png(16, 16)[:40], "jpeg": bytes(jpeg), "gif": bytes(gif), "bmp": bytes(bmp),
-        "ppm": b"P6 99999 99999 255\n", "ppm of digits": b"P3 " + b"9" * 100_000 + b" 1 255\n",
-        "jpeg behind a png": picture("PNG", "RGB") + picture("JPEG", "RGB"), "zip behind a jpeg": picture("JPEG",
-        "RGB") + b"PK\3\4" + bytes(99),
-        "script behind a gif": b"GIF89a=1;alert(1)//" + bytes(30), "svg": b"<svg xmlns='http://www.w3.org/2000/svg'><image href='file:///etc/passwd'/></svg>",
-    }  # fmt: skip
+        "png that is cut": png(16, 16)[:40],
+        "jpeg": bytes(jpeg),
+        "gif": bytes(gif),
+        "bmp": bytes(bmp),
+        "ppm": b"P6 99999 99999 255\n",
+        "ppm of digits": b"P3 " + b"9" * 100_000 + b" 1 255\n",
+        "jpeg behind a png": picture("PNG", "RGB") + picture("JPEG", "RGB"),
+        "zip behind a jpeg": picture("JPEG", "RGB") + b"PK\3\4" + bytes(99),
+        "script behind a gif": b"GIF89a=1;alert(1)//" + bytes(30),
+        "svg": b"<svg xmlns='http://www.w3.org/2000/svg'><image href='file:///etc/passwd'/></svg>",
+    }
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -114,7 +153,9 @@ def test_a_bomb_is_refused_or_small(name: str) -> None:
     judge(bombs()[name])
 
 
-@pytest.mark.parametrize("form", ["EPS", "ICNS", "ICO", "PCX", "SGI", "DDS", "TGA", "JPEG2000", "PDF"])
+@pytest.mark.parametrize(
+    "form", ["EPS", "ICNS", "ICO", "PCX", "SGI", "DDS", "TGA", "JPEG2000", "PDF"]
+)
 def test_only_kinds_of_images_that_a_source_names_are_opened(form: str) -> None:
     """Others have decoders that nobody here needs: that of EPS is a program, Ghostscript."""
     told = picture(form, "RGB")

@@ -1,4 +1,6 @@
-"""Files called anything: what is said of them reaches a terminal as text, and what is packed of them is packed or refused."""
+"""Files called anything: what is said of them reaches a terminal as text, and what is packed of
+them is packed or refused.
+"""
 
 import io
 import os
@@ -9,18 +11,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from tests.fuzz.bounds import bounded, examples
-from tests.fuzz.hostile import NAMES
-from jobs import cli
-from pipeline import progress as told
-from pipeline.packing import PackingSettings, pack
-from pipeline.photo_files import find_photos
-from pipeline.progress import UNSEEN, console, progress, results, visible
-from pipeline.records import InputError, Unfinished
-from pipeline.rejects import FILE
-from pipeline.shards import read_manifest
+from jobs.command_line import cli
+from pipeline.core import progress as told
+from pipeline.core.errors import InputError, Unfinished
+from pipeline.core.progress import UNSEEN, console, progress, results, visible
+from pipeline.core.rejections import FILE
+from pipeline.locate.photo_files import find_photos
+from pipeline.shards.manifest import read_manifest
+from pipeline.shards.pack import PackingSettings, pack
 from pipeline.sources.photos import Photos
 from pipeline.sources.university1652 import University1652
+from tests.fuzz.bounds import bounded, examples
+from tests.fuzz.hostile import NAMES
 
 text = st.text(max_size=30) | st.sampled_from(NAMES)
 
@@ -48,7 +50,9 @@ def test_a_bar_shows_names_as_they_are(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name.isprintable()])
-def test_an_error_is_one_line(name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_is_one_line(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def job() -> None:
         raise InputError(f"no file {name}\n; expected one")
 
@@ -64,7 +68,9 @@ def test_an_error_is_one_line(name: str, capsys: pytest.CaptureFixture[str], mon
 def raw(name: str) -> bytes:
     return name.encode(
         "utf-8",
-        "surrogateescape" if all(ord(c) >= 0xDC80 for c in name if 0xD800 <= ord(c) <= 0xDFFF) else "surrogatepass",
+        "surrogateescape"
+        if all(ord(c) >= 0xDC80 for c in name if 0xD800 <= ord(c) <= 0xDFFF)
+        else "surrogatepass",
     )
 
 
@@ -90,7 +96,9 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("source", [Photos(), University1652()])
-def test_files_of_any_name_are_packed_or_refused(source: Photos | University1652, world: Path, tmp_path: Path) -> None:
+def test_files_of_any_name_are_packed_or_refused(
+    source: Photos | University1652, world: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "shards"
     with bounded(InputError, Unfinished):
         pack(source, PackingSettings(root=str(world), out=str(out), workers=0, max_bad_fraction=1))

@@ -1,4 +1,6 @@
-"""CSV, Parquet, GeoJSON, text and JSON lists from anybody: rows, refused rows, or a sentence why there are none."""
+"""CSV, Parquet, GeoJSON, text and JSON lists from anybody: rows, refused rows, or a sentence why
+there are none.
+"""
 
 import csv
 import io
@@ -14,35 +16,57 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.fuzz.bounds import bounded, examples
-from tests.fuzz.hostile import damaged, names, numbers, twisted, values
-from pipeline.records import ImageRecord, InputError, Rejection
-from pipeline.sources import mbtiles
+from pipeline.core.errors import InputError
+from pipeline.core.records import ImageRecord, Rejection
 from pipeline.sources.denseuav import parse_line, read_geotags
 from pipeline.sources.gta_uav import GtaUav
+from pipeline.sources.maps import mbtiles
 from pipeline.sources.table import Table
-from pipeline.sources.tables import Unreadable, read_rows
+from pipeline.sources.text_tables import Unreadable, read_rows
 from pipeline.sources.university1652 import University1652
 from pipeline.sources.visloc_maps import read_corners, read_maps
 from pipeline.sources.xyz import Xyz
+from tests.fuzz.bounds import bounded, examples
+from tests.fuzz.hostile import damaged, names, numbers, twisted, values
 
-COLUMNS = ("path", "view", "split", "location", "lat", "lon", "altitude_m", "heading_deg", "pitch_deg", "taken_at")
+COLUMNS = (
+    "path",
+    "view",
+    "split",
+    "location",
+    "lat",
+    "lon",
+    "altitude_m",
+    "heading_deg",
+    "pitch_deg",
+    "taken_at",
+)
 ROW = ("a.jpg", "drone", "query", "0001", "47.5", "8.5", "100", "10", "-90", "2024-05-06T07:08:09")
 PAIR = {
-    "drone_img_dir": "drone/images", "drone_img_name": "a.png", "pair_pos_sate_img_list": ["t.png", "u.png"],
-    "pair_pos_sate_weight_list": [0.5, 0.25], "pair_pos_semipos_sate_img_list": ["t.png"],
+    "drone_img_dir": "drone/images",
+    "drone_img_name": "a.png",
+    "pair_pos_sate_img_list": ["t.png", "u.png"],
+    "pair_pos_sate_weight_list": [0.5, 0.25],
+    "pair_pos_semipos_sate_img_list": ["t.png"],
     "pair_pos_semipos_sate_weight_list": [0.5],
-}  # fmt: skip
+}
 RING = [[[8.0, 47.0], [8.1, 47.0], [8.1, 47.1], [8.0, 47.1], [8.0, 47.0]]]
 GEOJSON = {
-    "type": "FeatureCollection", "crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}},
+    "type": "FeatureCollection",
+    "crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}},
     "features": [
-        {"type": "Feature", "geometry": {"type": "Point", "coordinates": [8.5, 47.5]},
-        "properties": dict(zip(COLUMNS, ROW, strict=True))},
-        {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": RING}, "properties": {"path": "b.jpg",
-        "heading_deg": 10}},
+        {
+            "type": "Feature",
+            "geometry": {"type": "Point", "coordinates": [8.5, 47.5]},
+            "properties": dict(zip(COLUMNS, ROW, strict=True)),
+        },
+        {
+            "type": "Feature",
+            "geometry": {"type": "Polygon", "coordinates": RING},
+            "properties": {"path": "b.jpg", "heading_deg": 10},
+        },
     ],
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
@@ -66,14 +90,20 @@ def scanned(table: Path) -> list[ImageRecord | Rejection]:
 cells = numbers | names | st.sampled_from(ROW)
 
 
-@given(st.lists(st.lists(cells, min_size=9, max_size=11), max_size=4), st.sampled_from(",;\t"), st.data())
+@given(
+    st.lists(st.lists(cells, min_size=9, max_size=11), max_size=4),
+    st.sampled_from(",;\t"),
+    st.data(),
+)
 @examples(60)
 def test_a_csv(folder: Path, rows: list[list[str]], delimiter: str, data: st.DataObject) -> None:
     text = io.StringIO()
     writer = csv.writer(text, delimiter=delimiter, escapechar="\\")
     writer.writerows([COLUMNS, ROW, *rows])
     encoding = data.draw(st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "latin-1"]))
-    told = text.getvalue().encode(encoding, "surrogatepass" if encoding.startswith("utf") else "replace")
+    told = text.getvalue().encode(
+        encoding, "surrogatepass" if encoding.startswith("utf") else "replace"
+    )
     (folder / "t.csv").write_bytes(data.draw(damaged(told)) if data.draw(st.booleans()) else told)
     scanned(folder / "t.csv")
     with bounded(InputError):
@@ -84,7 +114,9 @@ def test_a_csv(folder: Path, rows: list[list[str]], delimiter: str, data: st.Dat
 @examples(80)
 def test_a_geojson(folder: Path, value: Any, data: st.DataObject) -> None:
     told = json.dumps(value).encode()
-    (folder / "t.geojson").write_bytes(data.draw(damaged(told)) if data.draw(st.booleans()) else told)
+    (folder / "t.geojson").write_bytes(
+        data.draw(damaged(told)) if data.draw(st.booleans()) else told
+    )
     scanned(folder / "t.geojson")
 
 
@@ -98,27 +130,53 @@ def test_a_geojson_deeper_than_any_reader(folder: Path) -> None:
 
 
 ARROW = [
-    pa.string(), pa.large_string(), pa.binary(), pa.int8(), pa.uint64(), pa.float16(), pa.float64(), pa.bool_(), pa.null(),
-    pa.timestamp("ns"), pa.timestamp("s"), pa.timestamp("us", "Europe/Zurich"), pa.timestamp("us", "No/Where"),
-    pa.date32(), pa.date64(),
-    pa.time64("ns"), pa.duration("ns"), pa.decimal128(38, 10), pa.list_(pa.string()), pa.struct([("path", pa.string())]),
-    pa.dictionary(pa.int32(), pa.string()), pa.map_(pa.string(), pa.string()), pa.binary_view(), pa.month_day_nano_interval(),
-]  # fmt: skip
+    pa.string(),
+    pa.large_string(),
+    pa.binary(),
+    pa.int8(),
+    pa.uint64(),
+    pa.float16(),
+    pa.float64(),
+    pa.bool_(),
+    pa.null(),
+    pa.timestamp("ns"),
+    pa.timestamp("s"),
+    pa.timestamp("us", "Europe/Zurich"),
+    pa.timestamp("us", "No/Where"),
+    pa.date32(),
+    pa.date64(),
+    pa.time64("ns"),
+    pa.duration("ns"),
+    pa.decimal128(38, 10),
+    pa.list_(pa.string()),
+    pa.struct([("path", pa.string())]),
+    pa.dictionary(pa.int32(), pa.string()),
+    pa.map_(pa.string(), pa.string()),
+    pa.binary_view(),
+    pa.month_day_nano_interval(),
+]
 
 
 @given(
-    st.dictionaries(st.sampled_from(COLUMNS), st.tuples(st.sampled_from(ARROW), st.binary(min_size=64, max_size=64))),
+    st.dictionaries(
+        st.sampled_from(COLUMNS),
+        st.tuples(st.sampled_from(ARROW), st.binary(min_size=64, max_size=64)),
+    ),
     st.data(),
 )
 @examples(60)
-def test_a_parquet_of_any_types(folder: Path, columns: dict[str, tuple[Any, bytes]], data: st.DataObject) -> None:
-    """Columns of types that nobody would choose, with whatever these bytes mean as one: dates of the year 30,000,
-    text in no encoding."""
+def test_a_parquet_of_any_types(
+    folder: Path, columns: dict[str, tuple[Any, bytes]], data: st.DataObject
+) -> None:
+    """Columns of types that nobody would choose, with whatever these bytes mean as one: dates of
+    the year 30,000, text in no encoding."""
     arrays: dict[str, Any] = {"path": pa.array(["a.jpg", "b.jpg"])}
     for name, (kind, raw) in columns.items():
         buffer = pa.py_buffer(raw)
         if pa.types.is_string(kind) or pa.types.is_binary(kind):
-            arrays[name] = pa.Array.from_buffers(kind, 2, [None, pa.array([0, 8, 16], pa.int32()).buffers()[1], buffer])
+            arrays[name] = pa.Array.from_buffers(
+                kind, 2, [None, pa.array([0, 8, 16], pa.int32()).buffers()[1], buffer]
+            )
         elif (
             pa.types.is_boolean(kind)
             or pa.types.is_nested(kind)
@@ -155,14 +213,23 @@ def test_a_line_of_denseuav(line: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "line", ["a.jpg " * 50_000, "a.jpg E1 " * 30_000, "a.jpg" + " " * 100_000 + "x", "1.jpg" * 50_000 + " 1" * 50_000]
+    "line",
+    [
+        "a.jpg " * 50_000,
+        "a.jpg E1 " * 30_000,
+        "a.jpg" + " " * 100_000 + "x",
+        "1.jpg" * 50_000 + " 1" * 50_000,
+    ],
 )
 def test_a_long_line_of_denseuav_is_read_in_time(line: str) -> None:
     with bounded(Unreadable):
         parse_line(line)
 
 
-@given(st.binary(max_size=200) | damaged(b"train/satellite/0001/H80.tif E120.387 N30.32 94.6\nb.jpg 30.1 120.2 80\n"))
+@given(
+    st.binary(max_size=200)
+    | damaged(b"train/satellite/0001/H80.tif E120.387 N30.32 94.6\nb.jpg 30.1 120.2 80\n")
+)
 @examples(30)
 def test_tables_of_denseuav_and_university1652(folder: Path, data: bytes) -> None:
     (folder / "Dense_GPS_train.txt").write_bytes(data)
@@ -218,7 +285,9 @@ sql = values.filter(lambda value: not isinstance(value, list | dict)) | st.binar
     st.data(),
 )
 @examples(40)
-def test_an_mbtiles(folder: Path, tiles: list[tuple[Any, ...]], metadata: dict[str, Any], data: st.DataObject) -> None:
+def test_an_mbtiles(
+    folder: Path, tiles: list[tuple[Any, ...]], metadata: dict[str, Any], data: st.DataObject
+) -> None:
     path = folder / "t.mbtiles"
     path.unlink(missing_ok=True)
     with closing(sqlite3.connect(path)) as database:
@@ -230,7 +299,9 @@ def test_an_mbtiles(folder: Path, tiles: list[tuple[Any, ...]], metadata: dict[s
         ):
             for row in rows:
                 try:
-                    database.execute(f"INSERT INTO {table} VALUES ({','.join('?' * len(row))})", row)
+                    database.execute(
+                        f"INSERT INTO {table} VALUES ({','.join('?' * len(row))})", row
+                    )
                 except (OverflowError, UnicodeEncodeError):
                     continue
         database.commit()
@@ -254,7 +325,9 @@ def read_tiles(path: Path, seconds: float = 10) -> None:
     "SELECT 3 AS zoom_level, 1 AS tile_column, 1 AS tile_row, zeroblob(900000000) AS tile_data",
     "SELECT 3 AS zoom_level, a.x AS tile_column, 1 AS tile_row, x'89' AS tile_data FROM t a, t b, t c, t d, t e, t f",
 ])  # fmt: skip
-def test_a_view_without_end_is_given_up(folder: Path, view: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_view_without_end_is_given_up(
+    folder: Path, view: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(mbtiles, "PATIENCE_S", 0.5)
     path = folder / "view.mbtiles"
     path.unlink(missing_ok=True)

@@ -1,4 +1,6 @@
-"""Tars from anybody, and the JSON within: samples, or a sentence why not. Nothing is unpacked, and no size is believed."""
+"""Tars from anybody, and the JSON within: samples, or a sentence why not. Nothing is unpacked, and
+no size is believed.
+"""
 
 import io
 import json
@@ -12,21 +14,36 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.core.errors import InputError
+from pipeline.core.records import Split, View
+from pipeline.shards.external import open_manifest
+from pipeline.shards.manifest import Shard
+from pipeline.shards.samples import read_locations, read_shard
+from pipeline.shards.tar_reader import read_members
+from pipeline.shards.verify import check_shard
 from tests.fuzz.bounds import bounded, examples
 from tests.fuzz.hostile import damaged, names, twisted, values
-from pipeline.foreign import open_manifest
-from pipeline.records import InputError, Split, View
-from pipeline.samples import read_locations, read_shard
-from pipeline.shards import Shard
-from pipeline.tars import read_members
-from pipeline.verification import check_shard
 
 FACTS = {
-    "key": "query-drone-0001-0", "location": "0001", "view": "drone", "split": "query", "variant": "", "source": "photos",
-    "geotag": {"lat": 47.5, "lon": 8.5, "altitude_m": 100.0, "heading_deg": 1.0, "pitch_deg": -90.0,
-    "footprint": [[1, 2], [3, 4]]},
-    "taken_at": None, "sha256": "0" * 64, "width": 16, "height": 16,
-}  # fmt: skip
+    "key": "query-drone-0001-0",
+    "location": "0001",
+    "view": "drone",
+    "split": "query",
+    "variant": "",
+    "source": "photos",
+    "geotag": {
+        "lat": 47.5,
+        "lon": 8.5,
+        "altitude_m": 100.0,
+        "heading_deg": 1.0,
+        "pitch_deg": -90.0,
+        "footprint": [[1, 2], [3, 4]],
+    },
+    "taken_at": None,
+    "sha256": "0" * 64,
+    "width": 16,
+    "height": 16,
+}
 KINDS = [
     tarfile.REGTYPE,
     tarfile.AREGTYPE,
@@ -90,7 +107,12 @@ def member(
     name: str, data: bytes, kind: bytes = tarfile.REGTYPE, pax: dict[str, str] | None = None
 ) -> tuple[tarfile.TarInfo, bytes]:
     info = tarfile.TarInfo(name)
-    info.size, info.type, info.linkname, info.pax_headers = len(data), kind, "/etc/passwd", pax or {}
+    info.size, info.type, info.linkname, info.pax_headers = (
+        len(data),
+        kind,
+        "/etc/passwd",
+        pax or {},
+    )
     return info, data
 
 
@@ -139,7 +161,9 @@ def test_a_damaged_tar(data: st.DataObject, form: int) -> None:
 def test_members_of_any_name_and_kind(
     told: list[tuple[str, bytes, bytes, dict[str, str]]], data: st.DataObject
 ) -> None:
-    form = data.draw(st.sampled_from([tarfile.USTAR_FORMAT, tarfile.GNU_FORMAT, tarfile.PAX_FORMAT]))
+    form = data.draw(
+        st.sampled_from([tarfile.USTAR_FORMAT, tarfile.GNU_FORMAT, tarfile.PAX_FORMAT])
+    )
     whole = packed(
         [
             member(f"{name}.jpg" if data.draw(st.booleans()) else name, body, kind, pax)
@@ -152,7 +176,9 @@ def test_members_of_any_name_and_kind(
 
 
 def header(kind: bytes, size: int, name: bytes = b"0.jpg", sparse: bytes = b"") -> bytes:
-    """One header with a checksum that is right; sizes beyond 8 GiB, and below 0, as GNU's tar writes them."""
+    """One header with a checksum that is right; sizes beyond 8 GiB, and below 0, as GNU's tar
+    writes them.
+    """
     block = bytearray(tarfile.TarInfo(name.decode()).tobuf(tarfile.GNU_FORMAT))
     block[156:157] = kind
     block[124:136] = (
@@ -188,23 +214,36 @@ def test_a_header_that_says_another_size(kind: bytes, size: int) -> None:
 
 def test_a_file_that_is_mostly_a_hole_is_refused() -> None:
     """GNU's sparse file of old: a terabyte of nothing in a kilobyte."""
-    sparse = b"%011o\0%011o\0" % (0, 0) + bytes(72) + b"\0" + (b"\x80" + (2**40).to_bytes(11, "big"))
+    sparse = (
+        b"%011o\0%011o\0" % (0, 0) + bytes(72) + b"\0" + (b"\x80" + (2**40).to_bytes(11, "big"))
+    )
     read(header(tarfile.GNUTYPE_SPARSE, 0, sparse=sparse) + bytes(1024))
     for pax in (
         {"GNU.sparse.size": str(2**40), "GNU.sparse.map": "0,0"},
-        {"GNU.sparse.major": "0", "GNU.sparse.minor": "1", "GNU.sparse.realsize": str(2**40), "GNU.sparse.map": "0,1"},
+        {
+            "GNU.sparse.major": "0",
+            "GNU.sparse.minor": "1",
+            "GNU.sparse.realsize": str(2**40),
+            "GNU.sparse.map": "0,1",
+        },
     ):
         read(packed([member("0.jpg", b"x", pax=pax)], tarfile.PAX_FORMAT))
     with pytest.raises(InputError, match="sparse"):
         list(
-            read_members(io.BytesIO(header(tarfile.GNUTYPE_SPARSE, 0, sparse=sparse) + bytes(1024)), "it.tar", ("jpg",))
+            read_members(
+                io.BytesIO(header(tarfile.GNUTYPE_SPARSE, 0, sparse=sparse) + bytes(1024)),
+                "it.tar",
+                ("jpg",),
+            )
         )
 
 
 @pytest.mark.parametrize("kind", [tarfile.GNUTYPE_LONGNAME, tarfile.XHDTYPE])
 def test_headers_before_headers_without_end(kind: bytes) -> None:
     content = (
-        b"a/0.jpg\0".ljust(512, b"\0") if kind == tarfile.GNUTYPE_LONGNAME else b"16 path=a/0.jpg\n".ljust(512, b"\0")
+        b"a/0.jpg\0".ljust(512, b"\0")
+        if kind == tarfile.GNUTYPE_LONGNAME
+        else b"16 path=a/0.jpg\n".ljust(512, b"\0")
     )
     size = 8 if kind == tarfile.GNUTYPE_LONGNAME else 16
     read((header(kind, size) + content) * 20_000 + header(tarfile.REGTYPE, 0) + bytes(1024))
@@ -238,7 +277,12 @@ def usable(facts: dict[str, Any]) -> None:
 
 
 @given(
-    st.data(), st.one_of(twisted(FACTS), values, twisted({"location": "a", "lat": 1.0, "lon": 2, "geotag": {"lat": 1}}))
+    st.data(),
+    st.one_of(
+        twisted(FACTS),
+        values,
+        twisted({"location": "a", "lat": 1.0, "lon": 2, "geotag": {"lat": 1}}),
+    ),
 )
 @examples(150)
 def test_the_json_of_a_sample(folder: Path, data: st.DataObject, said: Any) -> None:
@@ -248,7 +292,11 @@ def test_the_json_of_a_sample(folder: Path, data: st.DataObject, said: Any) -> N
     name = data.draw(st.sampled_from(["0", "a/0", "\udcff/0", "é"]))
     (folder / "query-drone-000000.tar").write_bytes(
         packed(
-            [member(f"{name}.jpg", b"x"), member(f"{name}.json", told), member(f"{name}.cls", label)],
+            [
+                member(f"{name}.jpg", b"x"),
+                member(f"{name}.json", told),
+                member(f"{name}.cls", label),
+            ],
             tarfile.GNU_FORMAT,
         )
     )
@@ -263,7 +311,14 @@ def test_the_json_of_a_sample(folder: Path, data: st.DataObject, said: Any) -> N
     with bounded(InputError):
         assert check_shard(
             str(folder),
-            Shard(name="query-drone-000000", split=Split.QUERY, view=View.DRONE, samples=1, bytes=1, sha256=""),
+            Shard(
+                name="query-drone-000000",
+                split=Split.QUERY,
+                view=View.DRONE,
+                samples=1,
+                bytes=1,
+                sha256="",
+            ),
         )
     with bounded(InputError):
         open_manifest(str(folder), Split.QUERY, View.DRONE)

@@ -1,4 +1,6 @@
-"""Checkpoints, weights and features from anybody: what they hold, or a sentence. Nothing in them is run, nothing inflated."""
+"""Checkpoints, weights and features from anybody: what they hold, or a sentence. Nothing in them is
+run, nothing inflated.
+"""
 
 import io
 import pickle
@@ -15,14 +17,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.fuzz.bounds import bounded, examples
-from tests.fuzz.hostile import VALUES, damaged, twisted, values
 from jobs.import_weights import Settings, import_weights
 from model.checkpoint import Checkpoint, CheckpointError, build_encoder, dumps, fingerprint, loads
 from model.pvda import FeatureEncoder, PVDAConfig
-from model.weights import measure_backbone, parse_state_dict
-from pipeline.foreign_features import ImportSettings, import_features
-from pipeline.records import InputError
+from model.weights.load import measure_backbone, parse_state_dict
+from pipeline.core.errors import InputError
+from pipeline.features.import_mat import ImportSettings, import_features
+from tests.fuzz.bounds import bounded, examples
+from tests.fuzz.hostile import VALUES, damaged, twisted, values
 
 NETWORK = PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=8)
 
@@ -32,10 +34,14 @@ def checkpoint() -> bytes:
     encoder = FeatureEncoder(NETWORK)
     return dumps(
         Checkpoint(
-            network=NETWORK, recipe={"name": "made", "seed": 0}, locations=["0001"], epoch=1, history=[{"epoch": 1}],
+            network=NETWORK,
+            recipe={"name": "made", "seed": 0},
+            locations=["0001"],
+            epoch=1,
+            history=[{"epoch": 1}],
             state={"modules": {"encoder": encoder.state_dict()}},
         )
-    )  # fmt: skip
+    )
 
 
 @cache
@@ -61,7 +67,9 @@ def open_all(data: bytes) -> None:
 @examples(25)
 def test_a_damaged_checkpoint(data: st.DataObject) -> None:
     whole = checkpoint()
-    head = whole.find(b"PK\1\2")  # flips in a weight are no damage that one could see; the pickle and the directory are
+    head = whole.find(
+        b"PK\1\2"
+    )  # flips in a weight are no damage that one could see; the pickle and the directory are
     told = (
         data.draw(damaged(whole, most=3, head=2000))
         if data.draw(st.booleans())
@@ -72,13 +80,26 @@ def test_a_damaged_checkpoint(data: st.DataObject) -> None:
 
 @given(
     st.sampled_from(
-        ["format", "network", "recipe", "history", "locations", "epoch", "step", "running", "state", "more"]
+        [
+            "format",
+            "network",
+            "recipe",
+            "history",
+            "locations",
+            "epoch",
+            "step",
+            "running",
+            "state",
+            "more",
+        ]
     ),
     values,
     st.data(),
 )
 @examples(40)
-def test_a_checkpoint_with_something_else_in_a_field(field: str, value: Any, data: st.DataObject) -> None:
+def test_a_checkpoint_with_something_else_in_a_field(
+    field: str, value: Any, data: st.DataObject
+) -> None:
     if data.draw(st.booleans()) and field in plain():
         value = data.draw(twisted(plain()[field])) if field != "state" else {"modules": value}
     open_all(saved(plain() | {field: value}))
@@ -120,7 +141,10 @@ def test_a_tensor_that_is_not_there(tensor: torch.Tensor) -> None:
     open_all(saved(plain() | {"running": {"x": tensor}}))
     with bounded(CheckpointError):
         measure_backbone(
-            parse_state_dict(saved({"conv1.weight": tensor, "layer1.0.conv1.weight": tensor}), "x.pth"), "x"
+            parse_state_dict(
+                saved({"conv1.weight": tensor, "layer1.0.conv1.weight": tensor}), "x.pth"
+            ),
+            "x",
         )
 
 
@@ -171,7 +195,9 @@ def test_code_in_any_file_is_not_run(protocol: int, tmp_path: Path) -> None:
 
 
 def laughs() -> bytes:
-    """Lists of ten times the same list, forty deep: small as a pickle, and without end for whoever walks it."""
+    """Lists of ten times the same list, forty deep: small as a pickle, and without end for whoever
+    walks it.
+    """
     value: Any = ["ha"]
     for _ in range(40):
         value = [value] * 10
@@ -186,13 +212,18 @@ def test_lists_of_lists_of_one_list() -> None:
 
 @cache
 def tensors(form: str) -> bytes:
-    state = {"conv1.weight": torch.zeros(8, 3, 7, 7), "layer1.0.conv1.weight": torch.zeros(8, 8, 3, 3)}
+    state = {
+        "conv1.weight": torch.zeros(8, 3, 7, 7),
+        "layer1.0.conv1.weight": torch.zeros(8, 8, 3, 3),
+    }
     return safetensors.torch.save(state) if form == "safetensors" else saved(state)
 
 
 @given(st.data(), st.sampled_from(["safetensors", "pth"]))
 @examples(40)
-def test_a_damaged_file_of_weights(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, form: str) -> None:
+def test_a_damaged_file_of_weights(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, form: str
+) -> None:
     folder = tmp_path_factory.mktemp("weights")
     path = folder / f"x.{form}"
     path.write_bytes(data.draw(damaged(tensors(form), head=300)))
@@ -251,7 +282,9 @@ def test_features_of_another_program(
     strange = data.draw(st.sets(st.sampled_from(sorted(said))))
     scipy.io.savemat(folder / "x.mat", good | {name: said[name] for name in strange})
     if data.draw(st.booleans()):
-        (folder / "x.mat").write_bytes(data.draw(damaged((folder / "x.mat").read_bytes(), head=200)))
+        (folder / "x.mat").write_bytes(
+            data.draw(damaged((folder / "x.mat").read_bytes(), head=200))
+        )
     with bounded(InputError):
         import_features(ImportSettings(mat=str(folder / "x.mat"), out=str(folder / "out")))
     assert {each.name for each in folder.iterdir()} <= {"x.mat", "out"}

@@ -1,8 +1,9 @@
-"""Faults of the storage, in every Python process that has this folder on its path and CHAOS in its environment.
+"""Faults of the storage, in every Python process that has this folder on its path and CHAOS in its
+environment.
 
-CHAOS names a file, as JSON `kind, operation, at, under, counter`: of the operations ("read" or "write") on files below
-the folder `under`, counted over all processes in files beside `counter`, the one with number `at` meets the fault `kind`.
-Where no such file is, nothing happens.
+CHAOS names a file, as JSON `kind, operation, at, under, counter`: of the operations ("read" or
+"write") on files below the folder `under`, counted over all processes in files beside `counter`,
+the one with number `at` meets the fault `kind`. Where no such file is, nothing happens.
 """
 
 import errno
@@ -108,10 +109,10 @@ def spoil(storage: Any) -> None:
 
 
 class Finder(importlib.abc.MetaPathFinder):
-    """Finds pipeline.storage as it is, and spoils it when it has been loaded."""
+    """Finds pipeline.core.storage as it is, and spoils it when it has been loaded."""
 
     def find_spec(self, name: str, path: object = None, target: object = None) -> Any:
-        if name != "pipeline.storage":
+        if name != "pipeline.core.storage":
             return None
         sys.meta_path.remove(self)
         spec: Any = importlib.util.find_spec(name)

@@ -1,0 +1,90 @@
+"""Photos on any storage -> their embeddings, alone or as one query for all photos of a place."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+
+from jobs.encoding.photo_encoder import PhotoEncoder
+from pipeline.core import storage
+from pipeline.core.prefetch import ahead
+from pipeline.core.progress import progress
+from pipeline.core.records import Rejection
+from pipeline.features.table import Floats
+from pipeline.locate.photo_files import folder_of, taken_at
+
+BATCH = 128
+"Photos that are held and encoded at a time."
+READERS = 4
+"Files that are read at once: enough for a network's waiting."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Query:
+    """What is asked of the index: one photo, or several of one place."""
+
+    name: str
+    "The photo's path; the folder's, of several."
+    photos: tuple[str, ...]
+    embedding_D: Floats | None
+    "None where no photo of it could be decoded."
+    rejected: tuple[Rejection, ...]
+    taken_at: str | None
+
+
+def read_photos(photos: Sequence[str], encoder: PhotoEncoder) -> list[Query]:
+    """One query per photo, in order."""
+    queries: list[Query] = []
+    with progress(len(photos), "photos", "photos") as meter:
+        for begin in range(0, len(photos), BATCH):
+            names = photos[begin : begin + BATCH]
+            read = list(ahead(_read, names, READERS, 2 * READERS))
+            held = [b"" if isinstance(data, Rejection) else data for data in read]
+            embeddings_QD, refusals = encoder.encode(held, names)
+            rejected = [
+                one if isinstance(one, Rejection) else two
+                for one, two in zip(read, refusals, strict=True)
+            ]
+            rows = iter(embeddings_QD)
+            queries += [
+                Query(
+                    name=name,
+                    photos=(name,),
+                    embedding_D=None if refused else next(rows),
+                    rejected=(refused,) if refused else (),
+                    taken_at=None if refused else taken_at(data),
+                )
+                for name, data, refused in zip(names, held, rejected, strict=True)
+            ]
+            meter.advance(len(names))
+    return queries
+
+
+def _read(photo: str) -> bytes | Rejection:
+    try:
+        return storage.read_bytes(photo)
+    except OSError as error:
+        return Rejection(path=photo, reason="unreadable file", found=str(error))
+
+
+def together(queries: Sequence[Query]) -> list[Query]:
+    """One query per folder: the mean of its photos' embeddings at unit length, as the paper's
+    multi-query.
+    """
+    ordered = sorted(queries, key=lambda query: folder_of(query.name))
+    return [
+        _merged(folder, list(group))
+        for folder, group in groupby(ordered, key=lambda query: folder_of(query.name))
+    ]
+
+
+def _merged(folder: str, group: Sequence[Query]) -> Query:
+    rows = [query.embedding_D for query in group if query.embedding_D is not None]
+    total_D = np.sum(rows, axis=0) if rows else None
+    return Query(
+        name=folder, photos=tuple(query.name for query in group),
+        embedding_D=None if total_D is None else total_D / np.linalg.norm(total_D),
+        rejected=tuple(refused for query in group for refused in query.rejected),
+        taken_at=next((query.taken_at for query in group if query.taken_at), None),
+    )  # fmt: skip

@@ -1,0 +1,81 @@
+"""Sums of what an epoch's steps measure: kept on the device, looked at when somebody asks, held in
+a checkpoint.
+
+In: measures of steps. Out: their means. Looking waits for the device, so a step never does.
+"""
+
+import math
+import time
+from collections.abc import Iterable, Mapping
+
+import torch
+from torch import Tensor
+
+SECONDS, DAMAGED = "seconds", "damaged_images"
+
+
+class NotFinite(ArithmeticError):
+    """A measure that is infinite or not a number. The message says which and its value."""
+
+
+class Tally:
+    """What the steps of one epoch add up to. `running` and `steps` go on with those of a
+    checkpoint.
+    """
+
+    def __init__(self, steps: int = 0, running: Mapping[str, Tensor] | None = None) -> None:
+        held = dict(running or {})
+        self.steps = steps
+        "That were added."
+        self.damaged = int(held.pop(DAMAGED, 0))
+        "Images that could not be decoded, of those that this worker drew."
+        self._before = float(held.pop(SECONDS, 0.0))
+        self._began = time.monotonic()
+        self._names = list(held)
+        self._sums: Tensor | None = torch.stack(list(held.values())) if held else None
+
+    @property
+    def seconds(self) -> float:
+        """Spent on the epoch, those before a kill included."""
+        return self._before + time.monotonic() - self._began
+
+    def add(self, measures: Mapping[str, Tensor]) -> None:
+        """Add one step's scalars, on whatever device they are. In float64: an epoch may have many
+        steps.
+        """
+        values = torch.stack(list(measures.values())).double()
+        self._names = list(measures)
+        self._sums = values if self._sums is None else self._sums.to(values.device) + values
+        self.steps += 1
+
+    def means(self) -> dict[str, float]:
+        """Mean of each measure over the steps so far.
+
+        Raises NotFinite: a sum that was once infinite or no number stays so, hence nothing is
+        missed between two looks.
+        """
+        sums = [] if self._sums is None else self._sums.tolist()
+        means = {name: total / self.steps for name, total in zip(self._names, sums, strict=True)}
+        wrong = worst(means.items())
+        if wrong is not None:
+            raise NotFinite(f"{wrong} is {means[wrong]}")
+        return means
+
+    def running(self) -> dict[str, Tensor]:
+        """The sums as a checkpoint holds them."""
+        if self._sums is None:
+            return {}
+        # Copies: saved as views, each scalar would carry the whole vector along.
+        sums = {
+            name: total.clone()
+            for name, total in zip(self._names, self._sums.cpu().unbind(), strict=True)
+        }
+        return sums | {
+            SECONDS: torch.tensor(self.seconds, dtype=torch.float64),
+            DAMAGED: torch.tensor(self.damaged, dtype=torch.int64),
+        }
+
+
+def worst(means: Iterable[tuple[str, float]]) -> str | None:
+    """The first measure that is not finite."""
+    return next((name for name, mean in means if not math.isfinite(mean)), None)

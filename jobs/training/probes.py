@@ -1,0 +1,142 @@
+"""What training does to places that it looks at from outside: the gap between the views, and
+retrieval of held-out places.
+
+In: an encoder and the training stream. Out: figures for the epoch's row. Never the test set: a run
+that was chosen by it would report how well it was chosen. Nothing here changes what training does
+next.
+
+Shapes: N images, B of a batch, C channels of the maps, E of an embedding.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+import torch
+
+from model.inference.embed import unit_embedding
+from model.pvda import FeatureEncoder
+from pipeline.batches.ordered import Opened, decoded, sound, stack
+from pipeline.batches.training import TrainingStream
+from pipeline.core.errors import InputError
+from pipeline.core.records import Split, View
+from pipeline.features.table import Floats
+from pipeline.retrieval.metrics import summarise
+from pipeline.retrieval.ranking import Side, rank, side_of_array
+from pipeline.shards.samples import read_shard
+
+GAP_IMAGES = 256
+"Of each view, for the view gap; half of them fit the probe, the other half is asked."
+BATCH = 32
+RIDGE = 0.1
+"Of the linear probe, on standardised features, as a share of an image's squared length."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seen:
+    """What the encoder makes of some images of one view."""
+
+    locations: list[str]
+    pooled_NC: Floats
+    "The maps averaged over their cells: what the discriminator's task is about."
+    embedding_NE: Floats
+
+
+def look(encoder: FeatureEncoder, stream: TrainingStream) -> dict[str, float]:
+    """The view gap and, where locations are held out, how well these are found in either direction.
+
+    The held-out locations' images are all looked at; without any, the first training images, in the
+    shards' order. What cannot be decoded is left out; where that leaves no image of a view, an
+    InputError is raised.
+    """
+    drone, satellite = (see(encoder, stream, view) for view in (View.DRONE, View.SATELLITE))
+    found = view_gap(drone.pooled_NC, satellite.pooled_NC)
+    if stream.held_out:
+        for name, queries, gallery in (
+            ("drone_to_satellite", drone, satellite),
+            ("satellite_to_drone", satellite, drone),
+        ):
+            ranking = rank(side(queries), side(gallery), top=1)
+            scores = summarise(ranking.first_rank_Q, ranking.ap_Q, len(gallery.locations))
+            found |= {f"held_out/{name}/r1": scores.r1, f"held_out/{name}/ap": scores.ap}
+    return found
+
+
+def see(encoder: FeatureEncoder, stream: TrainingStream, view: View) -> Seen:
+    """The images of one view through the encoder as it is, in evaluation mode for that long."""
+    device = next(encoder.parameters()).device
+    was_training, locations, pooled, embeddings = encoder.training, [], [], []
+    images = pictures(stream, view)
+    encoder.eval()
+    with torch.no_grad():
+        while group := list(islice(images, BATCH)):
+            whole, _ = sound(group)
+            if not whole:
+                continue
+            maps_BCHW, g_BPD = encoder(
+                torch.from_numpy(stack([image for _, image in whole])).to(device)
+            )
+            locations += [sample.facts["location"] for sample, _ in whole]
+            pooled.append(maps_BCHW.mean((2, 3)).float().cpu().numpy())
+            embeddings.append(unit_embedding(g_BPD.float()).cpu().numpy())
+    encoder.train(was_training)
+    if not locations:
+        raise InputError(
+            f"not one {view} image of {stream.shards} that the probes look at can be decoded, expected some; pack again"
+        )
+    return Seen(
+        locations=locations,
+        pooled_NC=np.concatenate(pooled),
+        embedding_NE=np.concatenate(embeddings),
+    )
+
+
+def pictures(stream: TrainingStream, view: View) -> Iterator[Opened]:
+    """The images that are looked at, as they are when tested: resized and nothing else."""
+    reading, held_out = stream.reading, stream.held_out
+    samples = (
+        s
+        for shard in stream.manifest.of(Split.TRAIN, view)
+        for s in read_shard(stream.shards, shard.name)
+    )
+    chosen = (
+        (s for s in samples if s.facts["location"] in held_out)
+        if held_out
+        else islice(samples, GAP_IMAGES)
+    )
+    return decoded(chosen, reading.image_size, reading.threads, 2 * BATCH, reading.resizer)
+
+
+def side(seen: Seen) -> Side:
+    keys = np.arange(len(seen.locations)).astype(np.str_)
+    return side_of_array(keys, np.array(seen.locations, np.str_), seen.embedding_NE)
+
+
+def view_gap(drone_NC: Floats, satellite_NC: Floats) -> dict[str, float]:
+    """How far apart the views are in the pooled maps.
+
+    `accuracy`: of a linear probe that was fitted on half of the images (ridge regression on the views), on the other half;
+    0.5 where nothing tells the views apart. `distance`: between the views' means, in units of the images' root mean square
+    distance from their own view's mean.
+    """
+    count = min(len(drone_NC), len(satellite_NC), GAP_IMAGES)
+    both_NC = np.concatenate([drone_NC[:count], satellite_NC[:count]]).astype(np.float64)
+    view_N = np.repeat([-1.0, 1.0], count)
+    means = [both_NC[view_N == sign].mean(0) for sign in (-1, 1)]
+    spread = np.sqrt(
+        np.mean(
+            [((both_NC[view_N == s] - m) ** 2).sum(1) for s, m in zip((-1, 1), means, strict=True)]
+        )
+    )
+    fitted_N = np.tile(np.arange(count) % 2 == 0, 2)
+    scale_C = both_NC[fitted_N].std(0)
+    standard_NC = (both_NC - both_NC[fitted_N].mean(0)) / np.where(scale_C > 0, scale_C, 1.0)
+    fit_NC, asked_NC = standard_NC[fitted_N], standard_NC[~fitted_N]
+    kernel_NN = fit_NC @ fit_NC.T / fit_NC.shape[1] + RIDGE * np.eye(len(fit_NC))
+    weight_C = fit_NC.T @ np.linalg.solve(kernel_NN, view_N[fitted_N])
+    right_N = np.sign(asked_NC @ weight_C) == view_N[~fitted_N]
+    return {
+        "view_gap/accuracy": float(right_N.mean()),
+        "view_gap/distance": float(np.linalg.norm(means[1] - means[0]) / max(spread, 1e-12)),
+    }

@@ -1,0 +1,144 @@
+"""Named configurations as functions that return the whole of it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from model.pvda import PVDAConfig
+from model.schedule import Schedule
+from model.training import Optimisation, Precision
+from pipeline.core.errors import InputError
+from pipeline.images.transforms import Augmentation, Resizer
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """All that decides what training computes, besides the data and the number of workers."""
+
+    name: str = "paper"
+    "Under which it is known."
+    network: PVDAConfig = field(default_factory=PVDAConfig)
+    optimisation: Optimisation = field(default_factory=Optimisation)
+    schedule: Schedule = field(default_factory=Schedule)
+    augmentation: Augmentation = field(default_factory=Augmentation)
+    resizer: Resizer = "torch"
+    """Whose bicubic resizes the images: torch's, or pillow's, which is faster on CPUs without AVX2
+    [chosen]."""
+    adversary: bool = True
+    "Whether there is a view discriminator; without it PVDA is LPN."
+    batch_size: int = 8
+    "Images of each view per step and worker [LPN lineage: 8]."
+    seed: int = 0
+    "Of the weights, the data's order and the augmentation."
+    precision: Precision = "auto"
+    """Of the networks' products: float32, bfloat16 by autocast, or auto: bfloat16 on CUDA, float32
+    on a CPU [chosen]."""
+    sync_bn: bool = False
+    """Whether BatchNorm's statistics are those of all workers' images; GPUs only [chosen: each
+    worker's own]."""
+    joint_bn: bool = False
+    """Whether the encoder sees both views in one batch, so that BatchNorm's statistics are common
+    to them [LPN: a view's own; where the views' sensors differ much, those leave the network
+    untested in training as it will be used]."""
+    hold_out: float = 0.0
+    """Share of the training locations that is not trained on but looked at every `probe_epochs`
+    [chosen: none]."""
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 2:
+            raise InputError(
+                f"batch_size is {self.batch_size}, expected at least 2: BatchNorm needs two images of a view"
+            )
+        if not 0 <= self.hold_out < 1:
+            raise InputError(
+                f"hold_out is {self.hold_out}, expected a share of the locations, from 0 to below 1"
+            )
+
+
+def paper() -> Recipe:
+    """PVDA at 256 px, as published."""
+    return Recipe()
+
+
+def paper_384() -> Recipe:
+    """PVDA at 384 px, as published: nothing else changes [paper]."""
+    return Recipe(name="paper_384", network=PVDAConfig(image_size=384))
+
+
+def lpn() -> Recipe:
+    """LPN at 256 px: no discriminator, its own 120 epochs with rates to a tenth after 80 [LPN].
+
+    The views are PVDA's two; LPN's own runs on University-1652 add street-view images through a
+    second backbone.
+    """
+    return Recipe(
+        name="lpn",
+        optimisation=Optimisation(backbone_rate=0.001, head_rate=0.01, classifier_rate=0.01),
+        schedule=Schedule(
+            epochs=120,
+            alpha=0.0,
+            alpha_step=0.0,
+            period=120,
+            decay=0.1,
+            decay_epochs=(80,),
+            restart=False,
+        ),
+        adversary=False,
+    )
+
+
+def constant_alpha() -> Recipe:
+    """Ablation: alpha stays 0.9, the rates restart as in `paper` [paper]."""
+    return Recipe(name="constant_alpha", schedule=Schedule(alpha_step=0.0))
+
+
+def no_restart() -> Recipe:
+    """Ablation: alpha grows as in `paper`, the rates only fall, by 0.8 after epochs 140, 280 and
+    420 [paper].
+    """
+    return Recipe(name="no_restart", schedule=Schedule(restart=False, decay_epochs=(140, 280, 420)))
+
+
+def alpha_zero() -> Recipe:
+    """Control: `paper` with alpha = 0, so D learns but nothing makes the encoder deceive it
+    [chosen].
+    """
+    return Recipe(name="alpha_zero", schedule=Schedule(alpha=0.0, alpha_step=0.0))
+
+
+def smoke(epochs: int = 80) -> Recipe:
+    """Minutes on two cores, from scratch: a thin ResNet-18 with AdamW, one cosine and a gentle
+    adversary.
+
+    The paper's rates suppose ImageNet weights and days of training; from scratch they learn nothing
+    in minutes. It stays the two-step method on the same code.
+    """
+    return Recipe(
+        name="smoke",
+        network=PVDAConfig(
+            depth=18,
+            width=0.25,
+            image_size=64,
+            parts=2,
+            part_dim=128,
+            dropout=0.0,
+            discriminator_channels=64,
+        ),
+        optimisation=Optimisation(
+            kind="adamw",
+            backbone_rate=3e-3,
+            head_rate=3e-3,
+            classifier_rate=3e-3,
+            discriminator_rate=1e-3,
+        ),
+        schedule=Schedule(
+            epochs=epochs, shape="cosine", warmup_epochs=4, alpha=0.1, alpha_step=0.0
+        ),
+        augmentation=Augmentation(pad=4, rotation=180),
+        batch_size=16,
+    )
+
+
+RECIPES: dict[str, Callable[[], Recipe]] = {
+    recipe.__name__: recipe
+    for recipe in (paper, paper_384, lpn, constant_alpha, no_restart, alpha_zero, smoke)
+}

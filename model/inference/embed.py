@@ -1,0 +1,134 @@
+"""The encoder as embedding uses it: bytes of images in, unit vectors out.
+
+`embed` is the reference; a FastEncoder computes the same faster, and is made and checked in `model/inference/optimise.py`.
+Shapes: B images, P rings, D numbers per ring, E = P * D numbers of an embedding.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from model.pvda import FeatureEncoder
+
+InEffect = Literal["float32", "bfloat16", "int8"]
+Precision = Literal["auto"] | InEffect
+Kind = Literal["plain", "folded", "compiled"]
+
+
+def unit_embedding(g_BPD: Tensor) -> Tensor:
+    """Each ring's vector to length 1, divided by sqrt(P), concatenated: (B, P * D) of length 1
+    [LPN].
+    """
+    parts = g_BPD.shape[1]
+    unit_BPD: Tensor = F.normalize(g_BPD, dim=2) / parts**0.5
+    return unit_BPD.flatten(1)
+
+
+@torch.inference_mode()
+def embed(encoder: FeatureEncoder, images_B3HW: Tensor, mirror: bool = True) -> Tensor:
+    """Unit embeddings (B, P * D), float32, of images given as bytes (B, 3, H, W).
+
+    With `mirror` the embeddings of an image and its mirror image are summed before they are
+    normalised [LPN].
+    """
+    g_BPD: Tensor = encoder(images_B3HW)[1]
+    if mirror:
+        g_BPD = g_BPD + encoder(images_B3HW.flip(3))[1]
+    return unit_embedding(g_BPD.float())
+
+
+def effective_precision(precision: Precision, device: str) -> InEffect:
+    """`auto` is bfloat16 on CUDA and float32 elsewhere; a function of the kind of device, so that
+    all workers agree.
+    """
+    if precision == "auto":
+        return "bfloat16" if device == "cuda" else "float32"
+    return precision
+
+
+def with_precision(preprocessing: str, precision: InEffect, calibration: str | None = None) -> str:
+    """What a model's fingerprint says of preprocessing, and of the precision where it changes the
+    embeddings.
+
+    float32 adds nothing: plain, folded and compiled embeddings are the same up to rounding, and may
+    share a table. For int8 `calibration` names the images it was calibrated by
+    (`calibration_digest`); ValueError without.
+    """
+    if precision == "int8":
+        if not calibration:
+            raise ValueError(
+                "int8 without its calibration; expected the digest of the images; see calibration_digest"
+            )
+        return f"{preprocessing}, int8 calibrated by {calibration}"
+    return preprocessing if precision == "float32" else f"{preprocessing}, {precision}"
+
+
+class OneBatch(nn.Module):
+    """Images as bytes -> unit embeddings in one pass: the mirror images are the second half of the
+    batch.
+    """
+
+    def __init__(self, encoder: FeatureEncoder, mirror: bool, in_bfloat16: bool = False) -> None:
+        super().__init__()
+        self.encoder, self.mirror, self.in_bfloat16 = encoder, mirror, in_bfloat16
+
+    def forward(self, images_B3HW: Tensor) -> Tensor:
+        """Bytes (B, 3, H, W) -> (B, E), float32, of length 1."""
+        both_B3HW = torch.cat([images_B3HW, images_B3HW.flip(3)]) if self.mirror else images_B3HW
+        with torch.autocast(images_B3HW.device.type, torch.bfloat16, enabled=self.in_bfloat16):
+            g_BPD: Tensor = self.encoder(both_B3HW)[1]
+        g_BPD = g_BPD.float()
+        if self.mirror:
+            count = len(images_B3HW)
+            g_BPD = g_BPD[:count] + g_BPD[count:]
+        return unit_embedding(g_BPD)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FastEncoder:
+    """Images as bytes (B, 3, H, W), any B -> unit embeddings (B, E), float32, on the encoder's
+    device.
+    """
+
+    kind: Kind
+    "How it computes."
+    precision: InEffect
+    "What it computes in; part of the fingerprint."
+    agreement: float = 1.0
+    "The least cosine between its embedding and the plain encoder's, over the probe images."
+    mean_agreement: float = 1.0
+    "The mean of these."
+    batch_size: int
+    "Images of a pass; a mirror image counts with its image."
+    device: torch.device
+    "Where it computes."
+    run: Callable[[Tensor], Tensor]
+    "What embeds a batch."
+
+    def __call__(self, images_B3HW: Tensor) -> Tensor:
+        # Not in inference mode, whatever the caller is in: the compiler takes it for another input
+        # and starts anew.
+        with torch.inference_mode(False), torch.no_grad():
+            return torch.cat(
+                [self._one(part_B3HW) for part_B3HW in torch.split(images_B3HW, self.batch_size)]
+            )
+
+    def _one(self, images_B3HW: Tensor) -> Tensor:
+        """A batch in memory of its own, whose strides are always the same; filled up with black for
+        the compiled encoder.
+        """
+        count, rows = (
+            len(images_B3HW),
+            self.batch_size if self.kind == "compiled" else len(images_B3HW),
+        )
+        shape = (rows, *images_B3HW.shape[1:])
+        batch_B3HW = torch.empty(
+            shape, dtype=torch.uint8, device=self.device, memory_format=torch.channels_last
+        )
+        batch_B3HW[:count] = images_B3HW
+        batch_B3HW[count:] = 0
+        return self.run(batch_B3HW)[:count]

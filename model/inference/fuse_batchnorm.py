@@ -1,0 +1,61 @@
+"""A trained encoder without its BatchNorms: in evaluation each is a scale and a shift, which the
+layer before it takes in.
+
+In: an encoder in evaluation mode. Out: a copy that computes the same with fewer passes over memory.
+"""
+
+import copy
+from itertools import pairwise
+
+from torch import nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
+
+from model.pvda import FeatureEncoder
+
+
+def fold(encoder: FeatureEncoder) -> FeatureEncoder:
+    """A copy of `encoder` whose BatchNorms are folded into convolutions and linear layers, without
+    gradients.
+
+    Its embeddings differ from the encoder's by float32's rounding only. `encoder` itself stays as
+    it is.
+
+    Raises ValueError when the encoder is in training mode, or when a BatchNorm stands after no
+    layer that could take it in.
+    """
+    if any(
+        isinstance(module, nn.modules.batchnorm._BatchNorm) and module.training
+        for module in encoder.modules()
+    ):
+        raise ValueError(
+            "the encoder is in training mode, where BatchNorm depends on the batch; expected evaluation mode; call eval()"
+        )
+    folded = copy.deepcopy(encoder).requires_grad_(False)
+    for parent in list(folded.modules()):
+        _fold_children(parent)
+    left = [
+        name
+        for name, module in folded.named_modules()
+        if isinstance(module, nn.modules.batchnorm._BatchNorm)
+    ]
+    if left:
+        raise ValueError(
+            f"{', '.join(left)} cannot be folded; expected each BatchNorm straight after its convolution or linear layer; "
+            "register the two in this order"
+        )
+    return folded
+
+
+def _fold_children(parent: nn.Module) -> None:
+    """Fold each BatchNorm into the child registered just before it: in our networks that is the
+    layer it normalises.
+    """
+    children = list(parent.named_children())
+    for (name, layer), (norm_name, norm) in pairwise(children):
+        if isinstance(layer, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
+            setattr(parent, name, fuse_conv_bn_eval(layer, norm))
+        elif isinstance(layer, nn.Linear) and isinstance(norm, nn.BatchNorm1d):
+            setattr(parent, name, fuse_linear_bn_eval(layer, norm))
+        else:
+            continue
+        setattr(parent, norm_name, nn.Identity())

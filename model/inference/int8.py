@@ -1,0 +1,118 @@
+"""The backbone in 8-bit integers, for CPUs that multiply them fast: torchao's post-training
+quantisation for x86.
+
+In: a folded encoder and images to calibrate by. Out: the same encoder with a quantised backbone, to
+be compiled: uncompiled it computes the same slower than float32. Rings and refinement stay in
+float32: they are a thousandth of the products.
+"""
+
+import hashlib
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
+
+import torch
+from torch import Tensor
+
+from model.inference.compile import quiet
+from model.pvda import FeatureEncoder
+
+STEPS = "torchao.quantization.pt2e.quantize_pt2e"
+QUANTIZER = "torchao.quantization.pt2e.quantizer.x86_inductor_quantizer"
+"Imported when they are needed: torchao is optional, and its import takes seconds."
+CALIBRATION_BATCH = 8
+"Images at a time, whatever the batch size of embedding: the ranges must not depend on it."
+INSTRUCTIONS = ("avx512_vnni", "avx_vnni", "amx_int8")
+"Any one of these multiplies 8-bit integers, as torch names them."
+
+
+class PrecisionError(ValueError):
+    """A precision that cannot be had here. The message says what was found, what was expected and
+    what to do.
+    """
+
+
+def require_int8(device: str) -> None:
+    """Raises PrecisionError where int8 would not be faster than float32, or torchao is not
+    installed.
+    """
+    has = torch.cpu.get_capabilities()
+    if device != "cpu":
+        raise PrecisionError(
+            f"int8 is for CPUs and the device is {device}; choose --precision bfloat16"
+        )
+    if not any(has.get(name) for name in INSTRUCTIONS):
+        raise PrecisionError(
+            f"this CPU ({has.get('architecture', 'unknown')}) has no {', '.join(INSTRUCTIONS)}, so int8 would be slower than "
+            "float32; choose --precision float32"
+        )
+    try:
+        with _quiet_torchao():
+            import_module(QUANTIZER)
+    except ImportError as error:
+        raise PrecisionError(
+            f"int8 needs torchao, which cannot be imported here ({error}); pip install 'pvda[int8]', or choose "
+            "--precision float32"
+        ) from error
+
+
+def quantise(encoder: FeatureEncoder, size: int, calibrate: Callable[[], None]) -> None:
+    """Put a quantised backbone into a folded `encoder`, for images of `size` x `size` pixels.
+
+    `calibrate` runs images through the encoder while the ranges of its activations are watched: per tensor, 8 bits
+    unsigned, from histograms. Weights have a range per output channel, signed. It runs on one thread: sums in another
+    order give other ranges in their last digit, and workers would round differently.
+    """
+    threads = torch.get_num_threads()
+    with _quiet_torchao(), torch.no_grad():
+        pt2e, x86 = import_module(STEPS), import_module(QUANTIZER)
+        example_B3HW = torch.zeros(CALIBRATION_BATCH, 3, size, size).to(
+            memory_format=torch.channels_last
+        )
+        quantizer = x86.X86InductorQuantizer().set_global(
+            x86.get_default_x86_inductor_quantization_config()
+        )
+        any_batch = ({0: torch.export.Dim.AUTO},)
+        exported = torch.export.export(
+            encoder.backbone, (example_B3HW,), dynamic_shapes=any_batch
+        ).module()
+        watched = pt2e.prepare_pt2e(exported, quantizer)
+        encoder.add_module("backbone", watched)
+        torch.set_num_threads(1)
+        try:
+            calibrate()
+        finally:
+            torch.set_num_threads(threads)
+        encoder.add_module("backbone", pt2e.convert_pt2e(watched))
+
+
+def calibration_digest(images_B3HW: Tensor) -> str:
+    """16 hexadecimal digits that name the images a backbone was calibrated by: their order and
+    their bytes (B, 3, H, W).
+    """
+    shape = str(tuple(images_B3HW.shape)).encode()
+    return hashlib.sha256(shape + images_B3HW.cpu().contiguous().numpy().tobytes()).hexdigest()[:16]
+
+
+@contextmanager
+def _quiet_torchao() -> Iterator[None]:
+    """Without what torchao 0.18 says on a machine without CUDA, and of its own future. Anything
+    else is told.
+    """
+
+    def wanted(record: logging.LogRecord) -> bool:
+        said = record.getMessage()
+        return "register_constant() on Enum" not in said and not (
+            "Failed to load" in said and "/torchao/_C_" in said
+        )
+
+    loggers = [logging.getLogger(name) for name in ("torchao", "torch.utils._pytree")]
+    for logger in loggers:
+        logger.addFilter(wanted)
+    try:
+        with quiet():
+            yield
+    finally:
+        for logger in loggers:
+            logger.removeFilter(wanted)

@@ -1,0 +1,203 @@
+"""An encoder made fast, each way of it checked against the plain one before it is used.
+
+In: an encoder in evaluation mode on its device, and a few images to check by. Out: a FastEncoder:
+BatchNorm folded away, channels last, image and mirror image in one batch, compiled where that pays;
+in bfloat16 or 8-bit integers where asked for. Shapes: B images, E numbers of an embedding.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from model.inference.compile import NotCompiled, compile_frozen
+from model.inference.embed import (
+    FastEncoder,
+    InEffect,
+    Kind,
+    OneBatch,
+    Precision,
+    effective_precision,
+    embed,
+)
+from model.inference.fuse_batchnorm import fold
+from model.inference.int8 import CALIBRATION_BATCH, PrecisionError, quantise, require_int8
+from model.pvda import FeatureEncoder
+
+LEAST_COSINE: dict[InEffect, float] = {"float32": 0.9999, "bfloat16": 0.999, "int8": 0.99}
+"""Between the fast and the plain embedding of a probe image: of the worst image, for int8 of their
+mean."""
+COMPILING_PAYS_FROM = 120.0
+"""Seconds that the folded encoder would need for all images. Compiling ResNet-50 for 256 px took 13
+to 25 s on two busy cores and saved a quarter of each image's time, so from two minutes on it has
+paid; slower machines compile slower, too."""
+Say = Callable[[str], None]
+
+
+def make_fast(
+    encoder: FeatureEncoder,
+    *,
+    probe_B3HW: Tensor,
+    batch_size: int,
+    precision: Precision = "auto",
+    mirror: bool = True,
+    compiled: bool | Literal["auto"] = "auto",
+    images: int | None = None,
+    calibration_B3HW: Tensor | None = None,
+    say: Say = print,
+) -> FastEncoder:
+    """The fastest encoder that computes what `embed` does with `encoder`, which is in evaluation
+    mode on its device.
+
+    It is checked on `probe_B3HW`, a few images as bytes: where it disagrees (LEAST_COSINE) `say` is
+    told, and a plainer one of the same precision is used. `images` is how many will be embedded:
+    with `compiled="auto"` the encoder is compiled where that pays, and unknown numbers count as
+    small. Set torch's threads before: it is compiled for their number. int8 is calibrated by
+    `calibration_B3HW`, 64 images or more, none of which should be a probe.
+
+    Raises PrecisionError where `precision` cannot be had or agrees too little. What is in effect
+    must be what the fingerprint says, so nothing falls back to float32 here.
+    """
+    device = encoder.mean_31.device
+    wanted = effective_precision(precision, device.type)
+    if wanted == "int8":
+        require_int8(device.type)
+    check = _Check(
+        probe_B3HW=probe_B3HW,
+        expected_BE=torch.cat(
+            [
+                embed(encoder, part.to(device), mirror)
+                for part in torch.split(probe_B3HW, batch_size)
+            ]
+        ),
+        precision=wanted,
+        batch_size=batch_size,
+        device=device,
+    )
+    module = OneBatch(fold(encoder), mirror, wanted == "bfloat16")
+    module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    if wanted == "int8":
+        return _int8(module, check, calibration_B3HW, say)
+    fast = check.measured("folded", module)
+    if not fast.agreement >= LEAST_COSINE[wanted]:  # NaN agrees with nothing
+        say(
+            f"the folded encoder disagrees with the plain one ({check.told(fast)}); the plain one is used"
+        )
+        fast = check.measured("plain", partial(_embed, encoder, mirror, wanted == "bfloat16"))
+        if wanted != "float32" and not fast.agreement >= LEAST_COSINE[wanted]:
+            raise PrecisionError(
+                f"{wanted} embeddings agree with the float32 ones by a cosine of {fast.agreement:.4f}, expected at least "
+                f"{LEAST_COSINE[wanted]}; choose --precision float32"
+            )
+    elif compiled is True or (
+        compiled == "auto" and images is not None and _is_long(fast, probe_B3HW, images)
+    ):
+        fast = _compiled(module, check, fast, say)
+    say(f"{fast.kind} encoder in {wanted}: {check.told(fast)}")
+    return fast
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Check:
+    """What a candidate is measured by."""
+
+    probe_B3HW: Tensor
+    expected_BE: Tensor
+    "The plain encoder's embeddings of these, in float32."
+    precision: InEffect
+    batch_size: int
+    device: torch.device
+
+    def measured(self, kind: Kind, run: Callable[[Tensor], Tensor]) -> FastEncoder:
+        """The candidate, with its agreement."""
+        fast = FastEncoder(
+            kind=kind,
+            precision=self.precision,
+            batch_size=self.batch_size,
+            device=self.device,
+            run=run,
+        )
+        cosine_B = (fast(self.probe_B3HW).double() * self.expected_BE.double()).sum(1)
+        return replace(fast, agreement=float(cosine_B.min()), mean_agreement=float(cosine_B.mean()))
+
+    def told(self, fast: FastEncoder) -> str:
+        count = len(self.probe_B3HW)
+        mean, worst = f"{fast.mean_agreement:.6f} in the mean", f"{fast.agreement:.6f} at worst"
+        return f"cosine with the plain one {mean}, {worst}, over {count} images"
+
+    def batch(self) -> Tensor:
+        """A black batch, to compile for."""
+        shape = (self.batch_size, *self.probe_B3HW.shape[1:])
+        black_B3HW = torch.zeros(shape, dtype=torch.uint8, device=self.device)
+        return black_B3HW.to(memory_format=torch.channels_last)
+
+
+def _compiled(module: OneBatch, check: _Check, folded: FastEncoder, say: Say) -> FastEncoder:
+    """`module` compiled, or `folded`, which it is, with the reason told."""
+    say(
+        f"compiling the encoder for batches of {check.batch_size}: this takes a while, less where it was done before"
+    )
+    start = time.perf_counter()
+    try:
+        fast = check.measured("compiled", compile_frozen(module, check.batch()))
+    except NotCompiled as error:
+        say(f"the encoder cannot be compiled here ({error}); it goes on uncompiled")
+        return folded
+    say(f"compiled in {time.perf_counter() - start:.0f} s")
+    if not fast.agreement >= LEAST_COSINE[check.precision]:
+        say(
+            f"the compiled encoder disagrees with the plain one ({check.told(fast)}); it goes on uncompiled"
+        )
+        return folded
+    return fast
+
+
+def _int8(
+    module: OneBatch, check: _Check, calibration_B3HW: Tensor | None, say: Say
+) -> FastEncoder:
+    """`module` quantised and compiled. Raises PrecisionError."""
+    if calibration_B3HW is None or not len(calibration_B3HW):
+        raise PrecisionError(
+            "int8 without images to calibrate by; expected 64 or more of the gallery; give some"
+        )
+    say(
+        f"calibrating int8 on {len(calibration_B3HW)} images and compiling it: this takes a minute or two"
+    )
+    start = time.perf_counter()
+
+    def calibrate() -> None:
+        for batch_B3HW in torch.split(calibration_B3HW, CALIBRATION_BATCH):
+            module(batch_B3HW)
+
+    quantise(module.encoder, check.probe_B3HW.shape[2], calibrate)
+    try:
+        fast = check.measured("compiled", compile_frozen(module, check.batch()))
+    except NotCompiled as error:
+        raise PrecisionError(
+            f"int8 needs a compiler and torch.compile failed ({error}); install g++, or choose --precision float32"
+        ) from error
+    say(f"int8 encoder, made in {time.perf_counter() - start:.0f} s: {check.told(fast)}")
+    if not fast.mean_agreement >= LEAST_COSINE["int8"]:
+        raise PrecisionError(
+            f"int8 embeddings agree with the float32 ones by a mean cosine of {fast.mean_agreement:.4f}, expected at least "
+            f"{LEAST_COSINE['int8']}; calibrate by more images that are like the gallery's, or choose --precision float32"
+        )
+    return fast
+
+
+def _is_long(fast: FastEncoder, probe_B3HW: Tensor, images: int) -> bool:
+    """Whether `images` of them would take `fast` long enough for compiling to pay. The probe has
+    warmed it up.
+    """
+    start = time.perf_counter()
+    fast(probe_B3HW).cpu()  # waits for the device
+    return (time.perf_counter() - start) / len(probe_B3HW) * images >= COMPILING_PAYS_FROM
+
+
+def _embed(encoder: FeatureEncoder, mirror: bool, bfloat16: bool, images_B3HW: Tensor) -> Tensor:
+    with torch.autocast(images_B3HW.device.type, torch.bfloat16, enabled=bfloat16):
+        return embed(encoder, images_B3HW, mirror)

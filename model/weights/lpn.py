@@ -1,0 +1,142 @@
+"""LPN's weights -> ours: the state dict of a `three_view_net` of the public LPN code
+(github.com/wtyhub/LPN, model.py).
+
+LPN keeps a backbone per view: `model_1` sees satellite images, `model_2` street and web images,
+`model_3` the UAV's. With its option --share the third is the first. Its classifiers hold our
+refinement (`add_block`) and our location classifier. Shapes: P rings, C channels of the maps, D
+numbers per ring, L locations.
+"""
+
+import re
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from model.checkpoint import CheckpointError
+from model.pvda import PVDAConfig
+from model.training import Learner
+from model.weights.load import load_by_name, measure_backbone
+
+OURS_TO_LPN = {
+    r"encoder\.backbone\.": "model_1.model.",
+    # Linear and BatchNorm. LPN's add_block.2 is dropout and holds nothing. Its rings stand centre
+    # first, as ours do.
+    r"encoder\.refine\.(\d+)\.([01])\.": r"classifier\1.add_block.\2.",
+    r"classifier\.branches\.(\d+)\.": r"classifier\1.classifier.0.",
+}
+"Beginnings of a Learner's names -> LPN's."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Converted:
+    """LPN's network as ours."""
+
+    network: PVDAConfig
+    modules: dict[str, dict[str, Tensor]]
+    "State dicts of encoder and classifier, as a checkpoint holds them."
+    locations: int
+    """L, the classifier's outputs. Their names are not in LPN's file: they are the training
+    folders', sorted."""
+    left_out: str | None
+    "LPN's backbone of a view that we do not have, where it is another than the one that is taken."
+
+
+def convert_lpn(state: dict[str, Tensor], name: str, image_size: int = 256) -> Converted:
+    """Encoder and classifier that embed and classify as LPN's do, its rings averaged over their
+    boxes.
+
+    `image_size`, in pixels, is not in the file; LPN's opts.yaml says it. Nor are its stride and its pooling: 1 and avg are
+    taken for granted, as LPN's run on University-1652 has them.
+
+    Raises CheckpointError that lists what is missing or unexpected, or where UAV and satellite
+    images have backbones of their own; ValueError where the image size is none that PVDAConfig
+    allows.
+    """
+    numbers = sorted(
+        {int(found[1]) for key in state if (found := re.match(r"classifier(\d+)\.", key))}
+    )
+    if not numbers or numbers != list(range(len(numbers))):
+        raise CheckpointError(
+            f"{name} is no three_view_net of LPN: its classifiers are numbered {numbers or 'not at all'} and its names begin "
+            f"with {', '.join(list(state)[:3]) or 'nothing'}; expected classifier0, classifier1, ... and model_1.model.*"
+        )
+    depth, width = measure_backbone(backbone_of(state, "model_1"), f"{name} (model_1.model)")
+    left_out = check_views(state, name)
+    network = PVDAConfig(
+        depth=depth, width=width, image_size=image_size, parts=len(numbers),
+        part_dim=rows(state, "classifier0.add_block.0.weight", name), ring_divisor="box",
+    )  # fmt: skip
+    learner = Learner(network, locations := rows(state, "classifier0.classifier.0.weight", name))
+    given = {
+        key: tensor
+        for key, tensor in state.items()
+        if not re.match(r"model_[23]\.model\.|model_1\.model\.fc\.", key)
+    }
+    load_by_name(
+        learner, given, f"{name} does not fit a ResNet-{depth} with {len(numbers)} rings",
+        "expected a three_view_net of LPN with average pooling", lpn_name,
+    )  # fmt: skip
+    modules = {
+        "encoder": learner.encoder.state_dict(),
+        "classifier": learner.classifier.state_dict(),
+    }
+    return Converted(network=network, modules=modules, locations=locations, left_out=left_out)
+
+
+def lpn_name(ours: str) -> str:
+    """What LPN calls one of a Learner's tensors."""
+    for beginning, theirs in OURS_TO_LPN.items():
+        ours = re.sub(f"^{beginning}", theirs, ours)
+    return ours
+
+
+def backbone_of(state: dict[str, Tensor], view: str) -> dict[str, Tensor]:
+    """One view's backbone by torchvision's names, without its ImageNet classifier."""
+    start = f"{view}.model."
+    held = {
+        key.removeprefix(start): tensor for key, tensor in state.items() if key.startswith(start)
+    }
+    return {key: tensor for key, tensor in held.items() if not key.startswith("fc.")}
+
+
+def check_views(state: dict[str, Tensor], name: str) -> str | None:
+    """Which backbone is left out: the street view's, where it is one of its own.
+
+    The UAV's must be the satellite's (in a file of two views, the second the first): PVDA's encoder
+    is shared by both. Raises CheckpointError where it is not.
+    """
+    other = "model_3" if backbone_of(state, "model_3") else "model_2"
+    if differing := differences(state, other):
+        raise CheckpointError(
+            f"{name} has a backbone per view: model_1 and {other} differ in {len(differing)} tensors, {differing[0]} first; "
+            "expected one for satellite and UAV images; train LPN with --share"
+        )
+    return "model_2" if differences(state, "model_2") else None
+
+
+def differences(state: dict[str, Tensor], other: str) -> list[str]:
+    """Names of what differs between the backbones of model_1 and another view; nothing where the
+    other is not there.
+    """
+    first, second = backbone_of(state, "model_1"), backbone_of(state, other)
+    names = [*first, *(key for key in second if key not in first)] if second else []
+    return [
+        key
+        for key in names
+        if not (key in first and key in second and same(first[key], second[key]))
+    ]
+
+
+def same(one: Tensor, other: Tensor) -> bool:
+    return one.shape == other.shape and one.dtype == other.dtype and torch.equal(one, other)
+
+
+def rows(state: dict[str, Tensor], key: str, name: str) -> int:
+    """Outputs of a Linear. Raises CheckpointError where it is none."""
+    if key not in state or state[key].ndim != 2:
+        found = f"of shape {tuple(state[key].shape)}" if key in state else "missing"
+        raise CheckpointError(
+            f"{name} is no three_view_net of LPN: {key} is {found}, expected a Linear's weight"
+        )
+    return len(state[key])

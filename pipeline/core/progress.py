@@ -1,0 +1,145 @@
+"""Progress of long work: a bar on a terminal, a JSON line every few seconds elsewhere; rate and
+time left in both.
+"""
+
+import json
+import re
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+SECONDS_BETWEEN_LINES = 5.0
+
+UNSEEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+"""What a terminal would obey and not show, line ends and tabs aside; what turns the direction of
+writing round; and halves of characters, which stand for the bytes of names that are no UTF-8."""
+
+
+def visible(text: str) -> str:
+    """Text as a terminal may be given it: files may be called anything, also what clears a screen."""
+    return UNSEEN.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+class _Plain(Console):
+    """A console that shows text as it is: names are no markup and no emoji, and command nothing."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(highlight=False, markup=False, emoji=False, **kwargs)
+
+    def render_str(self, text: str, **kwargs: Any) -> Text:
+        return super().render_str(visible(text), **kwargs)
+
+
+console = _Plain(stderr=True, soft_wrap=True)
+"Where progress and remarks go. Paths stay whole for whoever copies them."
+results = _Plain()
+"Where results go: standard output."
+
+
+class Meter(Protocol):
+    """What long work tells of itself while it runs."""
+
+    def advance(self, count: float = 1, **facts: float | str) -> None:
+        """`count` more units are done; `facts` are shown beside the bar until others come."""
+
+    def note(self, text: str) -> None:
+        """One remark that stays on the screen."""
+
+
+@contextmanager
+def progress(total: float | None, label: str, unit: str = "images") -> Iterator[Meter]:
+    """Show the progress of `total` units of work (None where unknown)."""
+    if not console.is_terminal:
+        meter = _Lines(total, label, unit)
+        yield meter
+        meter.line(last=True)
+        return
+    columns = (
+        _Told("{task.description}"),
+        BarColumn(bar_width=30),
+        MofNCompleteColumn(),
+        _Told("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        _Told("{task.fields[facts]}"),
+    )
+    with Progress(*columns, console=console) as bar:
+        yield _Bar(bar, total, label, unit)
+
+
+class _Told(TextColumn):
+    """A column of text that is no markup."""
+
+    def __init__(self, form: str) -> None:
+        super().__init__(form, markup=False)
+
+    def render(self, task: Task) -> Text:
+        return Text(visible(super().render(task).plain), style="none")
+
+
+class _Bar:
+    def __init__(self, bar: Progress, total: float | None, label: str, unit: str) -> None:
+        self._bar, self._unit, self._start, self._done = bar, unit, time.monotonic(), 0.0
+        self._task = bar.add_task(label, total=total, rate="", facts="")
+
+    def advance(self, count: float = 1, **facts: float | str) -> None:
+        self._done += count
+        rate = f"{self._done / max(1e-9, time.monotonic() - self._start):.1f} {self._unit}/s"
+        self._bar.update(self._task, advance=count, rate=rate)
+        if facts:
+            shown = "  ".join(f"{name} {_short(value)}" for name, value in facts.items())
+            self._bar.update(self._task, facts=shown)
+
+    def note(self, text: str) -> None:
+        self._bar.console.print(text)
+
+
+class _Lines:
+    def __init__(self, total: float | None, label: str, unit: str) -> None:
+        self._total, self._label, self._unit = total, label, unit
+        self._start = self._said = time.monotonic()
+        self._done = 0.0
+        self._facts: dict[str, float | str] = {}
+
+    def advance(self, count: float = 1, **facts: float | str) -> None:
+        self._done += count
+        self._facts.update(facts)
+        if time.monotonic() - self._said >= SECONDS_BETWEEN_LINES:
+            self.line()
+
+    def line(self, last: bool = False) -> None:
+        self._said = time.monotonic()
+        seconds = max(1e-9, self._said - self._start)
+        rate = self._done / seconds
+        said: dict[str, object] = {
+            "step": self._label,
+            "done": self._done,
+            "total": self._total,
+            "unit": self._unit,
+        }
+        said |= {"per_second": round(rate, 2), "seconds": round(seconds, 1)}
+        if self._total is not None and rate > 0 and not last:
+            said["seconds_left"] = round((self._total - self._done) / rate, 1)
+        print(json.dumps(said | self._facts), file=sys.stderr, flush=True)
+
+    def note(self, text: str) -> None:
+        print(json.dumps({"step": self._label, "note": text}), file=sys.stderr, flush=True)
+
+
+def _short(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.3g}"

@@ -1,0 +1,163 @@
+"""The shared vocabulary: what an image is, which of them it is (key), where it shows, and why one
+was refused.
+"""
+
+import hashlib
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Split(StrEnum):
+    """Which part of a data set an image belongs to. The official test set is all of query and
+    gallery.
+    """
+
+    TRAIN = "train"
+    QUERY = "query"
+    GALLERY = "gallery"
+
+
+class View(StrEnum):
+    """From where an image was taken. `google` is University-1652's street view images found by a
+    web search.
+    """
+
+    DRONE = "drone"
+    SATELLITE = "satellite"
+    STREET = "street"
+    GOOGLE = "google"
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeoTag:
+    """Where the place that an image shows lies, WGS84, and how the camera looked at it."""
+
+    lat: float
+    "Latitude of the place shown, degrees north."
+    lon: float
+    "Longitude of the place shown, degrees east."
+    altitude_m: float | None = None
+    "Height of the camera above the ground, metres."
+    heading_deg: float | None = None
+    "Direction in which the camera looks, degrees clockwise from north."
+    pitch_deg: float | None = None
+    "Angle of the optical axis above the horizon, degrees: -90 looks straight down."
+    footprint: tuple[tuple[float, float], ...] | None = None
+    """Corners (lat, lon) of the ground shown, from the image's upper left clockwise, where they are
+    known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageRecord:
+    """One image as a source found it; its pixels have not been read."""
+
+    path: str
+    "The file it is, or is a part of; a plain path or a URI."
+    part: str = ""
+    "Which part of the file, in its source's words; empty where it is the whole file."
+    split: Split
+    view: View
+    location: str
+    "The label: the folder's name, never an index."
+    variant: str = ""
+    "What tells apart images of one name in one location, such as the height they were taken from."
+    geotag: GeoTag | None = None
+    taken_at: str | None = None
+    "When, ISO 8601; without an offset it is the camera's own clock."
+    bytes: int | None = None
+    "Size of the file; None where the image is a part of one."
+
+    @property
+    def key(self) -> str:
+        """Name of this image in the data set: `[a-z0-9_-]+`, derived from split, view, location,
+        variant and file name.
+        """
+        stem = self.part or self.path.rsplit("/", 1)[-1].rsplit(".", 1)[0]
+        return make_key(
+            self.split, self.view, self.location, f"{self.variant}-{stem}" if self.variant else stem
+        )
+
+    @property
+    def name(self) -> str:
+        """What a person would look for: the path, and which part of it."""
+        return f"{self.path}#{self.part}" if self.part else self.path
+
+
+LONGEST_KEY = 90
+"A tar header of the oldest kind holds names of 100 characters, ending included."
+LONGEST_EXCERPT = 200
+"Characters of a damaged value that are shown."
+LONGEST_FOUND = 600
+"Characters of what was found that are written down."
+KEY = re.compile(rf"[a-z0-9_-]{{1,{LONGEST_KEY}}}")
+"What a key looks like."
+
+
+def is_text(name: str) -> bool:
+    """Whether it can be written down as UTF-8: names of files in other encodings hold lone
+    surrogates.
+    """
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def as_text(name: str) -> str:
+    """The name with what cannot be written down spelled out."""
+    return name.encode("utf-8", "backslashreplace").decode()
+
+
+def is_place(lat: object, lon: object) -> bool:
+    """Whether these are degrees north and east of some place."""
+    plain = all(
+        isinstance(value, int | float) and not isinstance(value, bool) for value in (lat, lon)
+    )
+    return plain and -90 <= lat <= 90 and -180 <= lon <= 180  # type: ignore[operator]  # false of a NaN
+
+
+def excerpt(value: object) -> str:
+    """So much of what was found as a sentence can hold."""
+    said = repr(value)
+    return said if len(said) <= LONGEST_EXCERPT else f"{said[:LONGEST_EXCERPT]}..."
+
+
+def make_key(split: Split, view: View, location: str, stem: str) -> str:
+    """Key of an image: stable under re-sharding, without dots (webdataset cuts a name at the first
+    one).
+
+    Where a character had to be replaced or the end cut off, eight digits of the original name's
+    hash keep two names apart.
+    """
+    named = f"{split}-{view}-{location}-{stem}"
+    slug = re.sub(r"[^a-z0-9_-]", "_", named.lower())
+    if slug == named and len(slug) <= LONGEST_KEY:
+        return slug
+    return f"{slug[: LONGEST_KEY - 9]}-{hashlib.sha256(named.encode('utf-8', 'surrogateescape')).hexdigest()[:8]}"
+
+
+def key_names(key: str, split: Split, view: View, location: str) -> bool:
+    """Whether a key that `make_key` made is of this split, view and location."""
+    begin = re.sub(r"[^a-z0-9_-]", "_", f"{split}-{view}-{location}-".lower())
+    return key.startswith(begin[: LONGEST_KEY - 9])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rejection:
+    """An image that was refused, and why."""
+
+    path: str
+    reason: str
+    "Short and countable: the same words for the same fault."
+    found: str
+    "What this file held, for the person who mends it; cut where it is longer than LONGEST_FOUND."
+
+    def __post_init__(self) -> None:
+        found = as_text(self.found)
+        if (
+            len(found) > LONGEST_FOUND
+        ):  # a damaged file may hold a megabyte where a number was expected
+            found = f"{found[: LONGEST_FOUND - 3]}..."
+        object.__setattr__(self, "found", found)

@@ -1,0 +1,243 @@
+"""Files on any storage that fsspec knows: a plain path, file://, s3://, gs://, memory://. Writing
+is all or nothing.
+"""
+
+import json
+import os
+import re
+import tempfile
+import uuid
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import fsspec
+from fsspec.implementations.local import LocalFileSystem
+
+from pipeline.core.errors import InputError
+
+TEMPORARY = re.compile(r"\.(.+)\.[0-9a-f]{8}")
+"Names that `atomic` gives to files until they are whole."
+
+
+def locate(path: str) -> tuple[Any, str]:
+    """The fsspec file system of a path and the path on it.
+
+    Raises InputError where no file system is known by a URI's scheme, or what it needs is not
+    installed.
+    """
+    if "://" not in path:  # to fsspec a name with :: in it would be a chain of file systems
+        local = LocalFileSystem()
+        return local, local._strip_protocol(path)
+    try:
+        filesystem, inner = fsspec.core.url_to_fs(path)
+    except (ValueError, ImportError) as error:
+        raise InputError(
+            f"{path} is on no storage that is known here ({error}); expected a path, file://, s3:// or gs://"
+        ) from None
+    return filesystem, inner
+
+
+def is_local(path: str) -> bool:
+    return isinstance(locate(path)[0], LocalFileSystem)
+
+
+def absolute(path: str) -> str:
+    """The path as another process with another working directory would have to name it; URIs stay
+    as they are.
+    """
+    return path if "://" in path else os.path.abspath(os.path.expanduser(path))
+
+
+def join(folder: str, *names: str) -> str:
+    return "/".join([folder.rstrip("/"), *names])
+
+
+def exists(path: str) -> bool:
+    filesystem, inner = locate(path)
+    return bool(filesystem.exists(inner))
+
+
+def names(folder: str) -> list[str]:
+    """File names in a folder, sorted, without temporary and hidden ones; an absent folder has none."""
+    filesystem, inner = locate(folder)
+    if not filesystem.isdir(inner):
+        return []
+    found = (entry.rstrip("/").rsplit("/", 1)[-1] for entry in filesystem.ls(inner, detail=False))
+    return sorted(name for name in found if not name.startswith("."))
+
+
+def walk(folder: str) -> dict[str, int]:
+    """Paths, relative to the folder, of all files below it, sorted, with their sizes in bytes;
+    hidden ones left out.
+
+    Links are followed, but not in circles.
+    """
+    filesystem, inner = locate(folder)
+    root = inner.rstrip("/") + "/"
+    if isinstance(filesystem, LocalFileSystem):
+        found = dict(_walk_disk(inner, frozenset()))
+    else:
+        found = {path: entry["size"] for path, entry in filesystem.find(inner, detail=True).items()}
+    below = ((path.removeprefix(root), size) for path, size in found.items())
+    return {
+        path: size
+        for path, size in sorted(below)
+        if not any(part.startswith(".") for part in path.split("/"))
+    }
+
+
+def _walk_disk(folder: str, above: frozenset[str]) -> Iterator[tuple[str, int]]:
+    """All files below a folder of this machine; links whose target is gone have size 0. `above`:
+    the folders on the way.
+    """
+    real = os.path.realpath(folder)
+    if real in above:
+        return
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_dir():
+                yield from _walk_disk(entry.path, above | {real})
+            else:
+                yield entry.path, entry.stat().st_size if entry.is_file() else 0
+
+
+def is_folder(path: str) -> bool:
+    filesystem, inner = locate(path)
+    return bool(filesystem.isdir(inner))
+
+
+def is_file(path: str) -> bool:
+    return exists(path) and not is_folder(path)
+
+
+def size(path: str) -> int:
+    """Bytes of a file."""
+    filesystem, inner = locate(path)
+    return int(filesystem.size(inner))
+
+
+def read_bytes(path: str) -> bytes:
+    filesystem, inner = locate(path)
+    data: bytes = filesystem.cat_file(inner)
+    return data
+
+
+def read_head(path: str, size: int) -> bytes:
+    """The first `size` bytes of a file, or all of it where it is shorter; of a remote file no more
+    is fetched.
+    """
+    filesystem, inner = locate(path)
+    data: bytes = filesystem.cat_file(inner, start=0, end=size)
+    return data
+
+
+def read_json(path: str) -> Any:
+    """Raises ValueError where it is no JSON, or nested deeper than anything of ours."""
+    try:
+        return json.loads(read_bytes(path))
+    except RecursionError:
+        raise ValueError("lists within lists without end") from None
+
+
+def open_read(path: str) -> IO[bytes]:
+    filesystem, inner = locate(path)
+    stream: IO[bytes] = filesystem.open(inner, "rb")
+    return stream
+
+
+@contextmanager
+def atomic(path: str) -> Iterator[IO[bytes]]:
+    """A stream to write a file through, which appears under its name when complete or not at all."""
+    with atomic_file(path) as local, open(local, "wb") as stream:
+        yield stream
+
+
+@contextmanager
+def atomic_file(path: str) -> Iterator[str]:
+    """A path on this machine to write a file to, which appears under its own name when complete or
+    not at all.
+
+    On a local disk: a hidden temporary neighbour, fsynced and renamed. Elsewhere: one upload at the
+    end, which object stores make visible whole.
+    """
+    filesystem, inner = locate(path)
+    if not isinstance(filesystem, LocalFileSystem):
+        filesystem.makedirs(inner.rsplit("/", 1)[0], exist_ok=True)
+        with tempfile.TemporaryDirectory() as scratch:
+            local = os.path.join(scratch, "file")
+            yield local
+            filesystem.put_file(local, inner)
+        return
+    target = Path(inner)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}")
+    try:
+        yield str(temporary)
+        with temporary.open("rb") as written:
+            os.fsync(written.fileno())
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def sweep(folder: str, names: Iterable[str]) -> None:
+    """Remove what `atomic` left of these files in a folder where its process was killed; nobody may
+    be writing them.
+    """
+    filesystem, inner = locate(folder)
+    if isinstance(filesystem, LocalFileSystem) and os.path.isdir(inner):
+        wanted = set(names)
+        for entry in os.listdir(inner):
+            left = TEMPORARY.fullmatch(entry)
+            if left and left[1] in wanted:
+                Path(inner, entry).unlink(missing_ok=True)
+
+
+def copy(source: str, target: str) -> None:
+    """A second name for a file's content on the same storage, all or nothing; both must be written
+    whole from then on.
+
+    On a local disk a hard link, which costs nothing, where the disk has them.
+    """
+    filesystem, inner = locate(source)
+    other = locate(target)[1]
+    if not isinstance(filesystem, LocalFileSystem):
+        filesystem.copy(inner, other)
+        return
+    temporary = Path(other).with_name(f".{Path(other).name}.{uuid.uuid4().hex[:8]}")
+    try:
+        os.link(inner, temporary)
+    except OSError:
+        write_bytes(target, read_bytes(source))
+    else:
+        temporary.replace(other)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def remove(path: str) -> None:
+    filesystem, inner = locate(path)
+    filesystem.rm_file(inner)
+
+
+def remove_folder(path: str) -> None:
+    """A folder with all that is in it; one that is not there is no fault."""
+    filesystem, inner = locate(path)
+    if filesystem.exists(inner):
+        filesystem.rm(inner, recursive=True)
+
+
+def write_bytes(path: str, data: bytes) -> None:
+    with atomic(path) as stream:
+        stream.write(data)
+
+
+def as_json(value: Any) -> bytes:
+    """The file that `write_json` writes."""
+    return (json.dumps(value, indent=2, ensure_ascii=False) + "\n").encode()
+
+
+def write_json(path: str, value: Any) -> None:
+    write_bytes(path, as_json(value))

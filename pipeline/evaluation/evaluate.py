@@ -1,0 +1,366 @@
+"""The evaluation stage: feature tables on disk -> metrics, per-query rows and the report in one
+folder.
+
+In: one table with query and gallery rows, or one table for each. Out: `queries.parquet`, `metrics.parquet`,
+`report.html`, what pipeline/evaluation/extras.py writes, `evaluation.json` (what all of it was made from) and, last,
+`metrics.json`: where that file is, the evaluation is complete.
+"""
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import pyarrow as pa
+
+from pipeline.core import json_files, parquet, storage
+from pipeline.core.errors import InputError
+from pipeline.core.lock import one_at_a_time
+from pipeline.core.progress import console, progress
+from pipeline.core.records import Split, View
+from pipeline.evaluation.extras import Besides, Export, write_besides
+from pipeline.features.table import FeatureTable, Floats, open_table, verify
+from pipeline.images.thumbnails import no_pictures
+from pipeline.report.inputs import (
+    Extras,
+    Findings,
+    Format,
+    read_besides,
+    read_extras,
+    read_findings,
+)
+from pipeline.report.page import render
+from pipeline.report.panels import PANELS
+from pipeline.retrieval.results import (
+    INPUTS,
+    METRICS,
+    RESULTS,
+    is_whole,
+    read_inputs,
+    read_rows,
+    write_inputs,
+)
+from pipeline.retrieval.subsets import vectors_by_key
+from pipeline.retrieval.tasks import (
+    METRICS_SCHEMA,
+    Protocol,
+    Task,
+    possible_tasks,
+    retrieve,
+    side_of,
+)
+from pipeline.shards.manifest import read_manifest
+from pipeline.shards.samples import fetch
+from pipeline.shards.verify import refuse_damaged
+
+ViewName = Literal["drone", "satellite", "street", "google"]
+SHOWN = ("title", "shards", "panels", "views", "parts", "by", "exports", "figures", "answer_order")
+"Settings that change what is written besides the ranking."
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationSettings:
+    """What to evaluate: --table for every task that it allows, or --queries and --gallery for one."""
+
+    out: str
+    "Folder for the results; a path or a URI."
+    table: str | None = None
+    """Feature table with query and gallery rows: every task of two views, and multi-query
+    drone->satellite."""
+    queries: str | None = None
+    "Feature table that holds the query rows."
+    gallery: str | None = None
+    "Feature table that holds the gallery rows."
+    protocol: Protocol = "full"
+    """full: the official one, with all distractors. queried-only: gallery rows of queried locations
+    alone."""
+    multi_query: bool = False
+    "One query per location, the mean of its queries' features; with --queries and --gallery."
+    query_view: ViewName | None = None
+    "View of the queries; needed where the tables allow more than one task."
+    gallery_view: ViewName | None = None
+    "View of the gallery."
+    shards: str | None = None
+    "Folder of the shards that were embedded: their pictures are shown in the report."
+    run: str | None = None
+    "Folder of the training run: its curves are shown in the report."
+    beside: str | None = None
+    """Folder of another evaluation on the same images, shown beside this one, such as the untrained
+    network's."""
+    title: str = "Retrieval evaluation"
+    "Headline of the report."
+    panels: int = PANELS
+    """Hits, and as many misses, that the report shows of each task; a few are open, the others
+    unfold."""
+    workers: int = 0
+    """Ray tasks that rank, of one core each, each for some of the queries; 0: this process ranks,
+    on all cores."""
+    verify: bool = False
+    "Look at every byte of the tables first, and of the shards where they are given."
+    views: bool = True
+    "Whether to measure drone->satellite by the number of views a query is the mean of."
+    parts: bool = True
+    """Whether to measure what each part of the embedding finds alone, and all but it: for four
+    parts, the time of four rankings."""
+    by: tuple[str, ...] = ()
+    """Columns of the shards' records to break the measures down by, such as altitude_m or
+    heading_deg; with --shards."""
+    exports: tuple[Export, ...] = ()
+    "answer: the challenge's answer.txt. mat: the features as pytorch_result.mat."
+    figures: tuple[Format, ...] = ()
+    "Formats, png or pdf, in which to write figures for a paper, into the folder figures/."
+    answer_order: str | None = None
+    """Text file with the queries' file names in the challenge's order, one a line; with --exports
+    answer and --shards."""
+
+    def __post_init__(self) -> None:
+        one, two = self.table is not None, (self.queries is not None, self.gallery is not None)
+        if one == any(two) or (any(two) and not all(two)):
+            given = [
+                f"--{name}"
+                for name in ("table", "queries", "gallery")
+                if getattr(self, name) is not None
+            ]
+            raise InputError(
+                f"found {' and '.join(given) or 'no table'}; expected --table alone, or --queries and --gallery together"
+            )
+        if one and self.multi_query:
+            raise InputError(
+                "found --multi-query with --table, which evaluates it already; leave it out"
+            )
+        if self.by and not self.shards:
+            raise InputError(
+                f"found --by {' '.join(self.by)} without --shards, whose records know it; add --shards"
+            )
+        if self.answer_order and ("answer" not in self.exports or not self.shards or self.table):
+            raise InputError(
+                "found --answer-order, expected one task (--queries and --gallery), --exports answer and --shards with it; "
+                "add them"
+            )
+        if self.panels < 0:
+            raise InputError(
+                f"--panels is {self.panels}, expected 0 or more; leave it out for {PANELS}"
+            )
+        if self.workers < 0:
+            raise InputError(
+                f"--workers is {self.workers}, expected 0 or more; leave it out to rank in this process"
+            )
+
+
+@one_at_a_time(lambda settings: settings.out)
+def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
+    """Evaluate into `settings.out` and return the metric rows. A finished evaluation of the same
+    inputs is left as it is.
+
+    Raises InputError when the tables do not go together or allow no task, or when the folder holds
+    something else.
+    """
+    queries, gallery, tasks = plan(settings)
+    ranked = {
+        "fingerprint": queries.fingerprint, "queries": queries.digest, "gallery": gallery.digest,
+        "protocol": settings.protocol, "tasks": [str(task) for task in tasks],
+    }  # fmt: skip
+    if settings.shards:
+        if settings.verify:
+            refuse_damaged(settings.shards)
+        read_manifest(
+            settings.shards
+        )  # that there are none is better said before the ranking than after it
+    extras = read_extras(settings.title, settings.run, settings.beside)
+    shown = {name: _plain(getattr(settings, name)) for name in SHOWN} | {"extras": extras.sha256}
+    earlier = _earlier(settings.out)
+    if earlier and earlier["ranked"] != ranked:
+        different = ", ".join(
+            name for name, value in ranked.items() if earlier["ranked"].get(name) != value
+        )
+        raise InputError(
+            f"{settings.out} holds an evaluation of something else (different {different}); expected the same or an "
+            "empty folder; choose another --out"
+        )
+    if earlier and not is_whole(settings.out, earlier):
+        console.print(
+            f"{settings.out}: a file is missing or damaged; evaluating again", style="yellow"
+        )
+        earlier = None
+    if earlier and earlier["shown"] == shown:
+        console.print(
+            f"{settings.out} is complete: the same features were evaluated before; nothing to do"
+        )
+    elif earlier:
+        # Until all is written anew it is of nothing that could be asked for, and says of no file
+        # what is in it.
+        results = read_findings(settings.out).results
+        json_files.write_checksummed(
+            storage.join(settings.out, INPUTS), {"ranked": ranked, "shown": {}}
+        )
+        _write_besides(settings, queries, gallery, tasks, results)
+        _write_report(settings, queries, gallery, read_findings(settings.out), extras)
+        write_inputs(settings.out, {"ranked": ranked, "shown": shown})
+        console.print(
+            f"{settings.out}: ranked before; wrote report.html and what goes with it anew"
+        )
+    else:
+        _evaluate(settings, queries, gallery, tasks, {"ranked": ranked, "shown": shown}, extras)
+    return read_rows(settings.out, METRICS)
+
+
+def plan(settings: EvaluationSettings) -> tuple[FeatureTable, FeatureTable, list[Task]]:
+    """The two tables and the tasks they are to be evaluated on.
+
+    Raises InputError when they come from different networks, allow no task, or more than the one
+    that was asked for.
+    """
+    opened = verify if settings.verify else open_table
+    queries = opened(settings.table or settings.queries or "")
+    gallery = queries if settings.table else opened(settings.gallery or "")
+    if queries.fingerprint != gallery.fingerprint:
+        raise InputError(
+            f"queries were embedded by network {queries.fingerprint[:12]} and the gallery by {gallery.fingerprint[:12]}; "
+            "expected one; embed both with the same checkpoint (jobs/embed_gallery.py --checkpoint)"
+        )
+    possible = [
+        task
+        for task in possible_tasks(queries, gallery)
+        if settings.query_view in (None, str(task.query_view))
+        and settings.gallery_view in (None, str(task.gallery_view))
+    ]
+    if not possible:
+        raise InputError(
+            f"found {_held(queries, Split.QUERY)} and {_held(gallery, Split.GALLERY)}; expected query rows of one view and "
+            "gallery rows of another; embed both splits, or name other views with --query-view and --gallery-view"
+        )
+    if settings.table:
+        both = Task(query_view=View.DRONE, gallery_view=View.SATELLITE)
+        merged = [replace(task, multi_query=True) for task in possible if task == both]
+        return queries, gallery, possible + merged
+    if len(possible) > 1:
+        raise InputError(
+            f"the tables allow {', '.join(task.name for task in possible)}; expected one task; choose with --query-view and "
+            "--gallery-view, or give one --table for all of them"
+        )
+    return queries, gallery, [replace(possible[0], multi_query=settings.multi_query)]
+
+
+def _evaluate(
+    settings: EvaluationSettings, queries: FeatureTable, gallery: FeatureTable, tasks: list[Task],
+    inputs: dict[str, Any], extras: Extras,
+) -> None:  # fmt: skip
+    begin = time.monotonic()
+    if storage.exists(storage.join(settings.out, INPUTS)):
+        storage.remove(storage.join(settings.out, INPUTS))  # of a run that was not finished
+    found, spent = [], {}
+    for task in tasks:
+        started = time.monotonic()
+        known = settings.protocol == "full" and not task.multi_query
+        pairs = (
+            queries.counts[Split.QUERY, task.query_view]
+            * gallery.counts[Split.GALLERY, task.gallery_view]
+        )
+        with progress(pairs if known else None, str(task), "scores") as meter:
+            found.append(
+                retrieve(
+                    task, queries, gallery, settings.protocol, None, meter.advance, settings.workers
+                )
+            )
+        spent[str(task)] = time.monotonic() - started
+    rows, results = (
+        [each.metrics for each in found],
+        pa.concat_tables([each.queries for each in found]),
+    )
+    for name, table in (
+        (RESULTS, results),
+        ("metrics.parquet", pa.Table.from_pylist(rows, METRICS_SCHEMA)),
+    ):
+        parquet.write_table(storage.join(settings.out, name), table)
+    started = time.monotonic()
+    _write_besides(settings, queries, gallery, tasks, results)
+    spent["views, groups and exports"] = time.monotonic() - started
+    started = time.monotonic()
+    findings = Findings(
+        name=settings.title, metrics=rows, results=results, **read_besides(settings.out)
+    )
+    _write_report(settings, queries, gallery, findings, extras)
+    spent["report"] = time.monotonic() - started
+    metrics = storage.as_json(rows)
+    write_inputs(settings.out, inputs, metrics)
+    storage.write_bytes(storage.join(settings.out, METRICS), metrics)
+    parts = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.items())
+    console.print(
+        f"{storage.join(settings.out, METRICS)}: {time.monotonic() - begin:.1f} s ({parts})"
+    )
+
+
+def _write_besides(
+    settings: EvaluationSettings,
+    queries: FeatureTable,
+    gallery: FeatureTable,
+    tasks: list[Task],
+    results: pa.Table,
+) -> None:
+    write_besides(
+        Besides(
+            out=settings.out,
+            protocol=settings.protocol,
+            workers=settings.workers,
+            views=settings.views,
+            parts=settings.parts,
+            by=settings.by,
+            exports=settings.exports,
+            shards=settings.shards,
+            answer_order=settings.answer_order,
+        ),
+        queries,
+        gallery,
+        tasks,
+        results,
+    )
+
+
+def _write_report(
+    settings: EvaluationSettings,
+    queries: FeatureTable,
+    gallery: FeatureTable,
+    findings: Findings,
+    extras: Extras,
+) -> None:
+    shards = settings.shards
+
+    def vectors(keys: Iterable[str]) -> dict[str, Floats]:
+        wanted = set(keys)
+        sides = side_of(queries.select(Split.QUERY)), side_of(gallery.select(Split.GALLERY))
+        return {
+            key: vector_D
+            for side in sides
+            for key, vector_D in vectors_by_key(side, wanted).items()
+        }
+
+    pictures = (lambda keys: fetch(shards, keys)) if shards else no_pictures
+    page = render(findings, extras, pictures, vectors, settings.panels)
+    storage.write_bytes(storage.join(settings.out, "report.html"), page.encode())
+    if settings.figures:
+        from pipeline.report.figures import (
+            write_figures,
+        )  # here: matplotlib takes half a second, for this alone
+
+        write_figures(findings, pictures, storage.join(settings.out, "figures"), settings.figures)
+
+
+def _plain(value: Any) -> Any:
+    """A setting as JSON gives it back."""
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _earlier(out: str) -> dict[str, Any] | None:
+    if not storage.exists(storage.join(out, METRICS)):
+        return None
+    said = read_inputs(out)
+    if said is None:
+        raise InputError(
+            f"{out} holds a {METRICS} without {INPUTS}; expected an evaluation's folder; choose another --out or delete {out}"
+        )
+    return said
+
+
+def _held(table: FeatureTable, split: Split) -> str:
+    views = [str(view) for (held, view), count in table.counts.items() if held == split and count]
+    return f"{split} rows of {' and '.join(sorted(views)) or 'no view'} in {table.path}"

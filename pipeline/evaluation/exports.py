@@ -1,0 +1,125 @@
+"""What the field's other programs read: the challenge's answer file and the `.mat` file of
+features.
+
+In: per-query rows, feature tables. Out: `answer.txt`, one line per query with the ids of its ten
+best gallery images, best first, between tabs, as University-1652's test_160k.py writes it for the
+workshop's challenge; and `pytorch_result.mat` with gallery_f, gallery_label, gallery_path, query_f,
+query_label, query_path, as its test.py saves them.
+"""
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import scipy.io
+
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.core.records import Split, View
+from pipeline.features.table import FeatureTable
+from pipeline.shards import record_table
+from pipeline.shards.manifest import read_manifest
+
+MAT_LIMIT = 2**32 - 1  # bytes of one array in a MATLAB 5 file
+
+
+def file_names(shards: str) -> dict[str, str]:
+    """The name of the file that each key was made from, without its folder."""
+    names: dict[str, str] = {}
+    for shard in read_manifest(shards).shards:
+        table = record_table.read_part(shards, shard.name, ["key", "path"])
+        paths = (path.rsplit("/", 1)[-1] for path in table["path"].to_pylist())
+        names.update(zip(table["key"].to_pylist(), paths, strict=True))
+    return names
+
+
+def answer_text(
+    rows: Sequence[dict[str, Any]],
+    names: dict[str, str] | None = None,
+    order: Sequence[str] | None = None,
+) -> str:
+    """The answer file of one task's per-query rows.
+
+    `names`: file name of each key; a gallery image's id is its file's name without ending, or, without `names`, its location,
+    which in University-1652's satellite gallery is the same. `order`: the queries' file names in the order that the challenge
+    asks for (its query_drone_name.txt); without it, the rows' order.
+
+    Raises InputError when a query that is asked for is not there, or two have one name.
+    """
+    if order is not None:
+        by_name: dict[str, dict[str, Any]] = {}
+        for row in rows:
+            name = (names or {}).get(row["query"], row["query"])
+            if by_name.setdefault(name, row) is not row:
+                raise InputError(
+                    f"two queries come from files named {name}; expected each name once, as in the challenge's masked test "
+                    "set; leave the order out"
+                )
+        missing = [name for name in order if name not in by_name]
+        if missing:
+            raise InputError(
+                f"{len(missing)} of {len(order)} names in the order were not queried, the first is {missing[0]}; expected "
+                "file names of the queries; give the --shards that were embedded, and the list that belongs to them"
+            )
+        rows = [by_name[name] for name in order]
+    lines = []
+    for row in rows:
+        ids = (
+            [names[key].rsplit(".", 1)[0] for key in row["top_keys"]]
+            if names
+            else row["top_locations"]
+        )
+        lines.append("\t".join(ids) + "\n")
+    return "".join(lines)
+
+
+def mat_bytes(
+    queries: FeatureTable, gallery: FeatureTable, query_view: View, gallery_view: View
+) -> bytes:
+    """The features of one task as a MATLAB 5 file. Labels are numbers there: a location's number
+    where all are numbers, else its place among the names. Paths hold the location as their folder,
+    whatever it is called.
+
+    Raises InputError when the features do not fit such a file.
+    """
+    sides = {
+        "query": queries.select(Split.QUERY, query_view),
+        "gallery": gallery.select(Split.GALLERY, gallery_view),
+    }
+    labels = {name: table.labels() for name, table in sides.items()}
+    places = np.unique(np.concatenate([known.locations for known in labels.values()]))
+    numbers = {place: int(place) if place.isdecimal() else -1 for place in places.tolist()}
+    if len(set(numbers.values())) < len(places) or -1 in numbers.values():
+        numbers = {place: index for index, place in enumerate(places.tolist())}
+    content: dict[str, Any] = {}
+    for name, table in sides.items():
+        size = table.rows * table.dimension * 4
+        if size > MAT_LIMIT:
+            raise InputError(
+                f"the {name} features take {size:,} bytes; expected at most {MAT_LIMIT:,}, all that an array of a .mat file "
+                "can hold; leave the export out and read the Parquet table"
+            )
+        known, folder = labels[name], f"{name}_{'-'.join(table.views)}"
+        content[f"{name}_f"] = table.embeddings()
+        content[f"{name}_label"] = np.array(
+            [[numbers[place] for place in known.locations.tolist()]], np.int64
+        )
+        pairs = zip(known.locations.tolist(), known.keys.tolist(), strict=True)
+        content[f"{name}_path"] = np.array([f"{folder}/{place}/{key}" for place, key in pairs])
+    stream = io.BytesIO()
+    scipy.io.savemat(stream, content)
+    return stream.getvalue()
+
+
+def read_order(path: str) -> list[str]:
+    """The lines of a challenge's list of query names, without folders.
+
+    Raises InputError when there is no such file.
+    """
+    if not storage.exists(path):
+        raise InputError(
+            f"no list of query names at {path}; expected a text file with one file name a line; check the path"
+        )
+    lines = storage.read_bytes(path).decode().splitlines()
+    return [line.strip().rsplit("/", 1)[-1] for line in lines if line.strip()]

@@ -1,0 +1,281 @@
+"""Shards + encoder -> feature table: the stage. Ray actors make one Parquet part per shard; done
+parts are left as they are.
+
+In: a set of shards, and the encoder as a factory that is called on each worker. Out: the table, the
+list of what of the shards has no row, and a summary. However often workers or the stage itself are
+killed, the table ends up with the same bytes: a part is a function of its shard, and appears whole.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import ray
+
+from pipeline.core import cluster, storage
+from pipeline.core import rejections as rejects
+from pipeline.core.actor_pool import CannotWork, Crew, NobodyCame, SetAside, Terms
+from pipeline.core.cluster import Node, Placement, place
+from pipeline.core.errors import InputError, Unfinished
+from pipeline.core.lock import one_at_a_time
+from pipeline.core.progress import console, progress
+from pipeline.core.records import Split, View
+from pipeline.features import expected_parts
+from pipeline.features.embed_worker import (
+    IN_FLIGHT,
+    Assignment,
+    CannotWrite,
+    Embedded,
+    Encoder,
+    Network,
+    ShardEmbedder,
+)
+from pipeline.features.part import (
+    REJECTED,
+    PartHeader,
+    list_rejected,
+    part_names,
+    read_header,
+    read_headers,
+    verify_part,
+)
+from pipeline.shards.external import open_manifest
+from pipeline.shards.manifest import MANIFEST, Manifest, Shard, mending, missing_tars
+from pipeline.shards.verify import refuse_damaged
+
+__all__ = ["EmbeddingSettings", "Encoder", "Incomplete", "Network", "embed_gallery"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmbeddingSettings:
+    """Which shards are embedded into which table, and how the work is spread."""
+
+    shards: str
+    "Folder or URI of the shards."
+    out: str
+    "Folder or URI of the feature table."
+    split: Split | None = None
+    "Only this split; of shards that others made, which have no manifest, what they are."
+    view: View | None = None
+    "Only this view; likewise."
+    batch_size: int = 32
+    "Images per forward pass."
+    dtype: str = "float32"
+    "Of the stored embeddings: float32, or float16 for half the space."
+    workers: int | None = None
+    "Actors; by default one per GPU, or where there is none one per eight CPU cores."
+    cpus_per_worker: int | None = None
+    "CPU cores of an actor; by default as many as let all actors fit on the nodes that are up."
+    gpus_per_worker: float | None = None
+    "GPUs of an actor; by default 1 where the cluster has any, else 0."
+    decode_threads: int | None = None
+    """Threads of an actor that decode; by default its cores but one beside a GPU, else one per four
+    cores."""
+    patience: float = 600.0
+    "Seconds to wait for the first actor to start, before giving up."
+    verify: bool = False
+    """Look at every byte of the shards first, and of the parts that are done: damaged parts are
+    embedded again."""
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 1:
+            raise InputError(f"--batch-size is {self.batch_size}, expected at least 1")
+        if self.dtype not in ("float32", "float16"):
+            raise InputError(f"--dtype is {self.dtype!r}, expected float32 or float16")
+        for name in ("workers", "cpus_per_worker", "decode_threads"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise InputError(f"--{name.replace('_', '-')} is {value}, expected at least 1")
+        if self.gpus_per_worker is not None and self.gpus_per_worker < 0:
+            raise InputError(f"--gpus-per-worker is {self.gpus_per_worker}, expected 0 or more")
+
+
+class Incomplete(Unfinished):
+    """Embedding has done what it could, and some shards could not be done. One sentence, with their
+    names.
+    """
+
+
+@one_at_a_time(lambda settings, network: settings.out)
+def embed_gallery(settings: EmbeddingSettings, network: Network) -> int:
+    """Embed every shard that has no finished part yet; returns how many images were embedded.
+
+    `settings` must name paths that a worker can open (absolute, or URIs). Raises InputError on unusable input, Incomplete
+    where shards are unreadable or kill their workers, the others being done.
+    """
+    if settings.verify and storage.exists(storage.join(settings.shards, MANIFEST)):
+        refuse_damaged(settings.shards)
+    wanted = wanted_shards(settings)
+    missing = missing_shards(settings, network, wanted)
+    expected_parts.promise(settings.out, [f"{shard.name}.parquet" for shard in wanted])
+    absent = missing_tars(settings.shards, missing)  # said now, and not when their turn comes
+    asked = mending(settings.shards)
+    lost = {
+        name: SetAside(reason="unusable", found=f"{said}; {asked}") for name, said in absent.items()
+    }
+    embedded = 0
+    for name, aside in lost.items():
+        console.print(f"{name} is set aside ({aside.reason}): {aside.found}", style="yellow")
+    if todo := [shard for shard in missing if shard.name not in lost]:
+        cluster.connect()
+        nodes = cluster.nodes()
+        given = (settings.workers, settings.cpus_per_worker, settings.gpus_per_worker)
+        placement = place(nodes, len(todo), *given)
+        crew = Crew(terms_of(settings, network, placement, nodes))
+        embedded, given_up = run(settings, crew, todo, placement)
+        lost |= given_up
+    expected_parts.give_up(settings.out, [f"{name}.parquet" for name in lost])
+    storage.sweep(
+        settings.out, [expected_parts.LIST, *(f"{shard.name}.parquet" for shard in wanted)]
+    )
+    rejections = [
+        (header.name.removesuffix(".parquet"), one)
+        for header in read_headers(settings.out)
+        for one in header.footer.rejected
+    ]
+    listed = list_rejected(
+        settings.out,
+        [
+            *((name, one.path, one.reason, one.found) for name, one in rejections),
+            *((name, None, aside.reason, aside.found) for name, aside in lost.items()),
+        ],
+    )
+    if listed and rejections:
+        reasons = rejects.commonest(one for _, one in rejections)
+        told = f"{len(rejections)} images could not be decoded: {reasons}; see {storage.join(settings.out, REJECTED)}"
+        console.print(told, style="yellow")
+    if lost:
+        reasons = "; ".join(
+            f"{name} ({aside.reason}: {aside.found})" for name, aside in sorted(lost.items())
+        )
+        raise Incomplete(
+            f"{len(lost)} of {len(wanted)} shards could not be embedded, expected all; the others are done; mend these and run "
+            f"the same command again: {reasons}"
+        )
+    if not missing:
+        console.print(f"{settings.out} is complete: {len(wanted)} parts; nothing to do")
+    return embedded
+
+
+def wanted_shards(settings: EmbeddingSettings) -> list[Shard]:
+    """The shards that were asked for.
+
+    Raises InputError when there are none.
+    """
+    manifest: Manifest = open_manifest(settings.shards, settings.split, settings.view)
+    wanted = [shard for shard in manifest.of(settings.split, settings.view) if shard.samples]
+    if not wanted:
+        held = (
+            ", ".join(sorted({f"{shard.split} {shard.view}" for shard in manifest.shards}))
+            or "nothing"
+        )
+        raise InputError(
+            f"{settings.shards} holds {held}, and none of it was asked for; check --split and --view"
+        )
+    return wanted
+
+
+def missing_shards(
+    settings: EmbeddingSettings, network: Network, wanted: Sequence[Shard]
+) -> list[Shard]:
+    """Those that have no finished part: one that is there, complete, and made of this very shard.
+
+    Raises InputError when the table holds another network's parts, or another kind of numbers.
+    """
+    own = {f"{shard.name}.parquet": shard for shard in wanted}
+    done = set()
+    for name in part_names(settings.out):
+        try:
+            header = read_header(storage.join(settings.out, name))
+            if settings.verify:
+                verify_part(storage.join(settings.out, name))
+        except InputError as error:
+            if name not in own:
+                raise
+            console.print(f"{error}; it is embedded again", style="yellow")
+            continue
+        refuse_other(settings, network, header)
+        footer, shard = header.footer, own.get(name)
+        counted = footer.rows + len(footer.rejected)
+        if shard and (footer.shard_sha256, counted) == (shard.sha256, shard.samples):
+            done.add(shard.name)
+    return [shard for shard in wanted if shard.name not in done]
+
+
+def refuse_other(settings: EmbeddingSettings, network: Network, header: PartHeader) -> None:
+    """Raise InputError where a part of the table cannot stand beside those that would be made."""
+    path, made_by = storage.join(settings.out, header.name), header.footer.fingerprint
+    if made_by != network.fingerprint:
+        raise InputError(
+            f"{path} was made by network {made_by[:12]}, this checkpoint is {network.fingerprint[:12]}; choose another "
+            "--out, the --precision, --resizer and --mirror that it was made with, or delete the old table"
+        )
+    if header.dtype != settings.dtype:
+        raise InputError(
+            f"{path} holds {header.dtype}, --dtype is {settings.dtype}, expected one kind of numbers in a table; choose "
+            f"another --out, or --dtype {header.dtype}"
+        )
+
+
+def terms_of(
+    settings: EmbeddingSettings, network: Network, placement: Placement, nodes: Sequence[Node]
+) -> Terms:
+    """How the crew works: what an actor is, and which failures are whose."""
+    cpus, gpus = placement.cpus, placement.gpus
+    assignment = Assignment(
+        shards=settings.shards,
+        out=settings.out,
+        batch_size=settings.batch_size,
+        dtype=settings.dtype,
+        threads=cpus,
+        decode_threads=settings.decode_threads or max(1, cpus - 1 if gpus else cpus // 4),
+    )
+    actor: Any = ray.remote(num_cpus=cpus, num_gpus=gpus)(ShardEmbedder).options(
+        max_concurrency=IN_FLIGHT
+    )
+    shared = ray.put(network)  # the weights travel to each node once
+    return Terms(
+        hire=lambda: actor.remote(assignment, shared),
+        size=placement.workers,
+        asks_for=f"{placement}, and the largest of {len(nodes)} nodes has {max((n.cpus for n in nodes), default=0):g} CPUs",
+        in_flight=IN_FLIGHT,
+        refusals=(InputError,),
+        fatal=(CannotWrite,),
+        patience=settings.patience,
+        say=console.print,
+    )
+
+
+def run(
+    settings: EmbeddingSettings, crew: Crew, missing: Sequence[Shard], placement: Placement
+) -> tuple[int, dict[str, SetAside]]:
+    """Embed the missing shards; returns how many images that made, and which shards had to be set
+    aside.
+    """
+    spent, embedded, lost, start = Counter[str](), 0, dict[str, SetAside](), time.monotonic()
+    try:
+        with progress(sum(shard.samples for shard in missing), "embedding") as meter:
+            for shard, result in crew.work(missing):
+                if isinstance(result, SetAside):
+                    lost[shard.name] = result
+                    meter.note(f"{shard.name} is set aside ({result.reason}): {result.found}")
+                    continue
+                assert isinstance(result, Embedded)
+                spent.update(result.seconds)
+                embedded += shard.samples
+                meter.advance(shard.samples, workers=crew.working)
+    except NobodyCame as error:
+        raise InputError(
+            f"{error}; start nodes that have them, or give --cpus-per-worker, --gpus-per-worker"
+        ) from None
+    except (CannotWork, CannotWrite) as error:
+        raise Incomplete(str(error)) from error
+    elapsed = time.monotonic() - start
+    idle = max(0.0, crew.seconds - spent["infer"])
+    threads = ", ".join(f"{name} {spent[name]:.1f} s" for name in ("read", "decode", "write"))
+    console.print(
+        f"{settings.out}: {embedded} images in {elapsed:.1f} s; over {placement.workers} workers of {placement}: infer "
+        f"{spent['infer']:.1f} s, idle {idle:.1f} s, beside it {threads}"
+    )
+    return embedded, lost

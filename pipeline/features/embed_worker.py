@@ -1,0 +1,262 @@
+"""The embedder's worker: holds the encoder, and turns one shard into one part of the feature table
+at a time.
+
+In: a shard. Out: its part, and where the seconds went. Reading, decoding and writing are done by
+threads beside the one that computes: while a shard is embedded, the next one's first batches are
+made ready and the last one's part is written. Shapes: B images of a batch, H x W pixels, D
+dimensions of an embedding, N images of a shard.
+"""
+
+import errno
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from itertools import chain
+from queue import SimpleQueue
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.batches.ordered import Opened, opened, stack
+from pipeline.core import storage
+from pipeline.core.arrays import Floats, Halves
+from pipeline.core.errors import InputError
+from pipeline.core.prefetch import ahead, ready
+from pipeline.core.records import Rejection
+from pipeline.features.part import PartFooter, PartRows, write_part
+from pipeline.images.decode import DecodeError, Pixels
+from pipeline.images.transforms import Resizer
+from pipeline.shards.manifest import Shard
+from pipeline.shards.samples import Sample, read_shard
+
+Encoder = Callable[[npt.NDArray[np.uint8]], Floats]
+"""Images as bytes (B, 3, H, W) -> unit vectors (B, D), float32. Made and called by one thread. What
+it has to say of itself stands in its `remarks`, where it has any."""
+IN_FLIGHT = 2
+"Shards that a worker has at once: one is embedded while the other is read, or written."
+READY_BATCHES = 2
+"Stacked and waiting for the encoder."
+TOLERANCE = 0.01
+"Of an embedding's length."
+NO_PLACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM})
+"Errors of writing that the next shard would meet as well."
+Seconds = defaultdict[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Network:
+    """The encoder as the embedder needs to know it."""
+
+    fingerprint: str
+    "Of weights, config and preprocessing."
+    image_size: int
+    "Side in pixels of the images that it takes."
+    resizer: Resizer = "torch"
+    "Whose bicubic brings them to it."
+    factory: Callable[[int], Encoder]
+    "Called once on each worker, with the number of threads that it may use."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assignment:
+    """What the work on every shard has in common."""
+
+    shards: str
+    out: str
+    batch_size: int
+    dtype: str
+    threads: int
+    "That the encoder may use."
+    decode_threads: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Embedded:
+    """What became of a shard."""
+
+    rows: int
+    rejected: tuple[Rejection, ...]
+    seconds: dict[str, float]
+    "Of threads, by what they did: read, decode, infer, write."
+
+
+class CannotWrite(RuntimeError):
+    """The table's place takes no more. One sentence."""
+
+
+class ShardEmbedder:
+    """One worker. `work` may be called by two threads at once."""
+
+    def __init__(self, given: Assignment, network: Network) -> None:
+        self._given, self._network = given, network
+        # One thread for all that computes: shards queue here, and torch's settings of a thread hold
+        # for every pass.
+        self._device = ThreadPoolExecutor(1)
+        # Threads for the worker's life, shared by the shards that it has at once.
+        self._decoders = ThreadPoolExecutor(given.decode_threads)
+        self._readers = SimpleQueue[ThreadPoolExecutor]()
+        for _ in range(IN_FLIGHT):
+            self._readers.put(ThreadPoolExecutor(1))
+        self._encoder: Encoder
+        self._dimension = 0
+
+    def start(self) -> list[str]:
+        """Load the encoder; returns its remarks."""
+        self._encoder = self._device.submit(self._network.factory, self._given.threads).result()
+        return list(getattr(self._encoder, "remarks", ()))
+
+    def work(self, shard: Shard) -> Embedded:
+        """Embed one shard and write its part.
+
+        Raises InputError where the tar is cut off or not what the manifest says, CannotWrite where
+        nothing can be written.
+        """
+        seconds, rejected, samples = Seconds(float), list[Rejection](), list[Sample]()
+        batches_made = self._batches(shard, samples, rejected, seconds)
+        with (
+            self._reader() as reader,
+            closing(ready(batches_made, READY_BATCHES, reader)) as batches,
+        ):
+            first = next(
+                batches, None
+            )  # asked for here, so that it is made while another shard is being embedded
+            found = chain([] if first is None else [first], batches)
+            embeddings_ND = self._device.submit(
+                self._infer, shard, samples, found, seconds
+            ).result()
+        if len(samples) + len(rejected) != shard.samples:
+            raise InputError(
+                f"{self._tar(shard)} holds {len(samples) + len(rejected)} images, expected the {shard.samples} of the "
+                "manifest; copy it again from where it came from, or pack again"
+            )
+        start = time.perf_counter()
+        self._write(shard, samples, embeddings_ND[: len(samples)], rejected)
+        seconds["write"] += time.perf_counter() - start
+        return Embedded(rows=len(samples), rejected=tuple(rejected), seconds=dict(seconds))
+
+    @contextmanager
+    def _reader(self) -> Iterator[ThreadPoolExecutor]:
+        reader = self._readers.get()
+        try:
+            yield reader
+        finally:
+            self._readers.put(reader)
+
+    def _tar(self, shard: Shard) -> str:
+        return storage.join(self._given.shards, f"{shard.name}.tar")
+
+    def _batches(
+        self, shard: Shard, kept: list[Sample], rejected: list[Rejection], seconds: Seconds
+    ) -> Iterator[npt.NDArray[np.uint8]]:
+        """Images (B, 3, H, W) of a shard: all batches but the last are full, whatever had to be
+        left out.
+        """
+        given = self._given
+        samples = _timed(
+            read_shard(given.shards, shard.name, shard.split, shard.view, shard.sha256), seconds
+        )
+        images: list[Pixels] = []
+        for (sample, image), spent in ahead(self._open, samples, self._decoders, given.batch_size):
+            seconds["decode"] += spent
+            if isinstance(image, DecodeError):
+                rejected.append(Rejection(path=sample.key, reason=image.reason, found=image.found))
+                continue
+            kept.append(Sample(key=sample.key, data=b"", facts=sample.facts))
+            images.append(image)
+            if len(images) == given.batch_size:
+                yield stack(images)
+                images = []
+        if images:
+            yield stack(images)
+
+    def _open(self, sample: Sample) -> tuple[Opened, float]:
+        start = time.perf_counter()
+        found = opened(sample, self._network.image_size, self._network.resizer)
+        return found, time.perf_counter() - start
+
+    def _infer(
+        self,
+        shard: Shard,
+        kept: list[Sample],
+        batches: Iterable[npt.NDArray[np.uint8]],
+        seconds: Seconds,
+    ) -> Floats | Halves:
+        """Embeddings (N, D) in the table's numbers; rows beyond the images that could be decoded
+        mean nothing.
+        """
+        found_ND: Floats | Halves | None = None
+        count = 0
+        for images_B3HW in batches:
+            start = time.perf_counter()
+            embeddings_BD = self._encoder(images_B3HW)
+            seconds["infer"] += time.perf_counter() - start
+            length_B = np.sqrt(np.einsum("bd,bd->b", embeddings_BD, embeddings_BD))
+            unit_B = np.abs(length_B - 1) <= TOLERANCE  # false of a NaN
+            if not unit_B.all():
+                worst = int(np.argmin(unit_B))
+                raise InputError(
+                    f"the network gives {kept[count + worst].key} an embedding of length {length_B[worst]:.4g}, expected 1; "
+                    "look at that image, and at the checkpoint"
+                )
+            if found_ND is None:
+                self._dimension = embeddings_BD.shape[1]
+                found_ND = np.empty((shard.samples, self._dimension), self._given.dtype)
+            if (
+                count + len(embeddings_BD) <= shard.samples
+            ):  # more is refused when all have been counted
+                found_ND[count : count + len(embeddings_BD)] = embeddings_BD
+            count += len(embeddings_BD)
+        if (
+            found_ND is None and not self._dimension
+        ):  # not one image, of this worker's first shard: a part all the same
+            size = self._network.image_size
+            self._dimension = self._encoder(stack([np.zeros((size, size, 3), np.uint8)])).shape[1]
+        return np.empty((0, self._dimension), self._given.dtype) if found_ND is None else found_ND
+
+    def _write(
+        self,
+        shard: Shard,
+        samples: list[Sample],
+        embeddings_BD: Floats | Halves,
+        rejected: list[Rejection],
+    ) -> None:
+        tags = [sample.facts["geotag"] or {} for sample in samples]
+        rows = PartRows(
+            keys=[sample.key for sample in samples],
+            locations=[sample.facts["location"] for sample in samples],
+            views=[sample.facts["view"] for sample in samples],
+            splits=[sample.facts["split"] for sample in samples],
+            lats=[tag.get("lat") for tag in tags],
+            lons=[tag.get("lon") for tag in tags],
+            embeddings_BD=embeddings_BD,
+        )
+        footer = PartFooter(
+            fingerprint=self._network.fingerprint,
+            shard_sha256=shard.sha256,
+            rows=len(samples),
+            rejected=tuple(rejected),
+        )
+        path = storage.join(self._given.out, f"{shard.name}.parquet")
+        try:
+            write_part(path, rows, footer, self._given.dtype)
+        except OSError as error:
+            if error.errno not in NO_PLACE:
+                raise
+            raise CannotWrite(
+                f"{path} cannot be written ({error.strerror}), expected {embeddings_BD.nbytes / 1e6:.1f} MB of room and the "
+                "right to write; make room or choose another --out, and run the same command again to go on"
+            ) from None
+
+
+def _timed(samples: Iterator[Sample], seconds: Seconds) -> Iterator[Sample]:
+    """The same samples, with the time that each took counted as reading."""
+    while True:
+        start = time.perf_counter()
+        sample = next(samples, None)
+        seconds["read"] += time.perf_counter() - start
+        if sample is None:
+            return
+        yield sample

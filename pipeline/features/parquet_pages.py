@@ -1,0 +1,165 @@
+"""Where the values of an uncompressed Parquet column lie in its file, so that single rows can be
+read without their row group.
+
+In: the bytes of a file whose column is stored plain and without nulls. Out: for each data page the
+number of its first value, the byte it begins at, and the checksum that its header has, by which
+whoever reads it finds damage. pyarrow reads whole row groups only, and says no place of a page.
+Source: the Parquet format (parquet.thrift) and Thrift's compact protocol, of which a page's header
+is one struct.
+"""
+
+import mmap
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow.parquet as pq
+
+DATA_PAGE, DATA_PAGE_V2 = 0, 3
+PLAIN = 0
+# Fields of a PageHeader, and of its struct on a data page of either version.
+KIND, SIZE, CRC, HEADER_V1, HEADER_V2 = 1, 3, 4, 5, 8
+VALUES, ENCODING_V1, ENCODING_V2 = 1, 2, 4
+STOP, TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRUCT = range(13)
+Struct = dict[int, "int | Struct"]
+Whole = npt.NDArray[np.int64]
+
+
+NO_CRC = -1
+
+
+class Damaged(Exception):
+    """A page is not what was written."""
+
+
+class NotPlain(Exception):
+    """The column is stored in a way that single values cannot be read from."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pages:
+    """The data pages of a column, over all row groups of a file; P pages."""
+
+    first_P: Whole
+    "Number of each page's first value."
+    begin_P: Whole
+    "Byte of the file at which its values begin."
+    page_P: Whole
+    """Byte at which each page begins, behind its header; the levels of the list stand before the
+    values."""
+    end_P: Whole
+    "Byte behind it."
+    crc_P: Whole
+    "CRC-32 of these bytes; NO_CRC where the header has none, as before 2026-11-24."
+    values: int
+    "Of the whole column."
+
+    def refuse_damaged(self, data: memoryview, page: int) -> None:
+        """Raise Damaged where a page's bytes have not the checksum of its header."""
+        crc = int(self.crc_P[page])
+        if (
+            crc != NO_CRC
+            and zlib.crc32(data[int(self.page_P[page]) : int(self.end_P[page])]) != crc
+        ):
+            raise Damaged(f"the checksum of the page at byte {self.page_P[page]} is another")
+
+
+def find_pages(parquet: pq.ParquetFile, data: mmap.mmap, column: int, width: int) -> Pages:
+    """The pages of one column whose values take `width` bytes each.
+
+    Raises NotPlain where it is compressed, encoded, or its pages do not add up.
+    """
+    pages: list[tuple[int, int, int, int, int]] = []
+    values = 0
+    for group in range(parquet.num_row_groups):
+        chunk = parquet.metadata.row_group(group).column(column)
+        if chunk.compression != "UNCOMPRESSED" or chunk.has_dictionary_page:
+            raise NotPlain
+        at, end, before = (
+            chunk.data_page_offset,
+            chunk.data_page_offset + chunk.total_compressed_size,
+            values,
+        )
+        while at < end:
+            try:
+                header, body = _struct(data, at)
+            except (IndexError, ValueError):  # a torn file
+                raise NotPlain from None
+            count = _values(header)
+            size = header.get(SIZE)
+            if not isinstance(size, int) or size < count * width or body + size > end:
+                raise NotPlain
+            said = header.get(CRC)
+            crc = said & 0xFFFFFFFF if isinstance(said, int) else NO_CRC
+            pages.append((values, body + size - count * width, body, body + size, crc))
+            values += count
+            at = body + size
+        if values - before != chunk.num_values:
+            raise NotPlain
+    first_P, begin_P, page_P, end_P, crc_P = np.array(pages, np.int64).reshape(-1, 5).T
+    return Pages(
+        first_P=first_P, begin_P=begin_P, page_P=page_P, end_P=end_P, crc_P=crc_P, values=values
+    )
+
+
+def _values(header: Struct) -> int:
+    """How many values a data page holds."""
+    version = {DATA_PAGE: (HEADER_V1, ENCODING_V1), DATA_PAGE_V2: (HEADER_V2, ENCODING_V2)}
+    kind = header.get(KIND)
+    field, encoding = version.get(kind, (0, 0)) if isinstance(kind, int) else (0, 0)
+    said = header.get(field)
+    if not isinstance(said, dict) or said.get(encoding) != PLAIN:
+        raise NotPlain
+    count = said.get(VALUES)
+    if not isinstance(count, int) or count < 0:
+        raise NotPlain
+    return count
+
+
+def _struct(data: mmap.mmap, at: int) -> tuple[Struct, int]:
+    """A struct of the compact protocol: its numbers and structs by field, and the byte behind it."""
+    found: Struct = {}
+    field = 0
+    while True:
+        step, kind = data[at] >> 4, data[at] & 15
+        at += 1
+        if kind == STOP:
+            return found, at
+        if step:
+            field += step
+        else:
+            field, at = _number(data, at)
+        if kind in (TRUE, FALSE):
+            continue
+        if kind == STRUCT:
+            found[field], at = _struct(data, at)
+        elif kind in (I16, I32, I64):
+            found[field], at = _number(data, at)
+        elif kind == BINARY:
+            length, at = _varint(data, at)
+            at += length
+        elif kind == BYTE:
+            at += 1
+        elif kind == DOUBLE:
+            at += 8
+        else:  # a page's header has no lists, sets or maps
+            raise ValueError(kind)
+
+
+def _number(data: mmap.mmap, at: int) -> tuple[int, int]:
+    value, at = _varint(data, at)
+    return (value >> 1) ^ -(value & 1), at
+
+
+def _varint(data: mmap.mmap, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        byte = data[at]
+        value |= (byte & 127) << shift
+        at += 1
+        if byte < 128:
+            return value, at
+        shift += 7
+        if shift > 63:
+            raise ValueError(shift)

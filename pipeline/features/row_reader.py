@@ -1,0 +1,148 @@
+"""Single embeddings out of a feature table on a local disk: where in which part they stand in,
+their vectors out.
+
+Parts are mapped into memory, so only what is asked for is read and the operating system keeps what
+is asked for often. The first time that a page is read from, all of it is, and held against its
+checksum: 65 us, once a page and reader. An index that refines its answers, or searches a few
+candidates exactly, needs no copy of the vectors. Shapes: R rows asked for, D dimensions.
+"""
+
+import mmap
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.core import storage
+from pipeline.core.arrays import Floats, Halves, Whole
+from pipeline.core.errors import InputError
+from pipeline.features.parquet_pages import Damaged, NotPlain, Pages, find_pages
+from pipeline.features.part import header_of, open_part
+
+OPEN_PARTS = 512
+"Mapped at once: each takes a file descriptor."
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Mapped:
+    bytes_N: npt.NDArray[np.uint8]
+    "The whole file."
+    pages: Pages
+    dtype: "np.dtype[np.float16] | np.dtype[np.float32]"
+    sound_P: npt.NDArray[np.bool_]
+    "Pages whose checksum was found right."
+
+
+class RowReader:
+    """The embeddings of a table's parts by row number within a part. Not for several threads at
+    once.
+    """
+
+    def __init__(self, table: str, dimension: int) -> None:
+        self._table, self._dimension = table, dimension
+        self._open: OrderedDict[str, _Mapped] = OrderedDict()
+
+    def read(self, part: str, shard_sha256: str, row_R: Whole) -> Floats | Halves:
+        """Embeddings (R, D) of rows of a part, as stored, in the order asked for.
+
+        `shard_sha256` is the shard that the part is of. Raises InputError where the part is gone, another's, or not stored
+        as embed_gallery stores it.
+        """
+        mapped = self._part(part, shard_sha256)
+        pages, width = mapped.pages, self._dimension * mapped.dtype.itemsize
+        rows_RW = np.empty((len(row_R), width), np.uint8)
+        end_P = np.append(pages.first_P[1:], pages.values)
+        value_R = row_R * self._dimension
+        page_R = np.searchsorted(pages.first_P, value_R, side="right") - 1
+        begin_R = pages.begin_P[page_R] + (value_R - pages.first_P[page_R]) * mapped.dtype.itemsize
+        whole_R = value_R + self._dimension <= end_P[page_R]
+        last_R = np.searchsorted(pages.first_P, value_R + self._dimension - 1, side="right") - 1
+        self._refuse_damaged(part, mapped, page_R, last_R)
+        for row, begin in zip(
+            np.flatnonzero(whole_R).tolist(), begin_R[whole_R].tolist(), strict=True
+        ):
+            rows_RW[row] = mapped.bytes_N[begin : begin + width]
+        for row in np.flatnonzero(~whole_R).tolist():
+            rows_RW[row] = self._across_pages(mapped, int(value_R[row]), int(page_R[row]))
+        return rows_RW.view(mapped.dtype)
+
+    def _refuse_damaged(self, part: str, mapped: _Mapped, first_R: Whole, last_R: Whole) -> None:
+        """Raise InputError where a page of rows that reach from a first to a last one is not what
+        was written.
+        """
+        if mapped.sound_P.all():
+            return
+        wanted_P = np.zeros(
+            len(mapped.sound_P) + 1, np.int32
+        )  # +1 where a row begins, -1 behind its end
+        np.add.at(wanted_P, first_R, 1)
+        np.add.at(wanted_P, last_R + 1, -1)
+        for page in np.flatnonzero((np.cumsum(wanted_P)[:-1] > 0) & ~mapped.sound_P).tolist():
+            try:
+                mapped.pages.refuse_damaged(mapped.bytes_N.data, page)
+            except Damaged as error:
+                raise InputError(
+                    f"{storage.join(self._table, part)} is damaged ({error}); delete it and embed its shard again"
+                ) from None
+            mapped.sound_P[page] = True
+
+    def _across_pages(self, mapped: _Mapped, value: int, page: int) -> npt.NDArray[np.uint8]:
+        """The bytes of a row that begins in one page and ends in another."""
+        pages, width, pieces, missing = mapped.pages, mapped.dtype.itemsize, [], self._dimension
+        while missing:
+            end = pages.values if page + 1 == len(pages.first_P) else int(pages.first_P[page + 1])
+            begin = int(pages.begin_P[page]) + (value - int(pages.first_P[page])) * width
+            here = min(missing, end - value)
+            pieces.append(mapped.bytes_N[begin : begin + here * width])
+            value, page, missing = value + here, page + 1, missing - here
+        return np.concatenate(pieces)
+
+    def _part(self, name: str, shard_sha256: str) -> _Mapped:
+        if name in self._open:
+            self._open.move_to_end(name)
+            return self._open[name]
+        path = storage.join(self._table, name)
+        if not storage.exists(path):
+            raise InputError(
+                f"the index answers by vectors of {path}, which is not there; expected the feature table where it was when "
+                "the index was built; put it back, or build the index again with jobs/build_index.py"
+            )
+        with open_part(path) as parquet:
+            header = header_of(parquet, path)
+            if header.footer.shard_sha256 != shard_sha256 or header.dimension != self._dimension:
+                raise InputError(
+                    f"{path} is no longer of the shard that the index was built from; expected an unchanged part; build the "
+                    "index again with jobs/build_index.py"
+                )
+            mapped = _map(parquet, path, header.dtype)
+        self._open[name] = mapped
+        if len(self._open) > OPEN_PARTS:
+            self._open.popitem(last=False)
+        return mapped
+
+
+def readable(table: str) -> bool:
+    """Whether single rows can be read: of a table on this machine's disks."""
+    return storage.is_local(table)
+
+
+def _map(parquet: pq.ParquetFile, path: str, dtype: str) -> _Mapped:
+    embedding = pa.schema(parquet.schema_arrow).get_field_index(
+        "embedding"
+    )  # those before it have one column each
+    with open(storage.locate(path)[1], "rb") as stream:
+        data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    try:
+        kept = np.dtype(np.float16) if dtype == "float16" else np.dtype(np.float32)
+        pages = find_pages(parquet, data, embedding, kept.itemsize)
+    except NotPlain:
+        data.close()
+        raise InputError(
+            f"the embeddings of {path} are compressed, encoded or damaged, expected plain ones, as jobs/embed_gallery.py "
+            "writes them; delete it and embed its shard again"
+        ) from None
+    sound_P = np.zeros(len(pages.first_P), np.bool_)
+    return _Mapped(bytes_N=np.frombuffer(data, np.uint8), pages=pages, dtype=kept, sound_P=sound_P)

@@ -1,0 +1,187 @@
+"""The bytes of a file -> the size of the image that they hold, in microseconds: judged by its
+structure, not decoded.
+
+In: the encoded bytes, whole. Out: width and height as the image stands upright, or why it is
+refused.
+"""
+
+import io
+from dataclasses import dataclass
+
+import simplejpeg
+from PIL import Image
+
+from pipeline.images.decode import FORMATS, DecodeError, decode, orientation_of, refusing
+
+MAX_PIXELS = 178_956_970
+"""Where Pillow sees a decompression bomb: twice what 24 bits a pixel make of a quarter of a GiB.
+Beyond it decode refuses."""
+MIN_SIDE, MAX_SIDE = 8, 65_535
+"""Pixels. Smaller ones are a web page's spacers and counters, larger ones a mosaic's, which a
+source cuts into tiles."""
+MAX_RATIO = 100
+"Longer side over shorter one: what remains of a strip, squeezed into a square, shows no place."
+SIDEWAYS = 5
+"EXIF orientations from this one on turn an image so that its width becomes its height."
+PNG_ORIENTED = (b"Raw profile type exif\0", b"XML:com.adobe.xmp\0")
+"Keywords of the text chunks that may hold an orientation."
+
+
+def inspect(data: bytes, most_pixels: int = MAX_PIXELS) -> tuple[int, int]:
+    """Encoded image -> (width, height), upright as its EXIF orientation says; JPEG, PNG and WebP
+    without decoding.
+
+    It refuses for decode's reasons (`empty file`, `not an image`, `damaged image`, `too many pixels`), and besides for
+    `truncated image`, where the end is missing, and `absurd dimensions`. What it accepts may still not decode: flipped or
+    overwritten bytes within the compressed pixels, and a hole that was filled so that the end is where it belongs, are not
+    seen. CMYK JPEG, TIFF, BMP, GIF and all others are decoded, so of them all is seen; JPEG, PNG and WebP of more than
+    `most_pixels` never are.
+
+    Raises DecodeError.
+    """
+    with refusing(data):
+        if data.startswith(b"\xff\xd8\xff"):
+            size = _jpeg(data, most_pixels)
+        elif data.startswith(b"\x89PNG\r\n\x1a\n"):
+            size = _png(data, most_pixels)
+        elif data.startswith(b"RIFF") and data[8:12] == b"WEBP":
+            size = _webp(data)
+        else:
+            size = _decoded(data)
+    _refuse_absurd(*size, most_pixels)
+    return size
+
+
+def _refuse_absurd(width: int, height: int, most_pixels: int) -> None:
+    short, long = sorted((width, height))
+    if width * height > most_pixels:
+        raise DecodeError(
+            "too many pixels", f"{width} x {height}, expected at most {most_pixels} pixels"
+        )
+    if short < MIN_SIDE or long > MAX_SIDE or long > MAX_RATIO * short:
+        raise DecodeError(
+            "absurd dimensions",
+            f"{width} x {height}, expected sides of {MIN_SIDE} to {MAX_SIDE} pixels, one at most {MAX_RATIO} times the other",
+        )
+
+
+def _decoded(data: bytes) -> tuple[int, int]:
+    height, width = decode(data).shape[:2]
+    return width, height
+
+
+def _upright(data: bytes) -> tuple[int, int]:
+    """The size of an image that may say how it is to be turned: decode's own reader is asked."""
+    with Image.open(io.BytesIO(data), formats=FORMATS) as opened:  # reads the header only
+        width, height = opened.size
+        return (height, width) if orientation_of(opened) >= SIDEWAYS else (width, height)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _JpegHeader:
+    width: int
+    height: int
+    colours: int
+    described: bool
+    "Whether an APP1 segment (EXIF, XMP) is there."
+    scan: int
+    "Where the first scan begins."
+
+
+def _jpeg(data: bytes, most_pixels: int) -> tuple[int, int]:
+    header = _jpeg_header(data)
+    _refuse_absurd(header.width, header.height, most_pixels)
+    if header.colours not in (
+        1,
+        3,
+    ):  # decode leaves these to Pillow, which is milder than libjpeg about the end
+        return _decoded(data)
+    # The end marker cannot occur within compressed pixels. It may stand far from the file's end:
+    # cameras append previews, depth maps and padding. A thumbnail in the header has one too, hence
+    # the search from the first scan on.
+    if data.rfind(b"\xff\xd9", header.scan) < 0:  # from the end: it is mostly there
+        raise DecodeError("truncated image", f"{len(data)} bytes of JPEG without an end marker")
+    simplejpeg.decode_jpeg_header(data)  # libjpeg's own opinion of tables and colours
+    return _upright(data) if header.described else (header.width, header.height)
+
+
+def _jpeg_header(data: bytes) -> _JpegHeader:
+    """The segments up to the first scan. Bytes between segments that belong to none are skipped, as
+    libjpeg does.
+    """
+    at, end = 2, len(data)
+    width = height = colours = -1
+    described = False
+    while 0 <= at < end - 3:
+        if data[at] != 0xFF:
+            at = data.find(b"\xff", at)
+            continue
+        kind = data[at + 1]
+        if kind == 0xFF:
+            at += 1
+            continue
+        if kind == 0 or kind == 1 or 0xD0 <= kind <= 0xD8:  # without a length
+            at += 2
+            continue
+        length = (data[at + 2] << 8) + data[at + 3]
+        if kind == 0xDA:
+            if colours < 0:
+                raise DecodeError(
+                    "damaged image", f"{end} bytes of JPEG whose pixels come before their size"
+                )
+            return _JpegHeader(
+                width=width,
+                height=height,
+                colours=colours,
+                described=described,
+                scan=at + 2 + length,
+            )
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC) and at + 9 < end:
+            height, width = (data[at + 5] << 8) + data[at + 6], (data[at + 7] << 8) + data[at + 8]
+            colours = data[at + 9]
+        elif kind == 0xE1:
+            described = True
+        elif kind == 0xD9:
+            raise DecodeError("damaged image", f"{end} bytes of JPEG that end before any pixel")
+        at += 2 + length
+    raise DecodeError("truncated image", f"{end} bytes of JPEG that end within the header")
+
+
+def _png(data: bytes, most_pixels: int) -> tuple[int, int]:
+    at, described, pixels, end = 8, False, False, len(data)
+    size: tuple[int, int] | None = None
+    while at + 12 <= end:
+        length, kind = int.from_bytes(data[at : at + 4]), data[at + 4 : at + 8]
+        if kind == b"IEND":
+            break
+        if kind == b"IHDR":
+            size = int.from_bytes(data[at + 8 : at + 12]), int.from_bytes(data[at + 12 : at + 16])
+            _refuse_absurd(*size, most_pixels)
+        elif kind == b"eXIf" or (
+            kind in (b"iTXt", b"zTXt", b"tEXt") and data.startswith(PNG_ORIENTED, at + 8)
+        ):
+            described = True
+        pixels |= kind == b"IDAT"
+        at += 12 + length
+    else:
+        raise DecodeError("truncated image", f"{end} bytes of PNG without an end chunk")
+    if size is None or not pixels:
+        raise DecodeError(
+            "damaged image", f"{end} bytes of PNG without {'pixels' if size else 'a header'}"
+        )
+    return _upright(data) if described else size
+
+
+def _webp(data: bytes) -> tuple[int, int]:
+    said = 8 + int.from_bytes(data[4:8], "little")
+    if len(data) < said:
+        raise DecodeError("truncated image", f"{len(data)} bytes of WebP that says it has {said}")
+    return _upright(data)
+
+
+IMAGE_NAMES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
+"Endings of files that are taken for images, in lower case; upper case is fine too."
+
+
+def is_image(name: str) -> bool:
+    return name.lower().endswith(IMAGE_NAMES)

@@ -1,0 +1,72 @@
+"""An XMP packet -> its properties as text, by their names without namespace.
+
+In: XML from a file that anybody may have written. Out: a plain dictionary. A packet with a DOCTYPE
+is refused, as entities need one; size and depth are bounded. Names stand for themselves whatever
+their namespace: makers use the same names in namespaces of their own, and some forget to declare
+them.
+"""
+
+from xml.parsers import expat
+
+from pipeline.images.image_blocks import UnreadableTag
+
+LONGEST = 1 << 20
+"Bytes of a packet; a JPEG segment holds 64 kB."
+DEEPEST = 32
+"Elements within elements; cameras need five."
+SCAFFOLD = {"xmpmeta", "xapmeta", "RDF", "Description", "Seq", "Bag", "Alt", "li"}
+"Elements that hold properties and are none."
+
+
+def read_xmp(packet: bytes) -> dict[str, str]:
+    """Properties of a packet, written as attributes or as elements; a field of a structure is named
+    `structure.field`.
+
+    Of a property that is there twice the first counts. Raises UnreadableTag.
+    """
+    if len(packet) > LONGEST:
+        raise UnreadableTag(f"XMP of {len(packet)} bytes, more than {LONGEST}")
+    found: dict[str, str] = {}
+    path: list[str] = []
+    text: list[str] = []
+
+    def begin(name: str, attributes: dict[str, str]) -> None:
+        path.append(_local(name))
+        text.clear()
+        if len(path) > DEEPEST:
+            raise UnreadableTag(f"XMP with more than {DEEPEST} elements within each other")
+        for attribute, value in attributes.items():
+            if not attribute.startswith(("xmlns", "rdf:")):
+                found.setdefault(_name([*path, _local(attribute)]), value.strip())
+
+    def end(_: str) -> None:
+        said = "".join(text).strip()
+        if said:
+            found.setdefault(_name(path), said)
+        text.clear()
+        path.pop()
+
+    def doctype(*_: object) -> None:
+        raise UnreadableTag("XMP with a DOCTYPE")
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    parser.CharacterDataHandler = text.append
+    parser.StartDoctypeDeclHandler = doctype
+    try:
+        parser.Parse(packet.strip(b"\0 \t\r\n"), True)  # padding behind the last element is common
+    except expat.ExpatError as error:
+        raise UnreadableTag(f"XMP that is no XML: {error}") from None
+    except (ValueError, LookupError) as error:
+        if isinstance(error, UnreadableTag):
+            raise
+        raise UnreadableTag(f"XMP in an encoding that nobody knows: {error}") from None
+    return found
+
+
+def _local(name: str) -> str:
+    return name.rpartition(":")[2]
+
+
+def _name(path: list[str]) -> str:
+    return ".".join(name for name in path if name not in SCAFFOLD)

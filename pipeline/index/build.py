@@ -1,0 +1,299 @@
+"""The indexing stage: feature table -> index on disk, within a memory budget, with the recall that
+was measured.
+
+In: a feature table, or one split or view of it. Out: a folder of the trained index, the parts with
+their ids, and `index.json`, written last. What a killed build has done lies in `_building` until
+then: the same command goes on with it.
+"""
+
+import math
+import os
+import re
+import time
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import faiss
+
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.core.lock import one_at_a_time
+from pipeline.core.progress import console
+from pipeline.core.records import Split, View
+from pipeline.features.row_reader import readable
+from pipeline.features.table import FeatureTable, open_table, verify
+from pipeline.index.metadata import (
+    FACTS,
+    Effort,
+    IndexFacts,
+    as_said,
+    check_files,
+    read_facts,
+    write_facts,
+)
+from pipeline.index.plan import Gallery, Plan, plan_factory, plan_index
+from pipeline.index.recall import Held, efforts, hold_queries, speed, tuned
+from pipeline.index.searcher import Index
+from pipeline.index.train import SPECTRUM_ROWS, effective_dimension, new_index, sample, train
+from pipeline.index.workspace import Workshop, rows_by_part
+
+UNITS = {"": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+
+
+@dataclass(frozen=True, kw_only=True)
+class IndexSettings:
+    """Which table is indexed, and how."""
+
+    table: str
+    "Folder or URI of the feature table."
+    out: str
+    "Folder or URI of the index."
+    split: Split | None = None
+    "Only rows of this split."
+    view: View | None = None
+    "Only rows of this view."
+    memory_budget: str = "4GB"
+    """What building and searching may take in memory, the process included: a number with KB, MB,
+    GB or TB."""
+    target_recall: float = 0.95
+    "Recall@10 against exact search that the index is to reach."
+    factory: str | None = None
+    "FAISS factory string; by default the planner chooses."
+    refine: bool = False
+    "With --factory: score the best candidates again by the table's own vectors."
+    parts: int = 1
+    "Parts of the index, each a file that a machine of a cluster can hold."
+    workers: int = 0
+    """Ray tasks that build units of the index, of one core each; 0: this process builds, on all
+    cores."""
+    verify: bool = False
+    "Look at every byte of the table first, and of an index that is finished."
+
+    def __post_init__(self) -> None:
+        if not 0 < self.target_recall <= 1:
+            raise InputError(
+                f"--target-recall is {self.target_recall}, expected a fraction above 0 and at most 1"
+            )
+        if self.parts < 1 or self.workers < 0:
+            raise InputError(
+                f"found --parts {self.parts} and --workers {self.workers}; expected at least one part, and 0 workers or more"
+            )
+        if self.refine and not self.factory:
+            raise InputError(
+                "found --refine without --factory, whose planner decides it; leave it out or name a --factory"
+            )
+        parse_bytes(self.memory_budget)
+
+
+def parse_bytes(text: str) -> int:
+    """Bytes that a text such as `4GB` means.
+
+    Raises InputError.
+    """
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?B?)\s*", text.upper())
+    unit = (
+        ""
+        if match is None
+        else match[2]
+        if match[2].endswith("B") or not match[2]
+        else match[2] + "B"
+    )
+    if match is None or unit not in UNITS:
+        raise InputError(
+            f"--memory-budget is {text!r}, expected a number with KB, MB, GB or TB, such as 4GB"
+        )
+    return int(float(match[1]) * UNITS[unit])
+
+
+@one_at_a_time(lambda settings: settings.out)
+def build_index(settings: IndexSettings) -> dict[str, Any]:
+    """Build the index of a table, or of one split or view of it; a finished one is left as it is.
+    Returns its facts.
+
+    Raises InputError on unusable input, and where no index fits the budget.
+    """
+    table = verify(settings.table) if settings.verify else open_table(settings.table)
+    chosen = table.select(settings.split, settings.view)
+    asked = {
+        name: getattr(settings, name) for name in ("split", "view", "factory", "refine", "parts")
+    }
+    if storage.exists(storage.join(settings.out, FACTS)):
+        told = _finished(settings.out, chosen, asked, settings.verify)
+        if told is not None:
+            return as_said(told)
+    rows_of_part = rows_by_part(chosen)
+    if not rows_of_part:
+        held = ", ".join(f"{count} {split} {view}" for (split, view), count in table.counts.items())
+        raise InputError(
+            f"{settings.table} holds {held} and none of it was asked for; check --split and --view"
+        )
+    faiss.omp_set_num_threads(
+        os.cpu_count() or 1
+    )  # Ray sets OMP_NUM_THREADS in its jobs; this one uses all cores
+    start = time.perf_counter()
+    plan = make_plan(settings, chosen, rows_of_part)
+    console.print(
+        f"{plan.factory}: {plan.why}"
+        + (f"; {plan.bytes / 1e9:.2f} GB of memory" if plan.bytes else "")
+    )
+    workshop = Workshop(
+        out=settings.out, table=chosen, workers=settings.workers,
+        identity={"asked": asked, "table": table.digest, "plan": asdict(plan)},
+    )  # fmt: skip
+    index = new_index(plan.factory, table.dimension)
+    training_rows = 0 if index.is_trained else plan.training_rows
+    if not workshop.is_trained():
+        if training_rows:
+            train(index, plan.factory, sample(chosen, rows_of_part, training_rows)[1])
+        workshop.keep_trained(index)
+    rows = sum(rows_of_part.values())
+    part_rows = min(plan.part_rows, math.ceil(rows / settings.parts))
+    parts = workshop.build(rows_of_part, plan.unit_rows, part_rows)
+    facts = IndexFacts(
+        factory=plan.factory,
+        metric="inner product",
+        rows=rows,
+        dimension=table.dimension,
+        fingerprint=table.fingerprint,
+        table=storage.absolute(table.path),
+        asked=asked,
+        why=plan.why,
+        refine=plan.refine,
+        on_disk=plan.on_disk,
+        effort=Effort(breadth=1),
+        target_recall=settings.target_recall,
+        training_sample=training_rows,
+        build_seconds=0.0,
+        bytes_per_vector=0.0,
+        expected_bytes=plan.bytes or None,
+        unit_rows=plan.unit_rows,
+        part_rows=part_rows,
+        measured={},
+        parts=parts,
+        trained=workshop.hand_out_trained(),
+    )
+    others = table.select(Split.QUERY) if settings.split == Split.GALLERY else None
+    return finish(settings.out, facts, hold_queries(chosen, rows_of_part, others), workshop, start)
+
+
+def make_plan(settings: IndexSettings, table: FeatureTable, rows_of_part: dict[str, int]) -> Plan:
+    """The planner's answer for a table, or what the user asked for."""
+    gallery = Gallery(
+        rows=sum(rows_of_part.values()),
+        dimension=table.dimension,
+        budget=parse_bytes(settings.memory_budget),
+        target_recall=settings.target_recall,
+        rows_readable=readable(table.path),
+        workers=settings.workers,
+    )
+    if settings.factory:
+        return plan_factory(gallery, settings.factory, "table" if settings.refine else "none")
+    plan = plan_index(gallery)
+    if not plan.training_rows:
+        return plan
+    directions = effective_dimension(
+        sample(table, rows_of_part, min(SPECTRUM_ROWS, plan.training_rows))[1]
+    )
+    return plan_index(replace(gallery, effective_dimension=directions))
+
+
+def finish(
+    out: str, facts: IndexFacts, held: Held, workshop: Workshop, start: float
+) -> dict[str, Any]:
+    """Find the effort that reaches the recall, write what the index is, and clear the workshop.
+    Returns its facts.
+    """
+    size = sum(
+        each["bytes"]
+        for part in facts.parts
+        for name, each in part.files.items()
+        if name.endswith(".faiss")
+    )
+    built = round(time.perf_counter() - start, 3)
+    whole = replace(facts, parts=tuple(replace(part, removed=()) for part in facts.parts))
+    index = Index(
+        out, told=whole
+    )  # measured as if nothing had been removed: exact search knows of no removals
+    effort, at_1, at_10 = tuned(
+        index,
+        held,
+        efforts(new_index(facts.factory, facts.dimension), facts.refine),
+        facts.target_recall,
+    )
+    measured = {
+        "recall_at_1": at_1,
+        "recall_at_10": at_10,
+        "recall_queries": len(held.queries_QD),
+        "recall_queries_from": held.source,
+    }
+    measured |= speed(index, held, effort)
+    facts = replace(
+        facts,
+        effort=effort,
+        build_seconds=built,
+        bytes_per_vector=size / facts.rows,
+        measured=measured,
+    )
+    write_facts(out, facts)
+    workshop.clear()
+    if at_10 < facts.target_recall:
+        console.print(
+            f"recall@10 is {at_10:.3f} however hard the search tries, below the target of {facts.target_recall}; the index is "
+            "kept; a larger --memory-budget or another --factory may reach it",
+            style="yellow",
+        )
+    console.print(
+        f"{out}: {facts.rows} rows, {facts.factory}, recall@10 {at_10:.3f} of exact, "
+        f"{measured['queries_per_second']:.0f} queries/s"
+    )
+    return as_said(facts)
+
+
+def _finished(
+    out: str, table: FeatureTable, asked: dict[str, Any], whole: bool
+) -> IndexFacts | None:
+    """A finished index of the same rows and settings; None where it was one, is damaged, and is to
+    be built again.
+
+    `whole`: every byte is looked at. Raises InputError where it is another's.
+    """
+    told = read_facts(out)
+    held = told.table_parts
+    missing = rows_by_part(table.only([name for name in table.parts if name not in held]))
+    if (
+        told.asked == asked
+        and told.fingerprint == table.fingerprint
+        and held.items() <= table.shards.items()
+    ):
+        if missing:
+            raise InputError(
+                f"{out} holds an index of {len(held)} parts of the table, which has {len(missing)} more by now; say --extend "
+                "to add them, or choose another --out"
+            )
+        if _is_whole(out, told, whole):
+            console.print(f"{out} is complete: {told.rows} rows, {told.factory}; nothing to do")
+            return told
+        storage.remove(storage.join(out, FACTS))
+        return None
+    raise InputError(
+        f"{out} holds an index of other rows or settings; choose another --out or delete it"
+    )
+
+
+def _is_whole(out: str, told: IndexFacts, whole: bool) -> bool:
+    """Whether each file of an index is there and has its size, or is what was written.
+
+    Raises InputError where not, and building again would not give the same index.
+    """
+    try:
+        for files in told.files:
+            check_files(out, files, whole)
+    except InputError as error:
+        if removed := sum(len(part.removed) for part in told.parts):
+            raise InputError(f"{error}, and remove the {removed} locations again") from None
+        console.print(
+            f"{out}: a file is missing or not what was written; the index is built again",
+            style="yellow",
+        )
+        return False
+    return True

@@ -1,0 +1,277 @@
+"""Which FAISS index suits a gallery: rows, dimension, memory and wanted recall in, a factory string
+and its reasons out. Pure.
+
+The families stand from the fastest to the slowest, as `benchmarks/index.py` measures them
+(docs/results.md). The first that fits the memory and is known to reach the recall is taken; where
+none reaches it, the one that comes nearest.
+"""
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+from pipeline.core.errors import InputError
+
+EXACT_ROWS = 100_000
+"Rows up to which exact search is fast enough to need no planning."
+GRAPH_ROWS = 500_000
+"Rows up to which a graph is built: it takes several times as long as lists, in one piece."
+PROCESS_BYTES = 300e6
+"Python, FAISS, Arrow and Ray before the first vector."
+BLOCK_BYTES = 4 * 64e6
+"Blocks of the table on their way into the index, and FAISS's own copies of them."
+MASK_BYTES = 1.125
+"""Of a row while a filter is looked at: a truth value and a bit. Names and positions are mapped
+from the disk."""
+TRAINING_SHARE = 0.25
+"Of the memory, for the rows that an index is trained on."
+COPIED = 1.75
+"FAISS's residuals and reduced copies of them, the rows themselves included."
+MERGED = 1.3
+"Of the codes, what merging them and reading them back took, as measured with lists of 8-bit codes."
+MOST_TRAINING_ROWS = 2_000_000
+ROWS_PER_LIST = 50  # that train a centroid: FAISS warns below 39 and uses no more than 256
+UNIT_SHARE = 1 / 16
+"Of the memory, for the codes of one unit of work; while lists grow they take twice that."
+LEAST_UNIT_ROWS = 20_000
+PART_SHARE = 1 / 3
+"Of the memory, for merging a part of an index whose lists then stay on the disk."
+PIECE = 8  # dimensions of a 4-bit subquantiser: 256 of them at 2,048 dimensions
+REFINING = 10
+"Candidates per wanted row whose vectors are read from the table."
+Refine = Literal["none", "table"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gallery:
+    """What is to be indexed, and within what."""
+
+    rows: int
+    dimension: int
+    budget: float
+    "Bytes that building or searching may take, the process included."
+    target_recall: float
+    "Recall@10 against exact search."
+    effective_dimension: int | None = None
+    "Leading directions that hold nearly all of the vectors' length; None where not known."
+    workers: int = 0
+    "Other processes that build units, on machines with as much memory for all of them together."
+    rows_readable: bool = True
+    "Whether single vectors can be read from the table while searching."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """How to build, what it will take, and why."""
+
+    factory: str
+    "As `faiss.index_factory` reads it."
+    refine: Refine
+    "table: candidates are scored again by the table's own vectors."
+    on_disk: bool
+    "Inverted lists stay on the disk and are mapped into memory."
+    training_rows: int
+    "0: nothing is trained."
+    unit_rows: int
+    "Rows of a unit of work: built alone, then merged with the others."
+    part_rows: int
+    "Rows of a part of the index: more than one part where the lists stay on the disk."
+    search_bytes: float
+    build_bytes: float
+    expected_recall: float
+    "Recall@10 that is reached once the breadth is tuned."
+    why: str
+
+    @property
+    def bytes(self) -> float:
+        """The most that is in memory at any time."""
+        return max(self.search_bytes, self.build_bytes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Family:
+    """A kind of index."""
+
+    name: str
+    form: str
+    "Factory string with {lists} and {pieces}, the subquantisers."
+    ceiling: float
+    "Recall@10 that is reached with enough breadth: what quantisation leaves."
+    refine: Refine = "none"
+    on_disk: bool = False
+    graph: bool = False
+    "Built in one piece, for FAISS cannot merge graphs."
+    merging: float = MERGED
+    "Its codes' room, while units become one, as a multiple of the codes: appended ones double."
+    reduces: bool = False
+    "Whether it is used behind a projection onto the leading directions, or without one."
+
+    def code_bytes(self, dimension: int) -> float:
+        """Of one row's code with its id or its links."""
+        return {
+            "Flat": 4.0 * dimension,
+            "HNSW32,SQ8": dimension + 4.0 * 2 * 32 + 24,
+            "SQ8": dimension + 8.0,
+            "SQfp16": 2 * dimension + 8.0,
+            "PQfs": dimension / (2 * PIECE) + 8,
+            "RaBitQ": dimension / 8 + 16,
+            "RaBitQ4": dimension / 2 + 24,
+        }[self.name]
+
+
+FAMILIES = (
+    _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985, refine="table", reduces=True),
+    _Family(name="HNSW32,SQ8", form="HNSW32,SQ8", ceiling=0.985, graph=True, merging=2),
+    _Family(name="PQfs", form="IVF{lists},PQ{pieces}x4fs", ceiling=0.98, refine="table", merging=2),
+    _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985),
+    _Family(name="SQfp16", form="IVF{lists},SQfp16", ceiling=0.999),
+    _Family(name="RaBitQ", form="IVF{lists},RaBitQ", ceiling=0.97, refine="table", on_disk=True),
+    _Family(name="RaBitQ4", form="IVF{lists},RaBitQ4", ceiling=0.9),
+    _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985, on_disk=True),
+)
+EXACT = _Family(name="Flat", form="Flat", ceiling=1.0, merging=2)
+
+
+def plan_index(gallery: Gallery) -> Plan:
+    """The plan for a gallery.
+
+    Raises InputError where no family fits the memory, with what would.
+    """
+    found = list(_plans(gallery))
+    fitting = [plan for plan in found if plan.bytes <= gallery.budget]
+    if not fitting:
+        least = min(found, key=lambda plan: plan.bytes)
+        raise InputError(
+            f"{gallery.rows:,} rows of {gallery.dimension} dimensions take {least.bytes / 1e9:.2f} GB at least, by "
+            f"{least.factory}, and the budget is {gallery.budget / 1e9:.2f} GB; raise --memory-budget, or index the gallery in "
+            "several indexes, by --split, --view or tables of their own"
+        )
+    for plan in fitting:
+        if plan.expected_recall >= gallery.target_recall:
+            return plan
+    return max(fitting, key=lambda plan: plan.expected_recall)
+
+
+def plan_factory(gallery: Gallery, factory: str, refine: Refine = "none") -> Plan:
+    """The plan for a factory string of the user's. What it takes and reaches is not foreseen: 0."""
+    lists = re.search(r"IVF(\d+)", factory)
+    return Plan(
+        factory=factory,
+        refine=refine,
+        on_disk=False,
+        training_rows=_training_rows(gallery, int(lists[1]) if lists else 0),
+        unit_rows=max(LEAST_UNIT_ROWS, int(gallery.budget * UNIT_SHARE / (4 * gallery.dimension))),
+        part_rows=gallery.rows,
+        search_bytes=0,
+        build_bytes=0,
+        expected_recall=0,
+        why="as asked by --factory",
+    )
+
+
+def _plans(gallery: Gallery) -> Iterator[Plan]:
+    """Every family that suits the gallery, the fastest first, whatever it takes."""
+    if gallery.rows <= EXACT_ROWS:
+        yield _plan(EXACT, gallery)
+    pays = (
+        gallery.effective_dimension is not None
+        and gallery.effective_dimension <= gallery.dimension // 2
+    )
+    for family in FAMILIES:
+        readable = gallery.rows_readable or family.refine == "none"
+        buildable = gallery.rows <= GRAPH_ROWS or not family.graph
+        if readable and buildable and (pays or not family.reduces):
+            yield _plan(family, gallery)
+
+
+def _plan(family: _Family, gallery: Gallery) -> Plan:
+    reduced = (
+        gallery.effective_dimension
+        if family.reduces and gallery.effective_dimension
+        else gallery.dimension
+    )
+    lists = 0 if family is EXACT or family.graph else _lists(gallery)
+    trained = 0 if family is EXACT else _training_rows(gallery, lists)
+    code = family.code_bytes(reduced)
+    fixed = (
+        PROCESS_BYTES
+        + lists * (4.0 * reduced + 64)
+        + 4.0 * gallery.dimension * (reduced if family.reduces else 0)
+    )
+    codes, masks = gallery.rows * code, MASK_BYTES * gallery.rows
+    unit = min(
+        gallery.rows,
+        max(LEAST_UNIT_ROWS, int(gallery.budget * UNIT_SHARE / code / max(1, gallery.workers))),
+    )
+    if family.graph:
+        unit = gallery.rows
+    part = max(unit, int(gallery.budget * PART_SHARE / code)) if family.on_disk else gallery.rows
+    merging = part * code if family.on_disk else family.merging * codes
+    growing = max(1, gallery.workers) * (fixed + BLOCK_BYTES + 2 * unit * code) + (
+        PROCESS_BYTES if gallery.workers else 0
+    )
+    return Plan(
+        factory=(f"PCA{reduced}," if family.reduces else "") + form_of(family, lists, reduced),
+        refine=family.refine,
+        on_disk=family.on_disk,
+        training_rows=trained,
+        unit_rows=unit,
+        part_rows=part,
+        search_bytes=fixed + masks + (0 if family.on_disk else codes),
+        build_bytes=max(
+            growing, fixed + BLOCK_BYTES + max(merging, COPIED * 4.0 * trained * gallery.dimension)
+        ),
+        expected_recall=family.ceiling,
+        why=_reason(family, gallery, reduced, code),
+    )
+
+
+def form_of(family: _Family, lists: int, dimension: int) -> str:
+    """A family's factory string. FAISS wants as many subquantisers as divide the dimension."""
+    most = max(1, dimension // PIECE)
+    pieces = next(count for count in range(most, 0, -1) if dimension % count == 0)
+    return family.form.format(lists=lists, pieces=pieces)
+
+
+def _lists(gallery: Gallery) -> int:
+    """About twice the root of the rows, as a power of two; no more than the memory allows to train."""
+    most = max(1, _most_training_rows(gallery) // ROWS_PER_LIST)
+    return int(2 ** min(round(math.log2(2 * math.sqrt(gallery.rows))), math.floor(math.log2(most))))
+
+
+def _most_training_rows(gallery: Gallery) -> int:
+    by_memory = int(gallery.budget * TRAINING_SHARE / (4 * gallery.dimension))
+    return max(1, min(gallery.rows, by_memory, MOST_TRAINING_ROWS))
+
+
+def _training_rows(gallery: Gallery, lists: int) -> int:
+    """At least 16,384, which codes and projections are trained on as well."""
+    return min(_most_training_rows(gallery), max(16_384, ROWS_PER_LIST * lists))
+
+
+def _reason(family: _Family, gallery: Gallery, reduced: int, code: float) -> str:
+    what = {
+        "Flat": f"exact search: {gallery.rows:,} rows are few enough to look at each",
+        "HNSW32,SQ8": "a graph over 8-bit codes",
+        "SQfp16": "lists of 16-bit numbers",
+        "SQ8": "lists of 8-bit codes",
+        "PQfs": "lists of 4-bit product codes",
+        "RaBitQ": "lists of one-bit codes",
+        "RaBitQ4": "lists of four-bit codes",
+    }[family.name]
+    if family is EXACT:
+        return what
+    less = (
+        f" of vectors reduced from {gallery.dimension} to {reduced} directions"
+        if family.reduces
+        else ""
+    )
+    where = ", on the disk" if family.on_disk else ""
+    again = (
+        ", the best candidates scored again by the table's vectors"
+        if family.refine == "table"
+        else ""
+    )
+    return f"{what}{less}{where}{again}: {code:,.0f} bytes a row"

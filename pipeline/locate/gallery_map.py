@@ -1,0 +1,82 @@
+"""The images of an index on the map: where they lie, and how far apart.
+
+In: an opened index. Out: keys and positions of its rows, and the gallery's spacing.
+Shapes: N rows, P distinct positions, 2 = latitude and longitude in degrees (NaN where unknown).
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipeline.core.arrays import Doubles, Whole, Words
+from pipeline.core.geo import on_sphere
+from pipeline.index.searcher import Index
+
+MOST = 200_000
+"Rows that are read at most: enough for the spacing, and more than a page can draw."
+
+
+@dataclass(frozen=True, kw_only=True)
+class GalleryMap:
+    """Rows of an index."""
+
+    keys: Words
+    places_N2: Doubles
+    rows: int
+    "Of the whole index, of which these may be a sample."
+
+    @cached_property
+    def distinct_P2(self) -> Doubles:
+        """Positions (P, 2) that are known, each once."""
+        return np.unique(self.places_N2[~np.isnan(self.places_N2).any(axis=1)], axis=0)
+
+    @property
+    def distinct(self) -> float:
+        """How many there are in the whole index, about."""
+        return len(self.distinct_P2) * self.rows / max(len(self.keys), 1)
+
+    @cached_property
+    def spacing_m(self) -> float | None:
+        """Median distance from a position to the next other one, metres; None where no two are
+        known.
+
+        From a sample of n of N rows it is taken for sqrt(n / N) of what the sample shows, as on an
+        area.
+        """
+        if len(self.distinct_P2) < 2:
+            return None
+        points_P3 = on_sphere(self.distinct_P2)
+        apart_P2, _ = cKDTree(points_P3).query(points_P3, k=2)
+        return float(np.median(apart_P2[:, 1]) * np.sqrt(len(self.keys) / self.rows))
+
+    def nearest(self, lat: float, lon: float, count: int) -> Whole:
+        """Numbers of the rows nearest to a position, nearest first, at most `count`."""
+        known = np.flatnonzero(~np.isnan(self.places_N2).any(axis=1))
+        here_13 = on_sphere(np.array([[lat, lon]]))
+        away_N = np.linalg.norm(on_sphere(self.places_N2[known]) - here_13, axis=1)
+        return np.asarray(known[np.argsort(away_N, kind="stable")[:count]])
+
+
+def gallery_map(index: Index) -> GalleryMap:
+    """The rows of an index, or MOST of them from all over it; without the locations that were
+    removed.
+    """
+    rows = np.unique(
+        np.linspace(0, index.told.rows - 1, min(index.told.rows, MOST)).astype(np.int64)
+    )
+    names = index.names(rows[None])
+    location_N = np.asarray(names["location"].to_pylist(), dtype=np.str_)
+    kept_N = np.ones(len(rows), np.bool_)
+    for part in index.told.parts:
+        here_N = (rows >= part.first_row) & (rows < part.first_row + part.rows)
+        kept_N &= ~(here_N & np.isin(location_N, np.array(part.removed, dtype=np.str_)))
+    places_N2 = np.stack(
+        [names[name].to_numpy().astype(np.float64) for name in ("lat", "lon")], axis=1
+    )
+    return GalleryMap(
+        keys=np.asarray(names["key"].to_pylist(), dtype=np.str_)[kept_N],
+        places_N2=places_N2[kept_N],
+        rows=len(index),
+    )

@@ -1,0 +1,214 @@
+"""Answers on a map, as SVG geometry: gallery images where they lie, candidates, and the circle that
+a photo lies in.
+
+In: positions in degrees. Out: pixels. A map is a plane touching the earth at its middle, north up,
+which holds over some hundred kilometres. Shapes: N positions, 2 = latitude, longitude; or x to the
+right, y downwards, pixels.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.core.arrays import Doubles
+from pipeline.core.geo import EARTH_M
+from pipeline.locate.gallery_map import GalleryMap
+from pipeline.locate.locate import Answer
+
+SIDE = 320
+"Pixels of a map's side, before it is scaled to the page."
+STEPS = 2.6
+"""Half the side of a map around a place, in spacings of the gallery: its neighbours are seen, and
+theirs in part."""
+TILES = 64
+"Gallery images that a map shows at most."
+DOTS = 4000
+"Gallery positions that the overview shows at most."
+Footprint = Sequence[Sequence[float]]
+"Corners, latitude and longitude, from the image's upper left clockwise."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """The square of ground that a map shows."""
+
+    lat: float
+    lon: float
+    half_m: float
+
+    def pixels(self, places_N2: Doubles) -> Doubles:
+        """Pixels (N, 2) of positions (N, 2). The difference of longitudes goes the short way round."""
+        away_N = (places_N2[:, 1] - self.lon + 180) % 360 - 180
+        east_N = EARTH_M * np.radians(away_N) * math.cos(math.radians(self.lat))
+        south_N = EARTH_M * np.radians(self.lat - places_N2[:, 0])
+        return np.stack([east_N, south_N], axis=1) * (SIDE / 2 / self.half_m) + SIDE / 2
+
+    def length(self, metres: float) -> float:
+        """Pixels of a length."""
+        return metres * SIDE / 2 / self.half_m
+
+    @property
+    def bar_m(self) -> float:
+        """A round number of metres that takes a tenth to a quarter of the side."""
+        power = 10.0 ** math.floor(math.log10(self.half_m / 2))
+        return max(times * power for times in (1, 2, 5) if times * power <= self.half_m / 2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tile:
+    """A gallery image on the ground."""
+
+    key: str
+    matrix: str
+    "Of the SVG transform that brings the unit square to its place."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mark:
+    """Something at a point of the map."""
+
+    x: float
+    y: float
+    label: str
+    title: str
+    kind: str
+    "Class of the template's style sheet."
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One map."""
+
+    frame: Frame
+    summary: str
+    "The map in words, for those who cannot see it."
+    tiles: tuple[Tile, ...] = ()
+    dots: tuple[tuple[float, float], ...] = ()
+    marks: tuple[Mark, ...] = ()
+    circle: tuple[float, float, float] | None = None
+    "x, y and radius of the uncertainty."
+    line: str = ""
+    "Points of the flight's polyline."
+
+
+def keys_around(answer: Answer, gallery: GalleryMap) -> list[str]:
+    """The gallery images that the map around an answer may show."""
+    if answer.position is None:
+        return []
+    return [
+        str(gallery.keys[number])
+        for number in gallery.nearest(answer.position.lat, answer.position.lon, TILES)
+    ]
+
+
+def place_map(
+    answer: Answer, gallery: GalleryMap, footprints: Mapping[str, Footprint]
+) -> View | None:
+    """The surroundings of an answer, drawn with the gallery's own images; None without a position."""
+    position = answer.position
+    if position is None:
+        return None
+    spacing = gallery.spacing_m or position.radius_m or 1.0
+    half_m = max(STEPS * spacing, 1.3 * position.radius_m)
+    frame = Frame(lat=position.lat, lon=position.lon, half_m=half_m)
+    tiles = []
+    for number in gallery.nearest(position.lat, position.lon, TILES).tolist():
+        key, (lat, lon) = str(gallery.keys[number]), gallery.places_N2[number].tolist()
+        corners_32 = frame.pixels(
+            np.array(footprints.get(key) or square(lat, lon, 0.96 * spacing))[[0, 1, 3]]
+        )
+        if (corners_32.max(axis=0) > 0).all() and (corners_32.min(axis=0) < SIDE).all():
+            tiles.append(Tile(key=key, matrix=matrix(corners_32)))
+    (x, y), *_ = frame.pixels(np.array([[position.lat, position.lon]])).tolist()
+    return View(
+        frame=frame,
+        tiles=tuple(reversed(tiles)),
+        marks=tuple(candidate_marks(answer, frame)),
+        circle=(x, y, frame.length(position.radius_m)),
+        summary=f"Map of {2 * half_m:.0f} m around latitude {position.lat:.5f}, longitude {position.lon:.5f}",
+    )
+
+
+def overview(
+    answers: Sequence[tuple[str, Answer]], gallery: GalleryMap, track: bool
+) -> View | None:
+    """All of the gallery as dots, with a mark for each answer that is known; None where no position
+    is known.
+    """
+    known_N2 = gallery.places_N2[~np.isnan(gallery.places_N2).any(axis=1)][:DOTS]
+    if not len(known_N2):
+        return None
+    found = [(name, one.position) for name, one in answers if one.known and one.position]
+    at_M2 = np.array([(position.lat, position.lon) for _, position in found]).reshape(-1, 2)
+    frame = frame_of(np.concatenate([known_N2, at_M2]))
+    points_M2 = frame.pixels(at_M2)
+    return View(
+        frame=frame,
+        dots=tuple(map(tuple, frame.pixels(known_N2).round(1).tolist())),
+        marks=tuple(
+            Mark(x=x, y=y, label="", title=name, kind="answer")
+            for (name, _), (x, y) in zip(found, points_M2.tolist(), strict=True)
+        ),
+        line=" ".join(f"{x:.1f},{y:.1f}" for x, y in points_M2.tolist()) if track else "",
+        summary=f"Map of the whole gallery, {2 * frame.half_m / 1000:.1f} km across, with {len(found)} answers",
+    )
+
+
+def frame_of(places_N2: Doubles) -> Frame:
+    """The square around positions; N >= 1. Around the first one, so that the meridian of 180
+    degrees is no border.
+    """
+    lon_N = (places_N2[:, 1] - places_N2[0, 1] + 180) % 360 - 180
+    lat = float((places_N2[:, 0].min() + places_N2[:, 0].max()) / 2)
+    lon = float((lon_N.min() + lon_N.max()) / 2 + places_N2[0, 1] + 180) % 360 - 180
+    half = Frame(lat=lat, lon=lon, half_m=SIDE / 2)  # a pixel is a metre
+    return Frame(
+        lat=lat,
+        lon=lon,
+        half_m=1.06 * max(float(np.abs(half.pixels(places_N2) - SIDE / 2).max()), 10.0),
+    )
+
+
+def candidate_marks(answer: Answer, frame: Frame) -> list[Mark]:
+    """The candidates that lie within a map, numbered by rank."""
+    marks = []
+    for rank, hit in enumerate(answer.candidates, 1):
+        if hit.lat is None or hit.lon is None:
+            continue
+        x, y = frame.pixels(np.array([[hit.lat, hit.lon]]))[0].tolist()
+        if 0 <= x <= SIDE and 0 <= y <= SIDE:
+            marks.append(
+                Mark(
+                    x=x,
+                    y=y,
+                    label=str(rank),
+                    title=f"{hit.location}, {hit.score:.3f}",
+                    kind="candidate",
+                )
+            )
+    return marks
+
+
+def square(lat: float, lon: float, side_m: float) -> Footprint:
+    """Corners, from the upper left clockwise, of a square of ground with its sides to the north and
+    east.
+    """
+    north = math.degrees(side_m / 2 / EARTH_M)
+    east = north / max(math.cos(math.radians(lat)), 1e-6)
+    return (
+        (lat + north, lon - east),
+        (lat + north, lon + east),
+        (lat - north, lon + east),
+        (lat - north, lon - east),
+    )
+
+
+def matrix(corners_32: Doubles) -> str:
+    """The transform that brings (0, 0), (1, 0), (0, 1) to three corners: upper left, upper right,
+    lower left.
+    """
+    origin_2, right_2, down_2 = corners_32
+    numbers = [*(right_2 - origin_2), *(down_2 - origin_2), *origin_2]
+    return f"matrix({' '.join(f'{number:.2f}' for number in numbers)})"

@@ -1,0 +1,106 @@
+"""A sheet of paper for a map: positions in, coordinates, scale bar, meridians and parallels out.
+
+Equirectangular, true to scale at its middle latitude: right for places some hundred metres apart,
+whichever meridian they lie at, and a plain world map for places all over the world.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.core.arrays import Doubles
+from pipeline.core.geo import EARTH_M
+from pipeline.report.svg import Tick, nice_ticks
+
+WIDTH, HEIGHT, MARGIN = 520, 360, 22
+SMALLEST_M = 100.0  # across: a single place gets a map too
+GRID_FROM_M = 50_000.0  # meridians and parallels mean something from here on
+METRES_PER_DEGREE = EARTH_M * math.pi / 180
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sheet:
+    """From positions to the map's coordinates."""
+
+    south: float
+    north: float
+    west: float
+    "The meridian that the map starts at; longitudes are counted eastwards from it."
+    wide: float
+    "Degrees of longitude across."
+    scale: float
+    "Map units per metre, at the middle latitude."
+
+    @classmethod
+    def around(cls, at_N2: Doubles) -> "Sheet":
+        """A map that holds these positions (latitude, longitude)."""
+        south, north = float(at_N2[:, 0].min()), float(at_N2[:, 0].max())
+        meridians = np.unique(at_N2[:, 1] % 360)
+        gaps = np.diff(meridians, append=meridians[0] + 360)
+        widest = int(np.argmax(gaps))
+        west, wide = float(meridians[(widest + 1) % len(meridians)]), float(360 - gaps[widest])
+        if wide > 180:  # all over the world: as world maps are
+            west, wide = -180.0, 360.0
+        shrink = math.cos(math.radians((south + north) / 2))
+        tall_m, wide_m = ((north - south) * METRES_PER_DEGREE, wide * METRES_PER_DEGREE * shrink)
+        scale = min(
+            (WIDTH - 2 * MARGIN) / max(wide_m, SMALLEST_M),
+            (HEIGHT - 2 * MARGIN) / max(tall_m, SMALLEST_M),
+        )
+        return cls(south=south, north=north, west=west, wide=wide, scale=scale)
+
+    @property
+    def _shrink(self) -> float:
+        return math.cos(math.radians((self.south + self.north) / 2))
+
+    def x(self, lon: float) -> float:
+        east = (lon - self.west) % 360
+        east = (
+            east - 360 if east > (360 + self.wide) / 2 else east
+        )  # rounding may put the first meridian behind the last
+        return round(
+            WIDTH / 2 + (east - self.wide / 2) * METRES_PER_DEGREE * self._shrink * self.scale, 1
+        )
+
+    def y(self, lat: float) -> float:
+        return round(
+            HEIGHT / 2 - (lat - (self.south + self.north) / 2) * METRES_PER_DEGREE * self.scale, 1
+        )
+
+    def xy(self, at_N2: Doubles) -> list[tuple[float, float]]:
+        return [(self.x(lon), self.y(lat)) for lat, lon in at_N2.tolist()]
+
+    def bar(self) -> tuple[float, str]:
+        """The longest round distance that takes at most a third of the map."""
+        most = WIDTH / 3 / self.scale
+        unit = 10.0 ** math.floor(math.log10(most))
+        length = max(step * unit for step in (1, 2, 5) if step * unit <= most)
+        return round(length * self.scale, 1), metres(length)
+
+    def meridians(self) -> tuple[Tick, ...]:
+        """Round longitudes across a map of a country or more."""
+        ticks = nice_ticks(self.west, self.west + self.wide) if self._wants_grid() else []
+        inside = [lon for lon in ticks if self.west <= lon <= self.west + self.wide]
+        return tuple(
+            Tick(at=self.x(lon), label=_degrees((lon + 180) % 360 - 180, "EW")) for lon in inside
+        )
+
+    def parallels(self) -> tuple[Tick, ...]:
+        ticks = nice_ticks(self.south, self.north) if self._wants_grid() else []
+        inside = [lat for lat in ticks if self.south <= lat <= self.north]
+        return tuple(Tick(at=self.y(lat), label=_degrees(lat, "NS")) for lat in inside)
+
+    def _wants_grid(self) -> bool:
+        return WIDTH / self.scale >= GRID_FROM_M
+
+
+def _degrees(value: float, letters: str) -> str:
+    return f"{abs(value):g}°" + (f" {letters[value < 0]}" if value else "")
+
+
+def metres(value: float) -> str:
+    """As people say it: 12 m, 1.2 km, 3,400 km."""
+    if value < 999.5:
+        return f"{value:.0f} m"
+    return f"{value / 1000:.2g} km" if value < 9_950 else f"{value / 1000:,.0f} km"

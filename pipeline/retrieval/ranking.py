@@ -1,0 +1,303 @@
+"""Exact retrieval: queries and a gallery in, the rank of every true match, average precision and
+the top k out.
+
+The full score matrix never exists: the gallery is read twice in blocks. The first pass scores the
+true matches alone, the second counts what ranks ahead of each of them and keeps the k best. Both
+rest on one total order of gallery rows, the same whatever the blocks: higher score first; at equal
+score the wrong rows before the true matches (see pipeline/retrieval/metrics.py on ties); then the
+gallery's order. How scores are exact and fast at once: pipeline/retrieval/exact_scores.py.
+
+Shapes: B gallery rows of a block, Q queries, P pairs of a query and a true match, D dimensions, K
+rows kept at the top.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import ray
+
+from pipeline.core import cluster
+from pipeline.core.arrays import Doubles, Whole, Words
+from pipeline.core.prefetch import ready
+from pipeline.features.table import Floats
+from pipeline.retrieval import exact_scores, metrics
+from pipeline.retrieval.exact_scores import LAST_ROW, NO_KEY, WRONG, on_grid
+
+BLOCKS_AHEAD = 1  # read while another is ranked; each takes 34 MB at 2,048 dimensions
+
+
+@dataclass(frozen=True, kw_only=True)
+class Side:
+    """The queries or the gallery: names in memory, unit vectors in blocks."""
+
+    keys: Words
+    locations: Words
+    blocks: Callable[[int], Iterator[Floats]]
+    "Vectors of at most so many rows at a time, float32 (B, D), in the order of `keys`."
+    positions: Doubles | None = None
+    """Latitude and longitude of each row (rows, 2), degrees, NaN where unknown; None where of no
+    interest."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blocks:
+    """How the work is cut. Changes memory and speed, never a result."""
+
+    held_queries: int = 65_536
+    """Queries in memory at once; the gallery is read twice for each such group. 0.5 GB at 2,048
+    dimensions."""
+    query_rows: int = 2_048
+    "Queries of one product."
+    gallery_rows: int = 4_096
+    "Gallery rows of one product; 2,048 x 4,096 scores take 33 MB."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ranking:
+    """What came of each query, in the queries' order. Rows point into the gallery."""
+
+    matches_Q: Whole
+    "How many true matches the gallery holds."
+    first_rank_Q: Whole
+    "Rank of the best true match, from 1; 0 where there is none."
+    first_row_Q: Whole
+    "Its row; -1 where there is none."
+    first_score_Q: Floats
+    "Its score; NaN where there is none."
+    ap_Q: Doubles
+    top_rows_QK: Whole
+    top_scores_QK: Floats
+
+
+def side_of_array(keys: Words, locations: Words, vectors_QD: Floats) -> Side:
+    """Vectors that are in memory."""
+
+    def blocks(rows: int) -> Iterator[Floats]:
+        return (vectors_QD[begin : begin + rows] for begin in range(0, len(vectors_QD), rows))
+
+    return Side(keys=keys, locations=locations, blocks=blocks)
+
+
+def rank(
+    queries: Side,
+    gallery: Side,
+    top: int = 10,
+    blocks: Blocks | None = None,
+    advance: Callable[[int], None] = lambda scores: None,
+) -> Ranking:
+    """Rank the gallery for every query, exactly. `advance` is told how many scores have been
+    settled.
+
+    Raises InputError when a vector is not of unit length.
+    """
+    cut = blocks or Blocks()
+    names, code = np.unique(
+        np.concatenate([queries.locations, gallery.locations]), return_inverse=True
+    )
+    query_code, gallery_code = code[: len(queries.keys)], code[len(queries.keys) :]
+    rows_by_code = np.argsort(gallery_code, kind="stable")
+    count_by_code = np.bincount(gallery_code, minlength=len(names))
+    begin_by_code = np.cumsum(count_by_code) - count_by_code
+    groups, begin = [], 0
+    for held_QD in _regrouped(queries.blocks(cut.held_queries), cut.held_queries):
+        code_Q = query_code[begin : begin + len(held_QD)]
+        matches_Q = count_by_code[code_Q]
+        owner_P = np.repeat(np.arange(len(held_QD)), matches_Q)
+        nth_P = np.arange(len(owner_P)) - np.repeat(np.cumsum(matches_Q) - matches_Q, matches_Q)
+        row_P = rows_by_code[np.repeat(begin_by_code[code_Q], matches_Q) + nth_P]
+        groups.append(
+            _rank_held(held_QD, gallery, owner_P, row_P, min(top, len(gallery.keys)), cut, advance)
+        )
+        begin += len(held_QD)
+    return joined(groups)
+
+
+def joined(rankings: Sequence[Ranking]) -> Ranking:
+    """The rankings of consecutive queries as one."""
+    fields = Ranking.__dataclass_fields__
+    return Ranking(
+        **{name: np.concatenate([getattr(each, name) for each in rankings]) for name in fields}
+    )
+
+
+def _rank_held(
+    held_QD: Floats,
+    gallery: Side,
+    owner_P: Whole,
+    row_P: Whole,
+    top: int,
+    cut: Blocks,
+    advance: Callable[[int], None],
+) -> Ranking:
+    queries = len(held_QD)
+    bound = exact_scores.error_bound(held_QD.shape[1])
+    score_P = _scores_of_pairs(held_QD, gallery, owner_P, row_P, cut)
+    low_P, high_P = exact_scores.below(score_P, bound), exact_scores.above(score_P, bound)
+    ahead_P = np.zeros(len(owner_P), np.int64)
+    best_QK = np.full((queries, top), NO_KEY)
+    room = np.empty(cut.query_rows * cut.gallery_rows, np.float32)
+    begin = 0
+    for block_BD in ready(
+        _regrouped(gallery.blocks(cut.gallery_rows), cut.gallery_rows), BLOCKS_AHEAD
+    ):
+        end = begin + len(block_BD)
+        for first in range(0, queries, cut.query_rows):
+            part = slice(first, min(first + cut.query_rows, queries))
+            part_QD = held_QD[part]
+            scores_QB = room[: len(part_QD) * len(block_BD)].reshape(len(part_QD), len(block_BD))
+            np.matmul(part_QD, block_BD.T, out=scores_QB)
+            pairs = slice(*np.searchsorted(owner_P, [part.start, part.stop]))
+            owner, here = owner_P[pairs] - first, (row_P[pairs] >= begin) & (row_P[pairs] < end)
+            scores_QB[
+                owner[here], row_P[pairs][here] - begin
+            ] = -np.inf  # true matches are known: wrong rows are counted
+            flat_N, exact_N, ahead = exact_scores.settle(
+                scores_QB,
+                owner,
+                score_P[pairs],
+                (low_P[pairs], high_P[pairs]),
+                _floors(scores_QB, best_QK[part], bound),
+                partial(exact_scores.exact_entries, part_QD, block_BD),
+            )
+            ahead_P[pairs] += ahead
+            query_N, in_block_N = np.divmod(flat_N, len(block_BD))
+            key_N = exact_scores.order_keys(exact_N) | WRONG | (LAST_ROW - begin - in_block_N)
+            better = key_N > best_QK[part][query_N, 0] if top else np.zeros(len(key_N), np.bool_)
+            best_QK[part] = exact_scores.merged(best_QK[part], query_N[better], key_N[better])
+            advance(scores_QB.size)
+        begin = end
+    return _ranking(best_QK, owner_P, row_P, score_P, ahead_P)
+
+
+def _floors(scores_QB: Floats, best_QK: Whole, bound: float) -> Floats:
+    """For each query what a float32 product must reach to be one of the best K: K of this block, or
+    of those before, are surely no worse. Never minus infinity, which marks true matches."""
+    top = best_QK.shape[1]
+    if not top:
+        return np.full(len(best_QK), np.inf, np.float32)
+    floor_Q = exact_scores.below(exact_scores.scores_of(best_QK[:, 0]), bound)
+    if scores_QB.shape[1] >= top and np.isneginf(floor_Q).any():
+        kth_Q = np.partition(scores_QB, -top, axis=1)[:, -top]
+        floor_Q = np.maximum(floor_Q, exact_scores.below(kth_Q, 2 * bound))
+    return np.maximum(floor_Q, np.finfo(np.float32).min)
+
+
+def _scores_of_pairs(
+    held_QD: Floats, gallery: Side, owner_P: Whole, row_P: Whole, cut: Blocks
+) -> Floats:
+    """Scores of the true matches alone."""
+    by_row = np.argsort(row_P, kind="stable")
+    sorted_P, score_P, begin = row_P[by_row], np.zeros(len(row_P), np.float32), 0
+    for block_BD in _regrouped(gallery.blocks(cut.gallery_rows), cut.gallery_rows):
+        low, high = np.searchsorted(sorted_P, [begin, begin + len(block_BD)])
+        for first in range(low, high, exact_scores.PAIR_ROWS):
+            pairs = by_row[first : min(first + exact_scores.PAIR_ROWS, high)]
+            score_P[pairs] = exact_scores.exact_pairs(
+                held_QD[owner_P[pairs]], block_BD[row_P[pairs] - begin]
+            )
+        begin += len(block_BD)
+    return score_P
+
+
+def _ranking(
+    best_QK: Whole, owner_P: Whole, row_P: Whole, score_P: Floats, ahead_P: Whole
+) -> Ranking:
+    """`ahead_P`: wrong rows ahead of each match; to these come the matches of the same query that
+    rank before it.
+    """
+    queries = len(best_QK)
+    key_P = exact_scores.order_keys(score_P) | (LAST_ROW - row_P)
+    order = np.lexsort((-key_P, owner_P))
+    owner_P, row_P, score_P, key_P = owner_P[order], row_P[order], score_P[order], key_P[order]
+    count_Q = np.bincount(owner_P, minlength=queries)
+    nth_P = np.arange(len(owner_P)) - (np.cumsum(count_Q) - count_Q)[owner_P]
+    rank_P = ahead_P[order] + nth_P + 1
+    with_match, first = np.unique(owner_P, return_index=True)
+    first_row_Q, first_score_Q = np.full(queries, -1), np.full(queries, np.nan, np.float32)
+    first_row_Q[with_match], first_score_Q[with_match] = row_P[first], score_P[first]
+    shown = nth_P < best_QK.shape[1]
+    top_QK = exact_scores.merged(best_QK, owner_P[shown], key_P[shown])[:, ::-1]
+    return Ranking(
+        matches_Q=count_Q,
+        first_rank_Q=metrics.first_match_ranks(rank_P, owner_P, queries),
+        first_row_Q=first_row_Q,
+        first_score_Q=first_score_Q,
+        ap_Q=metrics.average_precisions(rank_P, owner_P, queries),
+        top_rows_QK=LAST_ROW - (top_QK & LAST_ROW),
+        top_scores_QK=exact_scores.scores_of(top_QK),
+    )
+
+
+def _regrouped(blocks: Iterator[Floats], rows: int) -> Iterator[Floats]:
+    """On the grid, in blocks of `rows` rows (the last one fewer): tables come in parts of any size."""
+    waiting: list[Floats] = []
+    count = 0
+    for block_BD in blocks:
+        waiting.append(on_grid(block_BD))
+        count += len(block_BD)
+        while count >= rows:
+            whole_BD = _concatenated(waiting)
+            yield whole_BD[:rows]
+            waiting, count = [whole_BD[rows:]], count - rows
+    if count:
+        yield _concatenated(waiting)
+
+
+def _concatenated(blocks: list[Floats]) -> Floats:
+    some = [block_BD for block_BD in blocks if len(block_BD)]
+    return some[0] if len(some) == 1 else np.concatenate(some)
+
+
+def rank_spread(
+    queries: Side,
+    gallery: Side,
+    top: int,
+    workers: int,
+    advance: Callable[[int], None],
+    blocks: Blocks | None = None,
+) -> Ranking:
+    """As `ranking.rank`, with `workers` Ray tasks of one core each; 0 ranks in this process.
+
+    Each worker reads the gallery from its storage by itself, twice: where tables lie on one
+    machine's disk, they must be reachable under the same path from the others.
+    """
+    count = len(queries.keys)
+    if workers < 1 or count < 2:
+        return rank(queries, gallery, top, blocks, advance)
+    cluster.connect()
+    cut = blocks or Blocks()
+    rows = max(1, min(cut.held_queries, -(-count // workers)))
+    parts = [(begin, min(begin + rows, count)) for begin in range(0, count, rows)]
+    sides = ray.put((queries, gallery))
+    found: dict[tuple[int, int], Ranking] = {}
+    for part, ranking in cluster.bounded(
+        lambda part: _rank_part.remote(sides, part, top, cut), parts, workers
+    ):
+        found[part] = ranking
+        advance((part[1] - part[0]) * len(gallery.keys))
+    return joined([found[part] for part in parts])
+
+
+def rows_between(side: Side, begin: int, end: int) -> Side:
+    """Some consecutive rows of a side."""
+
+    def blocks(rows: int) -> Iterator[Floats]:
+        first = 0
+        for block_BD in side.blocks(rows):
+            if first >= end:
+                return
+            kept_BD = block_BD[max(begin - first, 0) : max(end - first, 0)]
+            first += len(block_BD)
+            if len(kept_BD):
+                yield kept_BD
+
+    return Side(keys=side.keys[begin:end], locations=side.locations[begin:end], blocks=blocks)
+
+
+@ray.remote(num_cpus=1)
+def _rank_part(sides: tuple[Side, Side], part: tuple[int, int], top: int, cut: Blocks) -> Any:
+    queries, gallery = sides
+    return rank(rows_between(queries, *part), gallery, top, cut)

@@ -1,0 +1,351 @@
+"""Imagery -> shards: the stage. Tars are packed by Ray tasks, several at once; what is there
+already is left as it is.
+
+In: a source and a root. Out: tars, their record table, `rejected.parquet`, and last of all
+`manifest.json`. The same input gives the same bytes whatever the parallelism, and however often
+packing was killed and begun again.
+"""
+
+import json
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import ray
+
+from pipeline.core import cluster, json_files, rejections, storage
+from pipeline.core.errors import InputError, Unfinished
+from pipeline.core.lock import one_at_a_time
+from pipeline.core.progress import console, progress
+from pipeline.core.records import ImageRecord, Rejection, Split, as_text, is_text
+from pipeline.shards.duplicates import COLUMNS, find_duplicates
+from pipeline.shards.extend import new_records, next_numbers
+from pipeline.shards.manifest import (
+    MANIFEST,
+    Manifest,
+    Shard,
+    note_damaged,
+    noted_damaged,
+    read_manifest,
+)
+from pipeline.shards.plan import ShardPlan, ShardSize, plan_shards
+from pipeline.shards.record_table import FOLDER, Packed, read_packed, read_part, whole_part
+from pipeline.shards.repair import damaged_shards, mend
+from pipeline.shards.writer import UNREADABLE, Check, write_shard
+from pipeline.sources import name_of
+from pipeline.sources.base import Source
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackingSettings:
+    """Which imagery becomes shards, and where."""
+
+    root: str
+    "Where the imagery is."
+    out: str
+    "Folder or URI for the shards."
+    samples_per_shard: int = 1000
+    "Images per tar at most."
+    megabytes_per_shard: float | None = None
+    "Megabytes (1e6 bytes) of images per tar at most; None for any number."
+    max_bad_fraction: float = 0.01
+    "Refused images over all images; above it the job stops."
+    check: Check = "quick"
+    """How images are judged: quick, by their headers and ends, or full, by decoding them: finds
+    every damage and takes long."""
+    extend: bool = False
+    "Add the imagery to the finished set in `out`, as new tars."
+    workers: int | None = None
+    """Tars packed at once, each by a Ray task; None for as many as there are cores, 0 for one after
+    the other in this process."""
+
+    def __post_init__(self) -> None:
+        if self.samples_per_shard < 1:
+            raise InputError(
+                f"--samples-per-shard is {self.samples_per_shard}, expected at least 1"
+            )
+        if self.megabytes_per_shard is not None and not self.megabytes_per_shard > 0:
+            raise InputError(
+                f"--megabytes-per-shard is {self.megabytes_per_shard}, expected more than 0"
+            )
+        if not 0 <= self.max_bad_fraction <= 1:
+            raise InputError(
+                f"--max-bad-fraction is {self.max_bad_fraction}, expected a fraction from 0 to 1"
+            )
+        if self.workers is not None and self.workers < 0:
+            raise InputError(f"--workers is {self.workers}, expected 0 (this process) or more")
+
+
+class TooManyRejected(Unfinished):
+    """More images were refused than `max_bad_fraction` allows."""
+
+
+@dataclass
+class Haul:
+    """What a source gave, and what has been refused of it so far."""
+
+    records: list[ImageRecord]
+    rejected: list[Rejection]
+    found: int
+    "Images before any were sorted out."
+    known: int = 0
+    "Images that the set held already."
+
+
+@one_at_a_time(lambda source, settings: settings.out)
+def pack(source: Source, settings: PackingSettings) -> Manifest:
+    """Pack a source's imagery; a finished set is left as it is, an unfinished one is gone on with.
+
+    Raises InputError on unusable input, TooManyRejected when more than `max_bad_fraction` of the
+    images are refused.
+    """
+    began, out, said = time.monotonic(), storage.absolute(settings.out), describe(source, settings)
+    before, damaged = finished(settings, said)
+    if before is not None and not settings.extend and not damaged:
+        console.print(f"{settings.out} is complete: {len(before.shards)} shards; nothing to do")
+        return before
+    haul = gather(source, storage.absolute(settings.root))  # workers may stand in another folder
+    if before is not None and damaged:
+        mend(source, out, before, damaged, haul.records)
+        console.print(f"{settings.out}: {len(damaged)} damaged shards were made anew")
+        if not settings.extend:
+            return before
+    if before is not None:
+        haul.records, refused, haul.known = new_records(haul.records, source, out, before)
+        haul.rejected += refused
+    size = ShardSize(
+        samples_per_shard=settings.samples_per_shard,
+        megabytes_per_shard=settings.megabytes_per_shard,
+        numbered_from={} if before is None else next_numbers(before),
+    )
+    plans, refused = plan_shards(haul.records, size)
+    haul.rejected += refused
+    old = frozenset() if before is None else frozenset(shard.name for shard in before.shards)
+    clear(out, old.union(plan.name for plan in plans))
+    scanned = time.monotonic()
+    packed = pack_plans(plans, source, settings, said, haul)
+    # Whether two images are the same is known when all have been read: the tars of the second ones
+    # are written again.
+    tables = (read_part(out, name, COLUMNS) for name in sorted(old.union(packed)))
+    doubles = find_duplicates(tables, settled=old) if packed else {}
+    again = [plan for plan in plans if plan.name in doubles]
+    if again:
+        packed |= pack_plans(again, source, settings, said, haul, doubles)
+    haul.rejected += [rejection for done in packed.values() for rejection in done.rejected]
+    judge(settings, haul.rejected, haul.found)
+    refusals = rejections.write(out, haul.rejected, keep=before is not None)
+    full = {name: done for name, done in packed.items() if done.shard.samples}
+    clear(out, old.union(full))
+    manifest = compose(before, said, full, haul, refusals)
+    json_files.write_checksummed(storage.join(out, MANIFEST), asdict(manifest))
+    note_damaged(out, ())
+    sum_up(settings, full, haul, scanned - began, time.monotonic() - scanned)
+    return manifest
+
+
+def describe(source: Source, settings: PackingSettings) -> dict[str, Any]:
+    """What of the settings decides what is packed."""
+    flags = json.loads(json.dumps(asdict(source)))
+    packing = {
+        name: getattr(settings, name)
+        for name in ("samples_per_shard", "megabytes_per_shard", "check")
+    }
+    return {"source": name_of(source), **flags, "root": storage.absolute(settings.root), **packing}
+
+
+def finished(
+    settings: PackingSettings, said: dict[str, Any]
+) -> tuple[Manifest | None, list[Shard]]:
+    """The manifest of the set in `out`, where there is one to be left, extended or mended, and its
+    damaged shards.
+
+    Raises InputError when it is another set than the settings ask for, or when there is nothing
+    that could be extended.
+    """
+    out = settings.out
+    if not storage.exists(storage.join(out, MANIFEST)):
+        if settings.extend:
+            raise InputError(
+                f"{out} holds no finished set of shards; expected one to extend; pack it without --extend first"
+            )
+        return None, []
+    manifest = read_manifest(out)
+    if not settings.extend and manifest.packing != said:
+        changed = ", ".join(name for name in said if manifest.packing.get(name) != said[name])
+        raise InputError(
+            f"{out} holds shards packed with another {changed}; choose another --out, delete it, or add to it with --extend"
+        )
+    damaged = damaged_shards(out, manifest)
+    if (
+        settings.extend
+        or manifest.added
+        or (not damaged and rejections.is_whole(out, manifest.rejected))
+    ):
+        return manifest, damaged
+    wrong = f"{len(damaged)} shards are" if damaged else f"{rejections.FILE} is"
+    console.print(f"{out}: {wrong} missing or damaged; what is not whole is packed again")
+    return None, []
+
+
+def gather(source: Source, root: str) -> Haul:
+    """All that a source finds; what has a name that cannot be written down is refused here."""
+    records: list[ImageRecord] = []
+    rejected: list[Rejection] = []
+    for found in source.scan(root):
+        name = found.path if isinstance(found, Rejection) else f"{found.name}{found.location}"
+        if not is_text(name):
+            told = as_text(found.path)
+            rejected.append(
+                Rejection(path=told, reason="name is not UTF-8", found=told.rsplit("/", 1)[-1])
+            )
+        elif isinstance(found, Rejection):
+            rejected.append(found)
+        else:
+            records.append(found)
+    return Haul(records=records, rejected=rejected, found=len(records) + len(rejected))
+
+
+def clear(out: str, wanted: frozenset[str]) -> None:
+    """Take away our other tars, known by their record parts: empty ones, and those that other
+    settings left.
+    """
+    for name in storage.names(storage.join(out, FOLDER)):
+        stem = name.removesuffix(".parquet")
+        if stem not in wanted:
+            tar = storage.join(out, f"{stem}.tar")
+            if storage.exists(tar):
+                storage.remove(tar)
+            storage.remove(storage.join(out, FOLDER, name))
+
+
+def pack_plans(
+    plans: Sequence[ShardPlan],
+    source: Source,
+    settings: PackingSettings,
+    said: dict[str, Any],
+    haul: Haul,
+    doubles: Mapping[str, dict[str, str]] | None = None,
+) -> dict[str, Packed]:
+    """Each plan's tar, by name: as it is there already, or else packed now. With `doubles`, without
+    these and in any case.
+
+    Raises TooManyRejected as soon as that is certain.
+    """
+    out, packed = storage.absolute(settings.out), {}
+    digests = {plan.name: plan.digest(said) for plan in plans}
+    if doubles is None:
+        sizes = storage.walk(out) if storage.is_folder(out) else {}
+        for name in noted_damaged(out):
+            sizes.pop(f"{name}.tar", None)
+        packed = {
+            name: done
+            for name in digests
+            if (done := already(out, name, digests[name], sizes)) is not None
+        }
+        if packed:
+            console.print(f"{len(packed)} of {len(plans)} shards are there already")
+    todo = [plan for plan in plans if plan.name not in packed]
+    refused, megabytes, began = list(haul.rejected), 0.0, time.monotonic()
+    with progress(sum(len(plan.records) for plan in todo), "packing") as meter:
+        arguments = (
+            (plan, source, out, digests[plan.name], settings.check, (doubles or {}).get(plan.name))
+            for plan in todo
+        )
+        # Starting Ray takes longer than one tar.
+        workers = 0 if settings.workers is None and len(todo) <= 1 else settings.workers
+        for done in write_all(arguments, workers):
+            packed[done.shard.name] = done
+            refused += done.rejected
+            megabytes += done.shard.bytes / 1e6
+            rate = f"{megabytes / (time.monotonic() - began):.1f}"
+            meter.advance(
+                done.shard.samples + len(done.rejected),
+                refused=len(refused),
+                megabytes_per_second=rate,
+            )
+            judge(settings, refused, haul.found)
+    return packed
+
+
+def already(out: str, name: str, digest: str, sizes: Mapping[str, int]) -> Packed | None:
+    """What became of this very plan, where it is done; images that could not be read get another
+    chance.
+    """
+    done = read_packed(out, name) if f"{FOLDER}/{name}.parquet" in sizes else None
+    if done is None or done.plan != digest or sizes.get(f"{name}.tar") != done.shard.bytes:
+        return None
+    if any(rejection.reason == UNREADABLE for rejection in done.rejected):
+        return None
+    return done if whole_part(out, name) else None
+
+
+def write_all(arguments: Iterable[tuple[Any, ...]], workers: int | None) -> Iterator[Packed]:
+    """`write_shard` for all arguments, as they are done."""
+    if workers == 0:
+        yield from (write_shard(*given) for given in arguments)
+        return
+    cluster.connect()
+    task = ray.remote(num_cpus=1)(write_shard)
+    window = workers or 2 * cluster.cpus()
+    yield from (
+        done for _, done in cluster.bounded(lambda given: task.remote(*given), arguments, window)
+    )
+
+
+def judge(settings: PackingSettings, refused: Sequence[Rejection], found: int) -> None:
+    """Raise TooManyRejected, with the list written, if that many were refused. A known image is no
+    bad one when extending.
+    """
+    bad = [one for one in refused if not (settings.extend and one.reason == "duplicate")]
+    if len(bad) <= settings.max_bad_fraction * found:
+        return
+    rejections.write(settings.out, refused, keep=settings.extend)
+    raise TooManyRejected(
+        f"{len(bad)} of {found} images were refused, more than {settings.max_bad_fraction:.2%}: {rejections.commonest(bad)}; see "
+        f"{storage.join(settings.out, rejections.FILE)}, mend them or raise --max-bad-fraction"
+    )
+
+
+def compose(
+    before: Manifest | None,
+    said: dict[str, Any],
+    packed: Mapping[str, Packed],
+    haul: Haul,
+    refusals: int,
+) -> Manifest:
+    """The set as it is now. Classes that were there keep their numbers."""
+    shards = tuple(packed[name].shard for name in sorted(packed))
+    trained = {record.location for record in haul.records if record.split == Split.TRAIN}
+    if before is None:
+        return Manifest(
+            shards=shards, classes=tuple(sorted(trained)), packing=said, rejected=refusals
+        )
+    return replace(
+        before,
+        shards=before.shards + shards,
+        classes=before.classes + tuple(sorted(trained.difference(before.classes))),
+        added=(*before.added, said) if packed else before.added,
+        rejected=refusals,
+    )
+
+
+def sum_up(
+    settings: PackingSettings,
+    packed: Mapping[str, Packed],
+    haul: Haul,
+    scanning: float,
+    packing: float,
+) -> None:
+    """Where the shards are, what is in them, how the time was spent."""
+    images, size = (
+        sum(getattr(done.shard, name) for done in packed.values()) for name in ("samples", "bytes")
+    )
+    refused = f"{len(haul.rejected)} refused"
+    if haul.rejected:
+        refused += f" ({rejections.commonest(haul.rejected)}; see {rejections.FILE})"
+    known = f"; {haul.known} were there already" if settings.extend else ""
+    console.print(
+        f"{settings.out}: {len(packed)} {'new ' if settings.extend else ''}shards, {images} images, {size / 1e6:.1f} MB, "
+        f"{refused}{known}; scanned in {scanning:.1f} s, packed in {packing:.1f} s",
+    )

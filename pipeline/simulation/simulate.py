@@ -1,0 +1,223 @@
+"""Simulated flights: settings come in, a made data set in University-1652's layout goes out.
+
+    train/{satellite,drone}/<id>/              locations to learn from
+    test/query_{satellite,drone}/<id>/         the test's queries
+    test/gallery_{satellite,drone}/<id>/       the same pictures again, and those of the distractors
+    locations.csv                              location, lat, lon
+    poses.csv                                  one row per UAV picture: its path, and where and how it was taken
+    simulation.json                            the settings; written last: where it is, the data set is complete
+
+A location is one Ray task. It leaves `.parts/<id>.json` when all its pictures are in place, so a
+run that was stopped goes on where it was. Pictures are written to a local or mounted path, since
+galleries share files with queries.
+"""
+
+import hashlib
+import shutil
+from collections import Counter
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import ray
+
+from pipeline.core import cluster, json_files, storage
+from pipeline.core.errors import InputError
+from pipeline.core.lock import one_at_a_time
+from pipeline.core.progress import console, progress
+from pipeline.simulation.layout import Job, Role, make_location, part, write_tables
+from pipeline.simulation.location import Order
+from pipeline.simulation.texture import usable_textures
+
+MOST_LOCATIONS, MOST_VIEWS = 1_000_000, 10_000
+"Beyond any use: a slip of the keyboard would fill the memory with plans before it fills the disk."
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationSettings:
+    """How large a data set is made, and of what."""
+
+    out: str
+    "Folder of the data set; a local or mounted path."
+    train_locations: int
+    "Locations to learn from. University-1652: 701."
+    test_locations: int
+    "Locations with queries. University-1652: 701."
+    distractors: int
+    "Locations in the gallery only. University-1652: 250."
+    views: int = 54
+    "UAV pictures per location, along the whole flight. University-1652: 54."
+    size: int = 512
+    "Side of every picture, pixels. University-1652: 512."
+    seed: int = 0
+    "Another seed makes another country."
+    textures: str | None = None
+    "Folder of real overhead images to fly over, one per location; without it, towns are made up."
+    texture_metres_per_pixel: float = 0.3
+    "Resolution of those images."
+
+    def __post_init__(self) -> None:
+        for name in ("train_locations", "test_locations", "distractors", "seed"):
+            if getattr(self, name) < 0:
+                raise InputError(
+                    f"--{name.replace('_', '-')} is {getattr(self, name)}; expected 0 or more"
+                )
+        if (
+            asked := self.train_locations + self.test_locations + self.distractors
+        ) > MOST_LOCATIONS:
+            raise InputError(
+                f"{asked} locations asked for; expected at most {MOST_LOCATIONS}; make several sets of them"
+            )
+        if asked == 0:
+            raise InputError(
+                "no locations asked for; expected one or more; set --train-locations or --test-locations"
+            )
+        if self.views < 1:
+            raise InputError(f"--views is {self.views}; expected 1 or more; University-1652 has 54")
+        if self.views > MOST_VIEWS:
+            raise InputError(
+                f"--views is {self.views}; expected at most {MOST_VIEWS}; University-1652 has 54"
+            )
+        if not 32 <= self.size <= 1024:
+            raise InputError(
+                f"--size is {self.size}; expected 32 to 1024 pixels; University-1652 has 512"
+            )
+        if not 0 < self.texture_metres_per_pixel < float("inf"):
+            raise InputError(
+                f"--texture-metres-per-pixel is {self.texture_metres_per_pixel}; expected more than 0"
+            )
+
+
+@one_at_a_time(lambda settings: settings.out)
+def simulate(settings: SimulationSettings) -> Path:
+    """Make the data set, or what is missing of it; its folder.
+
+    Raises InputError for textures that do not suffice and for a folder that holds something else.
+    """
+    if not storage.is_local(settings.out):
+        raise InputError(
+            f"--out is {settings.out}; expected a local or mounted folder; make it there and copy it"
+        )
+    root = Path(storage.locate(settings.out)[1]).absolute()
+    # Tasks may run in another working directory, so they are given whole paths.
+    textures, passed_over = (
+        usable_textures(storage.absolute(settings.textures)) if settings.textures else ([], 0)
+    )
+    described = _describe(settings, textures)
+    if _is_complete(root, described):
+        shutil.rmtree(
+            root / ".parts", ignore_errors=True
+        )  # of a run that was killed between its last two steps
+        console.print(f"{root} is complete already; nothing to do")
+        return root
+    jobs = plan(settings, str(root), textures)
+    if passed_over:
+        console.print(
+            f"{settings.textures}: {passed_over} files are no usable images and were passed over"
+        )
+    (root / ".parts").mkdir(parents=True, exist_ok=True)
+    json_files.write_checksummed(str(root / ".parts" / "settings.json"), described)
+    todo = [job for job in jobs if not part(job).exists()]
+    spent = _make(todo, len(jobs), settings.views + 1)
+    write_tables(root, jobs)
+    json_files.write_checksummed(str(root / "simulation.json"), described)
+    shutil.rmtree(root / ".parts")
+    share = ", ".join(f"{step} {seconds:.1f} s" for step, seconds in spent.items())
+    console.print(f"{root}: {len(jobs)} locations ({share or 'all were there'}, over all cores)")
+    return root
+
+
+def plan(settings: SimulationSettings, root: str, textures: list[str]) -> list[Job]:
+    """One job per location. Numbers are dealt out at random, so that they say nothing about the
+    role.
+    """
+    roles: list[Role] = ["train"] * settings.train_locations
+    roles += ["test"] * settings.test_locations
+    roles += ["distractor"] * settings.distractors
+    if settings.textures and len(textures) < len(roles):
+        raise InputError(
+            f"{settings.textures} holds {len(textures)} usable images for {len(roles)} locations; "
+            "expected one each; add images or ask for fewer locations"
+        )
+    rng = np.random.default_rng([settings.seed, 0])
+    numbers = rng.permutation(len(roles)) + 1
+    dealt = rng.permutation(len(textures)) if textures else None
+    return [
+        Job(
+            root=root,
+            role=role,
+            order=Order(
+                seed=settings.seed,
+                location=int(number),
+                views=settings.views,
+                size=settings.size,
+                texture=None if dealt is None else textures[int(dealt[int(number) - 1])],
+                texture_metres_per_pixel=settings.texture_metres_per_pixel,
+            ),
+        )
+        for role, number in zip(roles, numbers, strict=True)
+    ]
+
+
+def _make(todo: list[Job], total: int, pictures: int) -> Counter[str]:
+    """Run the jobs over the cluster; seconds spent by step, over all of them."""
+    spent: Counter[str] = Counter()
+    if not todo:
+        return spent
+    cluster.connect()
+    task = ray.remote(num_cpus=1)(make_location)
+    with progress(len(todo) * pictures, "simulate", "images") as meter:
+        if len(todo) < total:
+            meter.note(f"{total - len(todo)} of {total} locations are there already")
+        for _, seconds in cluster.bounded(task.remote, todo, window=2 * cluster.cpus()):
+            spent.update(seconds)
+            meter.advance(pictures)
+    return spent
+
+
+def _describe(settings: SimulationSettings, textures: list[str]) -> dict[str, Any]:
+    """What the data set depends on; where it lies, and where its textures lie, is no part of it."""
+    described = {
+        name: value for name, value in asdict(settings).items() if name not in ("out", "textures")
+    }
+    if settings.textures:
+        names = "\n".join(
+            str(Path(path).relative_to(storage.absolute(settings.textures))) for path in textures
+        )
+        described["textures"] = (
+            f"{len(textures)} images, {hashlib.sha256(names.encode()).hexdigest()[:16]}"
+        )
+    return described
+
+
+def _is_complete(root: Path, described: dict[str, Any]) -> bool:
+    """Whether this very data set is there.
+
+    Raises InputError when the folder holds another one, or something else.
+    """
+    complete, begun = root / "simulation.json", root / ".parts" / "settings.json"
+    there = complete if complete.exists() else begun
+    if not there.exists():
+        if root.exists() and any(root.iterdir()):
+            raise InputError(
+                f"{root} holds files that no simulation wrote; expected a new or empty folder; choose another --out"
+            )
+        return False
+    try:
+        found = json_files.read_checksummed(str(there))
+    except ValueError as error:
+        raise InputError(
+            f"{there} is damaged ({error}), expected the settings of a simulation; remove {root} and run jobs/simulate.py again"
+        ) from None
+    other = [
+        f"{name} {found.get(name)!r} instead of {described.get(name)!r}"
+        for name in sorted({*found, *described})
+        if found.get(name) != described.get(name)
+    ]
+    if other:
+        raise InputError(
+            f"{root} holds a data set made with {', '.join(other)}; expected the same settings to go on; "
+            "choose another --out or remove the folder"
+        )
+    return there == complete

@@ -1,0 +1,137 @@
+"""Worlds from real overhead images: a picture comes in, flat ground with its colours goes out.
+
+The picture's middle square is taken. Beside `quad.jpg` there may lie `quad.height.npy`: a
+two-dimensional array of metres above the ground that covers the whole picture, of any resolution;
+without it the ground is flat. Sun and shadows stay as the picture has them; season, sensor and haze
+change with the day.
+
+Letters: H, W pixels of the map; 3 red, green, blue.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from pipeline.core.errors import InputError
+from pipeline.images.decode import FORMATS
+from pipeline.simulation.flight import FlightPlan
+from pipeline.simulation.town.town import TEXELS_PER_RADIUS
+from pipeline.simulation.world import FloatMap, World
+
+IMAGE_NAMES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
+UNREADABLE = (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError)
+"""What Pillow raises for files that are no pictures, or broken, or absurdly large ones."""
+LEAST_PIXELS = 64
+"""Shorter sides hold too little to fly over."""
+RADIUS_PART = 0.21
+"""Target radius as a part of the picture's side: the satellite view stays on it, and most of the
+first UAV frame.
+"""
+FLIGHT_OVER_TEXTURE = FlightPlan(depression_start_deg=65.0, depression_end_deg=55.0)
+"""Steeper than over towns: a picture of flat ground has no facades to show and an edge to stay away
+from.
+"""
+
+
+def usable_textures(folder: str) -> tuple[list[str], int]:
+    """(images that can serve as ground, sorted by path; how many files were passed over).
+
+    Raises InputError when the folder is missing or holds no such image.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise InputError(
+            f"no folder {folder}; expected a folder of overhead images; check --textures"
+        )
+    files = sorted(
+        path for path in root.rglob("*") if path.is_file() and not path.name.endswith(".height.npy")
+    )
+    usable = [str(path) for path in files if _is_usable(path)]
+    if not usable:
+        raise InputError(
+            f"{folder} holds {len(files)} files and none is an image of at least {LEAST_PIXELS} pixels a side; "
+            f"expected overhead images ({', '.join(IMAGE_NAMES)}); check --textures"
+        )
+    return usable, len(files) - len(usable)
+
+
+def _is_usable(path: Path) -> bool:
+    if not path.name.lower().endswith(IMAGE_NAMES):
+        return False
+    try:
+        with Image.open(path, formats=FORMATS) as image:
+            least = min(image.size)
+            # A truncated file shows only when it is decoded; a JPEG at an eighth of its size shows
+            # it as well.
+            image.draft("RGB", (LEAST_PIXELS, LEAST_PIXELS))
+            image.load()
+    except UNREADABLE:
+        return False
+    return least >= LEAST_PIXELS
+
+
+def textured_world(path: str, *, metres_per_pixel: float, frame_pixels: int = 256) -> World:
+    """The world that a picture shows, as fine as frames of `frame_pixels` need.
+
+    `metres_per_pixel` is the picture's own. Raises InputError for a picture or height map that cannot be read.
+    """
+    try:
+        with Image.open(path, formats=FORMATS) as image:
+            picture = image.convert("RGB")
+    except UNREADABLE as error:
+        raise InputError(
+            f"{path} cannot be decoded ({error}); expected an image; take it out of --textures"
+        ) from None
+    square = min(picture.size)
+    left, top = (picture.width - square) // 2, (picture.height - square) // 2
+    extent_m = square * metres_per_pixel
+    side = round(TEXELS_PER_RADIUS / RADIUS_PART * frame_pixels / 256)
+    box = (left, top, left + square, top + square)
+    texture_HW3 = np.asarray(picture.resize((side, side), Image.Resampling.BICUBIC, box=box))
+    grass_HW, trees_HW = _plants(texture_HW3.astype(np.float32))
+    return World(
+        texture_HW3=texture_HW3,
+        height_HW=_heights(path, picture.size, box, side),
+        metres_per_pixel=extent_m / side,
+        target_radius_m=RADIUS_PART * extent_m,
+        grass_HW=(grass_HW * 255).astype(np.uint8),
+        trees_HW=(trees_HW * 255).astype(np.uint8),
+        facade_HW=np.zeros((side, side), np.uint8),
+        along_HW=np.zeros((side, side), np.float32),
+        facing_HW=np.zeros((side, side), np.float32),
+        light_is_baked=True,
+    )
+
+
+def _heights(
+    path: str, size: tuple[int, int], box: tuple[int, int, int, int], side: int
+) -> FloatMap:
+    """Heights (H, W) from the array beside the picture, metres; flat without one."""
+    beside = Path(path).with_suffix(".height.npy")
+    if not beside.exists():
+        return np.zeros((side, side), np.float32)
+    try:
+        heights = np.load(beside, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise InputError(
+            f"{beside} cannot be read ({error}); expected an array as numpy.save writes it"
+        ) from None
+    if heights.ndim != 2 or heights.dtype.kind not in "fiu" or not np.isfinite(heights).all():
+        raise InputError(
+            f"{beside} holds {heights.dtype} of shape {heights.shape}; expected two dimensions of finite metres; "
+            "write it again or take it away"
+        )
+    across, down = heights.shape[1] / size[0], heights.shape[0] / size[1]
+    cut = (box[0] * across, box[1] * down, box[2] * across, box[3] * down)
+    whole = Image.fromarray(np.maximum(heights, 0).astype(np.float32))
+    return np.asarray(whole.resize((side, side), Image.Resampling.NEAREST, box=cut), np.float32)
+
+
+def _plants(colour_HW3: FloatMap) -> tuple[FloatMap, FloatMap]:
+    """(grass, trees), each (H, W) from 0 to 1: green is plants, and trees are darker than grass."""
+    red, green, blue = (colour_HW3[..., c] for c in range(3))
+    total = red + green + blue + 1
+    plants = np.clip(((2 * green - red - blue) / total - 0.03) / 0.12, 0, 1)
+    dark = np.clip((95 - total / 3) / 30, 0, 1)
+    return (plants * (1 - dark)).astype(np.float32), (plants * dark * 0.8).astype(np.float32)

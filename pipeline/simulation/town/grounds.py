@@ -1,0 +1,296 @@
+"""What stands and lies between buildings: trees, cars, car parks, paths, pitches, courts, pools and
+ponds.
+
+Letters: h, w pixels of a stamp's window; 3 red, green, blue.
+"""
+
+from itertools import pairwise
+from math import cos, hypot, pi, sin
+
+import numpy as np
+
+from pipeline.simulation.canvas import GROUND, PAVED, ROAD, WATER, Canvas, Colour
+from pipeline.simulation.palette import ASPHALT, CARS, COURTS, EARTH, pick, shade
+from pipeline.simulation.palette import WATER as WATERS
+
+WHITE: Colour = (222, 222, 214)
+
+
+def tree(
+    canvas: Canvas, rng: np.random.Generator, x: float, y: float, radius: float, colour: Colour
+) -> None:
+    """A crown of lumpy height over whatever is lower; leaves turn and fall unless it is a conifer."""
+    conifer = rng.random() < 0.2
+    height = radius * float(rng.uniform(1.5, 2.3)) * (1.25 if conifer else 1.0)
+    stamp = canvas.stamp(x, y, 0.0, radius, radius)
+    if stamp is None:
+        return
+    at = (stamp.rows, stamp.cols)
+    lumps = canvas.lumps_HW[at]
+    reach = np.hypot(stamp.u_hw, stamp.v_hw) * np.float32(1 / radius) * (1 + 0.30 * lumps)
+    crown = 1 - reach if conifer else np.sqrt(np.maximum(0, 1 - reach * reach))
+    top = np.float32(height) * (np.float32(0.35) + np.float32(0.65) * crown * (1 + 0.30 * lumps))
+    grown = (reach < 1) & (top > canvas.height_HW[at])
+    canvas.height_HW[at][grown] = top[grown]
+    tone = (0.82 + 0.24 * crown + 0.24 * lumps)[..., None].astype(np.float32)
+    leaf = shade(colour, 0.78) if conifer else shade(colour, float(rng.uniform(0.85, 1.15)))
+    canvas.colour_HW3[at][grown] = (tone * np.asarray(leaf, np.float32))[grown]
+    canvas.grass_HW[at][grown] = 0
+    canvas.trees_HW[at][grown] = 0.08 if conifer else float(rng.uniform(0.75, 1.0))
+    canvas.facade_HW[at][grown] = 0
+
+
+def scatter_trees(
+    canvas: Canvas,
+    rng: np.random.Generator,
+    spots: list[tuple[float, float]],
+    colour: Colour,
+    *,
+    radius: tuple[float, float] = (1.8, 4.2),
+    on: tuple[int, ...] = (GROUND,),
+) -> None:
+    """Plant trees at the spots (x, y) where the ground allows it."""
+    for x, y in spots:
+        r = float(rng.uniform(*radius))
+        if canvas.covered_by(x, y) in on:
+            tree(canvas, rng, x, y, r, colour)
+
+
+def car(canvas: Canvas, rng: np.random.Generator, x: float, y: float, angle: float) -> None:
+    """A car, van or truck whose long side is along `angle`; never on what is not road or paving."""
+    size = rng.random()
+    half_u, half_v, rise = (
+        (2.2, 0.95, 1.3) if size < 0.85 else (2.7, 1.05, 2.0) if size < 0.97 else (4.6, 1.25, 3.0)
+    )
+    colour = pick(rng, CARS, spread=5)
+    if canvas.covered_by(x, y) not in (ROAD, PAVED):
+        return
+    stamp = canvas.stamp(x, y, angle, half_u, half_v)
+    if stamp is None:
+        return
+    at = (stamp.rows, stamp.cols)
+    u, v = stamp.u_hw, np.abs(stamp.v_hw)
+    body = (np.abs(u) < half_u) & (v < half_v) & (canvas.height_HW[at] < rise)
+    cabin = (u > -0.75 * half_u) & (u < 0.45 * half_u)
+    glass = cabin & ((u < -0.5 * half_u) | (u > 0.15 * half_u)) & (half_u < 4)
+    canvas.height_HW[at][body] = np.where(cabin, rise, rise * 0.7)[body]
+    canvas.colour_HW3[at][body] = np.where(
+        glass[..., None], np.float32(46), np.asarray(colour, np.float32)
+    )[body]
+
+
+def car_park(
+    canvas: Canvas,
+    rng: np.random.Generator,
+    x: float,
+    y: float,
+    angle: float,
+    half_u: float,
+    half_v: float,
+) -> None:
+    """Asphalt with rows of bays along u, more or less full, perhaps with trees between the rows."""
+    canvas.box(
+        x, y, angle, half_u, half_v, pick(rng, ASPHALT, spread=10), cover=PAVED, corner_m=1.5
+    )
+    fullness, bay = float(rng.beta(2, 2)), 2.7
+    c, s = cos(angle), sin(angle)
+    rows = np.arange(-half_v + 3.2, half_v - 2.6, 8.4)
+    green = rng.random() < 0.35
+    for row, v in enumerate(rows):
+        if green and row % 2 == 1:
+            canvas.box(
+                x - s * (v + 4.2),
+                y + c * (v + 4.2),
+                angle,
+                half_u - 3,
+                0.9,
+                (104, 116, 72),
+                cover=GROUND,
+                grass=0.9,
+                corner_m=0.8,
+            )
+        stamp = canvas.stamp(x - s * v, y + c * v, angle, half_u - 2, 2.5)
+        if stamp is not None:
+            line = np.abs(np.mod(stamp.u_hw + bay / 2, bay) - bay / 2) < max(
+                0.1, 0.28 * canvas.metres_per_pixel
+            )
+            inside = (np.abs(stamp.u_hw) < half_u - 2) & (np.abs(stamp.v_hw) < 2.5)
+            canvas.paint(stamp, (line & inside) * np.float32(0.5), WHITE)
+        for u in np.arange(-half_u + 2 + bay / 2, half_u - 2, bay):
+            if rng.random() < fullness:
+                jitter = rng.normal(0, 0.15, 2)
+                at_u, at_v = float(u + jitter[0]), float(v + jitter[1])
+                car(
+                    canvas,
+                    rng,
+                    x + c * at_u - s * at_v,
+                    y + s * at_u + c * at_v,
+                    angle + pi / 2 * float(rng.choice([-1, 1])),
+                )
+
+
+def path(
+    canvas: Canvas,
+    points: list[tuple[float, float]],
+    width: float,
+    colour: Colour,
+    *,
+    cover: int = PAVED,
+) -> None:
+    """A way through the points (x, y)."""
+    for (x0, y0), (x1, y1) in pairwise(points):
+        length = hypot(x1 - x0, y1 - y0)
+        canvas.box(
+            (x0 + x1) / 2,
+            (y0 + y1) / 2,
+            float(np.arctan2(y1 - y0, x1 - x0)),
+            length / 2 + width / 2,
+            width / 2,
+            colour,
+            cover=cover,
+            corner_m=width / 2,
+        )
+
+
+def pitch(
+    canvas: Canvas,
+    rng: np.random.Generator,
+    x: float,
+    y: float,
+    angle: float,
+    half_u: float,
+    half_v: float,
+) -> None:
+    """A football pitch, mown in stripes, with its lines; perhaps a running track around it."""
+    c, s = cos(angle), sin(angle)
+    if rng.random() < 0.5 and half_v > 20:
+        tartan: Colour = (164, 86, 68) if rng.random() < 0.7 else (88, 112, 140)
+        canvas.box(x, y, angle, half_u, half_v, tartan, cover=PAVED, corner_m=half_v - 0.1)
+        for lane in range(1, 5):
+            inset = lane * 1.25
+            _outline(canvas, x, y, angle, half_u - inset, half_v - inset, half_v - inset - 0.1)
+        half_u, half_v = half_u - 7, half_v - 7
+        canvas.box(
+            x,
+            y,
+            angle,
+            half_u,
+            half_v,
+            (96, 122, 66),
+            cover=PAVED,
+            grass=0.8,
+            corner_m=half_v - 0.1,
+        )
+        half_u, half_v = half_u - half_v * 0.42, half_v * 0.86
+    stamp = canvas.stamp(x, y, angle, half_u, half_v)
+    if stamp is not None:
+        inside = np.minimum(half_u - np.abs(stamp.u_hw), half_v - np.abs(stamp.v_hw))
+        stripes = 1 + 0.045 * np.where(np.mod(stamp.u_hw, 11) < 5.5, 1, -1)[..., None]
+        turf = np.asarray(pick(rng, ((94, 124, 66), (84, 116, 64), (104, 126, 74))), np.float32)
+        canvas.paint(stamp, canvas.coverage(inside), stripes * turf, cover=PAVED, grass=0.85)
+    _outline(canvas, x, y, angle, half_u - 1.5, half_v - 1.5, 0.0)
+    canvas.box(x, y, angle, 0.14, half_v - 1.5, WHITE, opacity=0.8)
+    canvas.disc(x, y, min(9.1, half_v * 0.4), WHITE, ring_m=0.3)
+    for side in (-1, 1):
+        u = side * (half_u - 1.5 - half_u * 0.15)
+        _outline(canvas, x + c * u, y + s * u, angle, half_u * 0.15, half_v * 0.5, 0.0)
+
+
+def _outline(
+    canvas: Canvas, x: float, y: float, angle: float, half_u: float, half_v: float, corner_m: float
+) -> None:
+    stamp = canvas.stamp(x, y, angle, half_u + 0.3, half_v + 0.3)
+    if stamp is None or half_v <= 0.5:
+        return
+    du, dv = np.abs(stamp.u_hw) - (half_u - corner_m), np.abs(stamp.v_hw) - (half_v - corner_m)
+    edge = (
+        np.hypot(np.maximum(du, 0), np.maximum(dv, 0))
+        + np.minimum(np.maximum(du, dv), 0)
+        - corner_m
+    )
+    canvas.paint(stamp, canvas.coverage(np.float32(0.14) - np.abs(edge)) * np.float32(0.85), WHITE)
+
+
+def courts(
+    canvas: Canvas,
+    rng: np.random.Generator,
+    x: float,
+    y: float,
+    angle: float,
+    half_u: float,
+    half_v: float,
+) -> None:
+    """Tennis courts side by side, as many as fit."""
+    inner, outer = COURTS[int(rng.integers(len(COURTS)))]
+    canvas.box(x, y, angle, half_u, half_v, outer, cover=PAVED)
+    c, s = cos(angle), sin(angle)
+    across, deep = max(1, int(2 * half_u // 17)), max(1, int(2 * half_v // 35))
+    for i in range(across):
+        for j in range(deep):
+            u = (i + 0.5) * 2 * half_u / across - half_u
+            v = (j + 0.5) * 2 * half_v / deep - half_v
+            cx, cy = x + c * u - s * v, y + s * u + c * v
+            hu, hv = min(5.5, half_u / across - 1), min(11.9, half_v / deep - 1)
+            canvas.box(cx, cy, angle, hu + 0.6, hv + 0.6, inner)
+            _outline(canvas, cx, cy, angle, hu, hv, 0.0)
+            _outline(canvas, cx, cy, angle, hu * 0.75, hv * 0.54, 0.0)
+            canvas.box(cx, cy, angle, hu, 0.2, shade(outer, 0.6))
+
+
+def diamond(
+    canvas: Canvas, rng: np.random.Generator, x: float, y: float, angle: float, radius: float
+) -> None:
+    """A baseball diamond: infield, bases, mound, mown outfield."""
+    earth = pick(rng, EARTH)
+    c, s = cos(angle), sin(angle)
+    canvas.disc(x, y, radius, (98, 122, 68), grass=0.9, cover=PAVED)
+    home_x, home_y = x - c * radius * 0.55, y - s * radius * 0.55
+    canvas.disc(home_x + c * radius * 0.33, home_y + s * radius * 0.33, radius * 0.42, earth)
+    canvas.disc(home_x, home_y, radius * 0.13, earth)
+    side = radius * 0.21
+    canvas.box(
+        home_x + c * side * 1.5,
+        home_y + s * side * 1.5,
+        angle + pi / 4,
+        side,
+        side,
+        (100, 124, 70),
+        grass=0.9,
+    )
+    canvas.disc(home_x + c * side * 1.5, home_y + s * side * 1.5, radius * 0.06, earth)
+
+
+def water(canvas: Canvas, rng: np.random.Generator, x: float, y: float, angle: float, half_u: float, half_v: float,
+          *, wobble: float = 0.25) -> None:  # fmt: skip
+    """A pond with a wandering shore and a darker middle."""
+    stamp = canvas.stamp(x, y, angle, half_u * 1.3, half_v * 1.3)
+    if stamp is None:
+        return
+    at = (stamp.rows, stamp.cols)
+    phase = rng.uniform(0, 2 * pi, 3)
+    turn = np.arctan2(stamp.v_hw / half_v, stamp.u_hw / half_u)
+    shore = 1 + wobble * (0.5 * np.sin(2 * turn + phase[0]) + 0.35 * np.sin(3 * turn + phase[1])
+                          + 0.2 * np.sin(5 * turn + phase[2]))  # fmt: skip
+    inside = (shore - np.hypot(stamp.u_hw / half_u, stamp.v_hw / half_v)) * np.float32(
+        min(half_u, half_v)
+    )
+    colour = np.asarray(pick(rng, WATERS), np.float32)
+    deep = (1.12 - 0.12 * np.clip(inside / 4, 0, 1) + 0.02 * canvas.lumps_HW[at])[..., None]
+    canvas.paint(stamp, canvas.coverage(inside + 1.2), (142, 132, 104), grass=0.4)
+    canvas.paint(stamp, canvas.coverage(inside), (deep * colour).astype(np.float32), cover=WATER)
+
+
+def pool(canvas: Canvas, rng: np.random.Generator, x: float, y: float, angle: float) -> None:
+    """A swimming pool in its terrace."""
+    hu, hv = float(rng.uniform(2.6, 5)), float(rng.uniform(1.6, 2.6))
+    canvas.box(x, y, angle, hu + 1.4, hv + 1.4, (190, 182, 166), cover=PAVED, corner_m=0.8)
+    canvas.box(
+        x,
+        y,
+        angle,
+        hu,
+        hv,
+        (92, 178, 196),
+        cover=WATER,
+        corner_m=min(hv * 0.8, float(rng.uniform(0.2, 2))),
+    )

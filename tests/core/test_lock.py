@@ -1,0 +1,91 @@
+"""Two runs on one output: the second is refused while the first lives, and not a moment longer."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.core.lock import one_at_a_time, only_one
+
+ROOT = Path(__file__).parents[2]
+HOLD = """
+import sys, time
+from pipeline.core.lock import only_one
+with only_one(sys.argv[1]):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@contextmanager
+def held(out: Path) -> Iterator["subprocess.Popen[str]"]:
+    """Another process that holds a folder."""
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(out)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held\n"
+        try:
+            yield other
+        finally:
+            other.kill()
+
+
+def test_a_second_run_is_refused_with_who_holds_it_and_leaves_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with held(out) as other:
+        with (
+            pytest.raises(
+                InputError,
+                match=rf"is being written by process {other.pid}, since 2.*wait until it has ended",
+            ),
+            only_one(str(out)),
+        ):
+            pass
+        with only_one(str(tmp_path / "another")):
+            assert not out.exists()
+
+
+def test_a_run_that_was_killed_holds_nothing(tmp_path: Path) -> None:
+    with held(tmp_path) as other:
+        os.kill(other.pid, signal.SIGKILL)
+        other.wait()
+        with only_one(str(tmp_path)):
+            pass
+
+
+def test_one_folder_by_two_names_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "out")
+    monkeypatch.chdir(tmp_path)
+    with only_one("out"):
+        for name in (f"{tmp_path}/out/", f"file://{tmp_path}/out", f"{tmp_path}/link"):
+            with pytest.raises(InputError, match="one run at a time"), only_one(name):
+                pass
+    with only_one(f"{tmp_path}/link"):
+        pass
+
+
+def test_a_stage_holds_its_output_while_it_runs_and_then_no_more(tmp_path: Path) -> None:
+    @one_at_a_time(lambda number, out: out)
+    def stage(number: int, out: str) -> int:
+        with pytest.raises(InputError, match="one run at a time"), only_one(out):
+            pass
+        if number < 0:
+            raise ValueError
+        return number
+
+    assert stage(3, str(tmp_path)) == 3
+    with pytest.raises(ValueError):  # noqa: PT011
+        stage(-1, str(tmp_path))
+    assert stage(4, out=str(tmp_path)) == 4
+
+
+def test_object_stores_have_no_locks() -> None:
+    with only_one("memory://out"), only_one("memory://out"):
+        pass

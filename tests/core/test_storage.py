@@ -1,0 +1,69 @@
+"""Files appear whole or not at all, on a disk and on any storage that fsspec knows."""
+
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from pipeline.core import storage
+
+
+@pytest.fixture(params=["disk", "file uri", "memory"])
+def folder(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    if request.param == "memory":
+        fsspec.filesystem("memory").rm("/", recursive=True)
+        return "memory://bucket/things"
+    return str(tmp_path) if request.param == "disk" else tmp_path.as_uri()
+
+
+def test_what_is_written_is_read_back_and_listed(folder: str) -> None:
+    path = storage.join(folder, "deep", "a.json")
+    assert not storage.exists(path)
+    storage.write_json(path, {"é": [1, 2]})
+    assert storage.exists(path)
+    assert storage.read_json(path) == {"é": [1, 2]}
+    assert storage.names(storage.join(folder, "deep")) == ["a.json"]
+    assert list(storage.walk(folder)) == ["deep/a.json"]
+    assert storage.is_folder(folder)
+
+
+def test_a_write_that_fails_leaves_what_was_there(folder: str) -> None:
+    path = storage.join(folder, "a.bin")
+    storage.write_bytes(path, b"good")
+
+    def half() -> None:
+        with storage.atomic(path) as stream:
+            stream.write(b"ba")
+            raise RuntimeError("half way")
+
+    with pytest.raises(RuntimeError, match="half way"):
+        half()
+    assert storage.read_bytes(path) == b"good"
+    assert storage.names(folder) == ["a.bin"]
+
+
+def test_an_absent_folder_has_no_names(tmp_path: Path) -> None:
+    assert storage.names(str(tmp_path / "nowhere")) == []
+
+
+def test_paths_are_made_absolute_and_uris_left_alone(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert storage.absolute("a/b") == str(tmp_path / "a" / "b")
+    assert storage.absolute("s3://bucket/a") == "s3://bucket/a"
+
+
+def test_what_killed_writers_left_is_swept_away_and_nothing_else(tmp_path: Path) -> None:
+    for name in (
+        ".a.parquet.0123abcd",
+        ".b.parquet.0123abcd",
+        ".a.parquet",
+        "a.parquet",
+        ".a.parquet.0123abcx",
+    ):
+        (tmp_path / name).touch()
+    storage.sweep(str(tmp_path), ["a.parquet"])
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert left == [".a.parquet", ".a.parquet.0123abcx", ".b.parquet.0123abcd", "a.parquet"]
+    storage.sweep(str(tmp_path / "nowhere"), ["a.parquet"])

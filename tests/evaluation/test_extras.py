@@ -1,0 +1,169 @@
+"""What an evaluation writes besides measures: numbers of views, groups, exports; and the same files
+from any workers.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from jobs import evaluate as job
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.evaluation import breakdowns
+from pipeline.evaluation.evaluate import EvaluationSettings, evaluate
+from pipeline.features.table import PartFooter, PartRows, write_part
+from pipeline.retrieval.tasks import RESULTS_SCHEMA
+from tests.evaluation.test_evaluate import TEST_SET, made_table
+
+
+def test_r1_by_views_starts_at_the_single_and_ends_at_the_multi_query(tmp_path: Path) -> None:
+    rows = evaluate(
+        EvaluationSettings(table=made_table(tmp_path / "t", TEST_SET), out=str(tmp_path / "o"))
+    )
+    curve = storage.read_json(str(tmp_path / "o" / "views.json"))
+    assert [(row["views"], row["queries"]) for row in curve] == [(1, 10), (2, 5)]
+    assert [curve[0][name] for name in ("r1", "ap", "r1_low")] == pytest.approx(
+        [rows[0][name] for name in ("r1", "ap", "r1_low")]
+    )
+    assert [curve[1][name] for name in ("r1", "ap")] == pytest.approx(
+        [rows[2][name] for name in ("r1", "ap")]
+    )
+
+
+def test_any_number_of_workers_writes_the_same_bytes(tmp_path: Path, ray_cluster: None) -> None:
+    table = made_table(tmp_path / "t", TEST_SET)
+    for workers in (0, 1, 3):
+        evaluate(
+            EvaluationSettings(
+                table=table, out=str(tmp_path / f"{workers}"), workers=workers, exports=("answer",)
+            )
+        )
+    names = sorted(path.name for path in (tmp_path / "0").iterdir())
+    assert "answer-drone-satellite.txt" in names
+    for workers in (1, 3):
+        assert all(
+            (tmp_path / f"{workers}" / n).read_bytes() == (tmp_path / "0" / n).read_bytes()
+            for n in names
+        )
+
+
+def test_asking_for_more_writes_it_without_ranking_again(tmp_path: Path) -> None:
+    table, out = made_table(tmp_path / "t", TEST_SET), tmp_path / "o"
+    evaluate(EvaluationSettings(table=table, out=str(out)))
+    ranked = (out / "queries.parquet").stat().st_mtime_ns
+    evaluate(EvaluationSettings(table=table, out=str(out), exports=("mat",)))
+    assert (out / "pytorch_result-satellite-drone.mat").exists()
+    assert (out / "queries.parquet").stat().st_mtime_ns == ranked
+
+
+@pytest.mark.parametrize(
+    ("asked", "sentence"),
+    [
+        ({"by": ("altitude_m",)}, r"found --by altitude_m without --shards"),
+        ({"answer_order": "x"}, r"expected one task .*--exports answer and --shards"),
+        ({"workers": -1}, r"--workers is -1"),
+        ({"panels": -1}, r"--panels is -1"),
+    ],
+)
+def test_what_cannot_go_together_is_refused(asked: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        EvaluationSettings(table="t", out="o", **asked)
+
+
+def results(*rows: tuple[str, str, int | None]) -> pa.Table:
+    return pa.Table.from_pylist(
+        [
+            {
+                "query": key,
+                "location": place,
+                "task": "drone->satellite",
+                "protocol": "full",
+                "multi_query": False,
+                "first_match_rank": rank,
+                "ap": 1.0 if rank == 1 else 0.0,
+            }
+            for key, place, rank in rows
+        ],
+        RESULTS_SCHEMA,
+    )
+
+
+def test_measures_by_group_are_those_of_the_group_s_queries() -> None:
+    known = {"a": 80.0, "b": 100.0, "c": 80.0, "d": None}
+    rows = breakdowns.break_down(
+        results(("a", "1", 1), ("b", "1", 3), ("c", "2", None), ("d", "2", 1)), "altitude_m", known
+    )
+    assert [(row["value"], row["queries"], row["r1"], row["r5"], row["ap"]) for row in rows] == [
+        ("80", 2, 0.5, 0.5, 0.5), ("100", 1, 0.0, 1.0, 0.0), ("unknown", 1, 1.0, 1.0, 1.0),
+    ]  # fmt: skip
+    assert (rows[0]["by"], rows[0]["locations"]) == ("altitude_m", 2)
+
+
+def test_directions_fall_into_sectors_and_many_numbers_into_round_bins() -> None:
+    names, _ = breakdowns.group_names("heading_deg", [0, 22.4, 22.6, 359, -90, 180, None])
+    assert names.tolist() == ["N", "N", "NE", "N", "W", "S", "unknown"]
+    values = [float(v) for v in range(100, 251, 5)]
+    names, order = breakdowns.group_names("altitude_m", values)
+    assert order == ["100 to 150", "150 to 200", "200 to 250", "unknown"]
+    assert (names[0], names[10], names[-1]) == ("100 to 150", "150 to 200", "200 to 250")
+    assert breakdowns.group_names("variant", ["b", "a", None])[1] == ["a", "b", "unknown"]
+
+
+def test_groups_come_from_the_records_beside_the_shards(tiny_shards: str) -> None:
+    assert set(breakdowns.read_column(tiny_shards, "view").values()) == {"drone", "satellite"}
+    with pytest.raises(
+        InputError,
+        match=r"--by is colour, expected a column of the shards' records: location, view",
+    ):
+        breakdowns.read_column(tiny_shards, "colour")
+
+
+def test_positions_of_the_table_become_distances(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = ["0001", "0002"]
+    for split, view, off in (("query", "drone", 0.0), ("gallery", "satellite", 0.0005)):
+        write_part(
+            str(tmp_path / "t" / f"{split}.parquet"),
+            PartRows(
+                keys=[f"{split}-{p}" for p in places],
+                locations=places,
+                views=[view] * 2,
+                splits=[split] * 2,
+                lats=[30.0 + off, 31.0 + off],
+                lons=[120.0, 120.0],
+                embeddings_BD=np.eye(2, dtype=np.float32),
+            ),
+            PartFooter(fingerprint="f", shard_sha256=split, rows=2),
+        )
+    asked_for = EvaluationSettings(
+        table=str(tmp_path / "t"), out=str(tmp_path / "o"), figures=("pdf",)
+    )
+    job.main(asked_for, published=True)
+    [row, merged] = storage.read_json(str(tmp_path / "o" / "metrics.json"))
+    assert (row["geo_queries"], row["within_25m"], row["within_100m"]) == (2, 0.0, 1.0)
+    assert row["distance_median_m"] == pytest.approx(55.6, abs=0.05)
+    assert row["sdm1"] == pytest.approx(np.exp(-2.5))
+    assert row["sdm3"] is None
+    assert merged["geo_queries"] == 0
+    assert pq.read_table(tmp_path / "o" / "metrics.parquet").to_pylist() == [row, merged]
+    asked = pq.read_table(tmp_path / "o" / "queries.parquet").to_pylist()
+    assert [each["distance_m"] for each in asked[:2]] == pytest.approx([55.6, 55.6], abs=0.05)
+    assert [asked[1][name] for name in ("lat", "lon", "answer_lat", "answer_lon")] == [
+        31.0,
+        120.0,
+        31.0005,
+        120.0,
+    ]
+    assert asked[2]["distance_m"] is None
+    assert (tmp_path / "o" / "figures" / "map-drone-satellite.pdf").exists()
+    assert 'id="map"' in (tmp_path / "o" / "report.html").read_text()
+    said = capsys.readouterr().out
+    assert "55.6 m" in said
+    assert "published" in said
+    assert "82.73" in said
+    assert "…" not in said

@@ -1,0 +1,332 @@
+"""Damage to any file that we write is found: a sentence that names the file and what mends it, or
+the content is what it was.
+
+Seeded: flipped bits, blocks of zeros, files cut off, files gone. Never a traceback, never other
+content without a word.
+"""
+
+import re
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from pipeline.core import json_files, rejections, storage
+from pipeline.core.errors import InputError
+from pipeline.core.records import Rejection, Split, View
+from pipeline.features.part import (
+    PartFooter,
+    PartRows,
+    list_rejected,
+    read_header,
+    read_rejected,
+    verify_part,
+    write_part,
+)
+from pipeline.features.row_reader import RowReader
+from pipeline.features.table import Box, open_table
+from pipeline.index.metadata import FACTS, Effort, IndexFacts, PartFacts, read_facts, write_facts
+from pipeline.locate.confidence import Confidence, read_confidence, write_confidence
+from pipeline.locate.logistic import Logistic
+from pipeline.locate.reliability import Bin
+from pipeline.retrieval.results import INPUTS, METRICS, VIEWS, read_inputs, read_rows, write_inputs
+from pipeline.shards import record_table
+from pipeline.shards.manifest import MANIFEST, Manifest, Shard, read_manifest
+from pipeline.shards.record_table import Packed
+from tests.damaging import MENDS, damages, found_or_equal, look_or_say_gone, sentence_of
+
+ROWS, DIMENSION = 40, 16
+
+
+@pytest.fixture
+def part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A feature table of one part, in three row groups."""
+    monkeypatch.setattr("pipeline.features.part.ROW_GROUP", 16)
+    vectors = np.random.default_rng(0).normal(size=(ROWS, DIMENSION)).astype(np.float32)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    places = [None if number % 5 == 0 else 40 + number / 7 for number in range(ROWS)]
+    rows = PartRows(
+        keys=[f"k{number}" for number in range(ROWS)],
+        locations=[f"place{number // 4}" for number in range(ROWS)],
+        views=["drone"] * 20 + ["satellite"] * 20,
+        splits=["gallery"] * ROWS,
+        lats=places,
+        lons=places,
+        embeddings_BD=vectors,
+    )
+    path = tmp_path / "table" / "gallery-drone-000000.parquet"
+    write_part(str(path), rows, PartFooter(fingerprint="f" * 64, shard_sha256="s" * 64, rows=ROWS))
+    return path
+
+
+def look_at_table(part: Path) -> list[Any]:
+    """All that others are told of a table, by every way of reading it."""
+    try:
+        table = open_table(str(part.parent))
+    except InputError as error:
+        if "no feature table" not in str(error):
+            raise
+        raise InputError(f"{part}: {error}") from None  # it was the only part
+    seen: list[Any] = [table.fingerprint, table.counts, table.footers]
+    box = Box(south=41, north=43, west=0, east=90)
+    for rows in (
+        table,
+        table.select(view=View.DRONE),
+        table.select(locations=["place7", "place3"]),
+        table.select(box=box),
+    ):
+        labels = rows.labels()
+        seen += [
+            rows.rows,
+            labels.keys.tolist(),
+            labels.locations.tolist(),
+            np.nan_to_num(labels.lats).tolist(),
+        ]
+        seen += [np.nan_to_num(labels.lons).tolist(), rows.embeddings().tobytes()]
+    seen.append(
+        [(name, rows.to_pylist()) for name, rows in table.select(Split.GALLERY).numbered(["key"])]
+    )
+    seen.append(
+        RowReader(str(part.parent), DIMENSION).read(part.name, "s" * 64, np.arange(ROWS)).tobytes()
+    )
+    return seen
+
+
+def test_a_damaged_part_of_a_table_is_refused_however_it_is_read(part: Path) -> None:
+    assert found_or_equal(part, lambda: look_at_table(part), 400) > 300
+
+
+def test_a_footer_is_held_against_the_seal_before_arrow_sees_it(part: Path) -> None:
+    """Arrow ends the process over some of them, and believes others."""
+    good, rng = part.read_bytes(), np.random.default_rng(0)
+    begin = len(good) - 8 - int.from_bytes(good[-8:-4], "little")
+    for place in range(begin - len(good), 0, 3):
+        data = bytearray(good)
+        data[place] ^= 1 << int(rng.integers(8))
+        part.write_bytes(data)
+        with pytest.raises(InputError, match=re.escape(f"{part} is not a readable Parquet file")):
+            read_header(str(part))
+
+
+def test_every_byte_of_a_part_is_looked_at_when_asked(part: Path) -> None:
+    assert found_or_equal(part, look_or_say_gone(part, lambda: verify_part(str(part))), 200) == 201
+
+
+def test_parts_without_seals_and_checksums_are_read_as_they_are(part: Path) -> None:
+    expected, whole = look_at_table(part), pq.read_table(part)
+    for dictionary in (False, ["key", "view"]):
+        pq.write_table(
+            whole, part, row_group_size=16, compression="none", use_dictionary=dictionary
+        )
+        assert look_at_table(part) == expected
+        verify_part(str(part))
+
+
+def test_a_damaged_record_part_is_refused_and_not_taken_for_done(tmp_path: Path) -> None:
+    shard = Shard(
+        name="train-drone-000000",
+        split=Split.TRAIN,
+        view=View.DRONE,
+        samples=9,
+        bytes=3,
+        sha256="s" * 64,
+    )
+    packed = Packed(
+        shard=shard,
+        plan="p" * 64,
+        rejected=(Rejection(path="x.jpg", reason="no image", found="text"),),
+    )
+    row = {
+        "key": "k",
+        "location": "a",
+        "view": "drone",
+        "split": "train",
+        "variant": "",
+        "shard": shard.name,
+        "lat": 1.0,
+        "footprint": [[1.0, 2.0]] * 4,
+        "source": "table",
+        "path": "/x.jpg",
+        "part": "",
+        "sha256": "h",
+        "bytes": 3,
+        "width": 2,
+        "height": 2,
+    }
+    record_table.write_part(
+        str(tmp_path), packed, [row | {"key": f"k{number}"} for number in range(9)]
+    )
+    path = tmp_path / record_table.FOLDER / f"{shard.name}.parquet"
+
+    def look() -> Any:
+        assert record_table.read_packed(str(tmp_path), shard.name) in (packed, None)
+        return record_table.read_part(str(tmp_path), shard.name).to_pylist()
+
+    assert found_or_equal(path, look, 300) > 200
+
+
+def test_a_damaged_list_of_what_was_refused_is_named(tmp_path: Path) -> None:
+    rejections.write(str(tmp_path), [Rejection(path="a", reason="b", found="c")], keep=False)
+    path = tmp_path / rejections.FILE
+    good = path.read_bytes()
+    for data in damages(good, 100):
+        if data is None:
+            continue
+        path.write_bytes(data)
+        said = sentence_of(
+            lambda: rejections.write(
+                str(tmp_path), [Rejection(path="d", reason="e", found="f")], keep=True
+            )
+        )
+        if said is None:
+            assert len(pq.read_table(path)) == 2
+        else:
+            assert str(path) in said
+            assert MENDS.search(said)
+
+
+def test_a_damaged_list_of_a_table_is_named_and_written_again(tmp_path: Path) -> None:
+    rows = [("shard", "key", "reason", "found")]
+    list_rejected(str(tmp_path), rows)
+    path = tmp_path / "_rejected" / "rejected.parquet"
+
+    look = look_or_say_gone(path, lambda: read_rejected(str(tmp_path)).to_pylist())
+    assert found_or_equal(path, look, 100) > 80
+    for data in damages(path.read_bytes(), 30, seed=1):
+        path.write_bytes(data or b"")
+        list_rejected(str(tmp_path), rows)
+        assert len(read_rejected(str(tmp_path))) == 1
+
+
+def test_a_damaged_manifest_is_refused(tmp_path: Path) -> None:
+    shards = tuple(
+        Shard(
+            name=f"train-drone-{n:06d}",
+            split=Split.TRAIN,
+            view=View.DRONE,
+            samples=n,
+            bytes=n,
+            sha256=f"{n:064x}",
+        )
+        for n in range(5)
+    )
+    manifest = Manifest(
+        shards=shards, classes=("a", "b"), packing={"source": "table", "check": "quick"}, rejected=0
+    )
+    path = tmp_path / MANIFEST
+    json_files.write_checksummed(str(path), asdict(manifest))
+    look = look_or_say_gone(path, lambda: asdict(read_manifest(str(tmp_path))))
+    assert found_or_equal(path, look, 400) > 300
+
+
+def test_a_damaged_index_json_is_refused(tmp_path: Path) -> None:
+    part = PartFacts(
+        faiss="index.faiss",
+        ids="ids.arrow",
+        first_row=0,
+        rows=5,
+        table_parts={"gallery-drone-000000.parquet": "s" * 64},
+        files={"index.faiss": {"bytes": 9, "sha256": "0" * 64}},
+    )
+    facts = IndexFacts(
+        factory="Flat",
+        metric="inner product",
+        rows=5,
+        dimension=8,
+        fingerprint="f" * 64,
+        table="/t",
+        asked={"split": None},
+        why="few rows",
+        refine="none",
+        on_disk=False,
+        effort=Effort(breadth=1),
+        target_recall=0.9,
+        unit_rows=9,
+        part_rows=9,
+        training_sample=0,
+        build_seconds=0.1,
+        bytes_per_vector=8.0,
+        expected_bytes=None,
+        measured={"recall_at_10": 1.0},
+        parts=(part,),
+        trained={},
+    )
+    write_facts(str(tmp_path), facts)
+    path = tmp_path / FACTS
+    assert (
+        found_or_equal(path, look_or_say_gone(path, lambda: read_facts(str(tmp_path))), 400) > 300
+    )
+
+
+def test_a_damaged_calibration_is_refused(tmp_path: Path) -> None:
+    model = Logistic(
+        mean_F=(0.1, 0.2, 0.3, 0.4),
+        scale_F=(1.0,) * 4,
+        coefficient_F=(1.5, 2.5, 3.5, 4.5),
+        intercept=0.25,
+    )
+    calibration = Confidence(
+        fingerprint="f" * 64,
+        gallery=5,
+        asked="places held out",
+        spacing_m=10.0,
+        within_m=5.0,
+        tolerance_m=3.0,
+        outside=0.5,
+        model=model,
+        threshold=0.5,
+        sharpness=9.0,
+        elsewhere=0.1,
+        photos=3,
+        locations=2,
+        right=0.7,
+        right_kept=0.6,
+        outside_unknown=0.8,
+        calibration_error=0.02,
+        bins=(Bin(said=0.5, seen=0.4, share=1.0),),
+    )
+    path = tmp_path / "calibration.json"
+    write_confidence(str(path), calibration)
+    look = look_or_say_gone(path, lambda: read_confidence(str(path), {"fingerprint": "f" * 64}))
+    assert found_or_equal(path, look, 400) > 300
+
+
+def test_an_evaluation_is_read_back_as_it_was_written_or_not_at_all(tmp_path: Path) -> None:
+    metrics = [
+        {
+            "task": "drone->satellite",
+            "protocol": "full",
+            "multi_query": False,
+            "r1": 0.25,
+            "ap": 0.5,
+        }
+    ]
+    storage.write_json(str(tmp_path / VIEWS), [{"views": 3, "r1": 0.5}])
+    write_inputs(
+        str(tmp_path), {"ranked": {"queries": "q" * 64}, "shown": {}}, storage.as_json(metrics)
+    )
+    storage.write_json(str(tmp_path / METRICS), metrics)
+    for name, listed in ((METRICS, METRICS), (VIEWS, VIEWS)):
+        read = partial(read_rows, str(tmp_path), listed)
+        assert found_or_equal(tmp_path / name, read, 200) == 201
+    path = tmp_path / INPUTS
+    assert (
+        found_or_equal(path, look_or_say_gone(path, lambda: read_inputs(str(tmp_path))), 200) > 150
+    )
+
+
+def test_json_without_a_seal_is_believed_and_one_changed_on_purpose_is_told_what_to_do(
+    tmp_path: Path,
+) -> None:
+    path, said = str(tmp_path / "a.json"), {"b": 1.5, "a": [None, "é"], "n": {"2": 1, "10": 2}}
+    json_files.write_checksummed(path, said)
+    assert json_files.read_checksummed(path) == said
+    storage.write_json(path, said)
+    assert json_files.read_checksummed(path) == said
+    storage.write_json(path, said | {"b": 2, "seal": json_files.checksum_of(said)})
+    with pytest.raises(ValueError, match="whoever changed it on purpose takes that entry out"):
+        json_files.read_checksummed(path)

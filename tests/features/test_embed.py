@@ -1,0 +1,135 @@
+"""Embedding: a part per shard, rows exactly once, done parts skipped, other networks refused."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.batches.ordered import CHANGED
+from pipeline.core.errors import InputError
+from pipeline.core.records import Split, View
+from pipeline.features.embed import EmbeddingSettings, Encoder, Network, embed_gallery
+from pipeline.features.part import read_rejected
+from pipeline.features.table import open_table, read_footer
+from pipeline.shards.manifest import read_manifest
+from pipeline.shards.samples import read_shard
+from tests.damaging import say_again
+
+
+def mean_colour_network(fingerprint: str = "f" * 64) -> Network:
+    """An encoder that needs no training: the unit vector of the mean colour."""
+
+    def factory(threads: int) -> Encoder:
+        def encode(images_B3HW: np.ndarray) -> np.ndarray:
+            mean_B3 = images_B3HW.mean((2, 3)).astype(np.float32) + 1
+            unit: np.ndarray = mean_B3 / np.linalg.norm(mean_B3, axis=1, keepdims=True)
+            return unit
+
+        return encode
+
+    return Network(fingerprint=fingerprint, image_size=32, factory=factory)
+
+
+def test_every_image_has_one_row_with_its_label_and_position(
+    tmp_path: Path, tiny_shards: str, ray_cluster: None
+) -> None:
+    out = str(tmp_path / "table")
+    count = embed_gallery(
+        EmbeddingSettings(shards=tiny_shards, out=out, batch_size=3), mean_colour_network()
+    )
+    manifest = read_manifest(tiny_shards)
+    assert count == sum(shard.samples for shard in manifest.shards)
+    table = open_table(out)
+    assert sorted(table.parts) == sorted(f"{shard.name}.parquet" for shard in manifest.shards)
+    samples = [
+        sample for shard in manifest.shards for sample in read_shard(tiny_shards, shard.name)
+    ]
+    labels = table.labels()
+    assert labels.keys.tolist() == [sample.key for sample in samples]
+    assert labels.locations.tolist() == [sample.facts["location"] for sample in samples]
+    assert labels.lats.tolist() == [sample.facts["geotag"]["lat"] for sample in samples]
+    assert np.allclose(np.linalg.norm(table.embeddings(), axis=1), 1, atol=1e-6)
+
+
+def test_run_again_does_only_what_is_missing(
+    tmp_path: Path, tiny_shards: str, ray_cluster: None
+) -> None:
+    settings = EmbeddingSettings(
+        shards=tiny_shards, out=str(tmp_path), split=Split.GALLERY, view=View.DRONE
+    )
+    shards = read_manifest(tiny_shards).of(Split.GALLERY, View.DRONE)
+    assert len(shards) > 1
+    assert embed_gallery(settings, mean_colour_network()) == sum(shard.samples for shard in shards)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    times = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    assert embed_gallery(settings, mean_colour_network()) == 0
+    lost = tmp_path / f"{shards[0].name}.parquet"
+    lost.unlink()
+    assert embed_gallery(settings, mean_colour_network()) == shards[0].samples
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert all(
+        path.stat().st_mtime_ns == times[path.name] for path in tmp_path.iterdir() if path != lost
+    )
+
+
+def test_a_table_of_another_network_is_refused(
+    tmp_path: Path, tiny_shards: str, ray_cluster: None
+) -> None:
+    settings = EmbeddingSettings(
+        shards=tiny_shards, out=str(tmp_path), split=Split.QUERY, view=View.SATELLITE
+    )
+    embed_gallery(settings, mean_colour_network())
+    with pytest.raises(
+        InputError, match=r"was made by network f+, this checkpoint is g+; choose another --out"
+    ):
+        embed_gallery(settings, mean_colour_network("g" * 64))
+
+
+def test_what_the_shards_do_not_hold_is_named(tmp_path: Path, tiny_shards: str) -> None:
+    with pytest.raises(InputError, match="none of it was asked for"):
+        embed_gallery(
+            EmbeddingSettings(shards=tiny_shards, out=str(tmp_path), view=View.STREET),
+            mean_colour_network(),
+        )
+    with pytest.raises(InputError, match="not a finished set of shards"):
+        embed_gallery(
+            EmbeddingSettings(shards=str(tmp_path), out=str(tmp_path)), mean_colour_network()
+        )
+
+
+def test_an_image_that_cannot_be_decoded_is_left_out_and_told(
+    tmp_path: Path, tiny_shards: str, ray_cluster: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Packing refuses such images; this one was changed later, and tar and manifest by somebody who
+    meant it.
+    """
+    shard = read_manifest(tiny_shards).of(Split.QUERY, View.SATELLITE)[0]
+    data = bytearray((Path(tiny_shards) / f"{shard.name}.tar").read_bytes())
+    start = data.index(b"\xff\xd8\xff")  # the first JPEG loses its beginning
+    data[start : start + 3] = b"\0\0\0"
+    shutil.copytree(tiny_shards, tmp_path, dirs_exist_ok=True)
+    (tmp_path / f"{shard.name}.tar").write_bytes(data)
+    say_again(tmp_path, shard.name)
+    settings = EmbeddingSettings(
+        shards=str(tmp_path), out=str(tmp_path / "table"), split=Split.QUERY, view=View.SATELLITE
+    )
+    embed_gallery(settings, mean_colour_network())
+    footer = read_footer(str(tmp_path / "table" / f"{shard.name}.parquet"))
+    assert footer.rows == shard.samples - 1
+    assert [rejection.reason for rejection in footer.rejected] == [CHANGED]
+    [listed] = read_rejected(str(tmp_path / "table")).to_pylist()
+    assert (listed["shard"], listed["key"], listed["reason"]) == (
+        shard.name,
+        footer.rejected[0].path,
+        CHANGED,
+    )
+    assert embed_gallery(settings, mean_colour_network()) == 0
+
+
+def test_shards_and_tables_may_be_uris(tmp_path: Path, tiny_shards: str, ray_cluster: None) -> None:
+    out = (tmp_path / "table").as_uri()
+    settings = EmbeddingSettings(
+        shards=Path(tiny_shards).as_uri(), out=out, split=Split.QUERY, view=View.DRONE
+    )
+    assert embed_gallery(settings, mean_colour_network()) == open_table(out).rows > 0

@@ -1,0 +1,299 @@
+"""Whatever goes wrong while embedding, the table ends up with the bytes of an undisturbed run's,
+and nothing beside them.
+
+Random kills, of workers and of the stage, are in tests/chaos.
+"""
+
+import errno
+import hashlib
+import os
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.core import cluster, json_files, storage
+from pipeline.core.cluster import Node
+from pipeline.core.errors import InputError
+from pipeline.features.embed import EmbeddingSettings, Encoder, Incomplete, Network, embed_gallery
+from pipeline.features.part import part_names, read_footer, read_rejected
+from pipeline.features.table import open_table, verify
+from pipeline.shards.manifest import Shard, read_manifest
+from tests.damaging import say_again
+
+
+def network_of_colours(
+    seconds: float = 0.0,
+    pids: str = "",
+    at_start: Callable[[], None] = lambda: None,
+    spoil: str = "",
+) -> Network:
+    """An encoder that needs no weights: the mean colour's unit vector. It takes `seconds` a batch,
+    and its worker leaves its process id in the folder `pids`; what `spoil` names happens to a black
+    image."""
+
+    def factory(threads: int) -> Encoder:
+        at_start()
+        if pids:
+            (Path(pids) / str(os.getpid())).touch()
+
+        def encode(images_B3HW: np.ndarray) -> np.ndarray:
+            time.sleep(seconds)
+            black_B = images_B3HW.max((1, 2, 3)) == 0
+            if spoil == "kill" and black_B.any():
+                os.kill(os.getpid(), signal.SIGKILL)
+            if spoil == "raise" and black_B.any():
+                raise ZeroDivisionError("a kernel failed")
+            mean_B3 = images_B3HW.mean((2, 3)).astype(np.float32) + 1
+            unit_B3: np.ndarray = mean_B3 / np.linalg.norm(mean_B3, axis=1, keepdims=True)
+            if spoil == "nan":
+                unit_B3[black_B] = np.nan
+            return unit_B3
+
+        return encode
+
+    return Network(fingerprint="f" * 64, image_size=16, resizer="pillow", factory=factory)
+
+
+def settings_of(shards: str | Path, out: str | Path, **more: Any) -> EmbeddingSettings:
+    return EmbeddingSettings(
+        shards=str(shards), out=str(out), **{"batch_size": 2, "workers": 2} | more
+    )
+
+
+def held(table: str | Path) -> dict[str, bytes]:
+    """Every file of a table, hidden ones too."""
+    files = (path for path in Path(table).rglob("*") if path.is_file())
+    return {str(path.relative_to(table)): path.read_bytes() for path in files}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory, tiny_shards: str) -> dict[str, bytes]:
+    out = tmp_path_factory.mktemp("undisturbed")
+    embed_gallery(settings_of(tiny_shards, out, workers=1), network_of_colours())
+    return held(out)
+
+
+def a_shard(shards: str | Path, number: int = 3) -> Shard:
+    return read_manifest(str(shards)).shards[number]
+
+
+@pytest.fixture
+def copied(tmp_path: Path, tiny_shards: str) -> Path:
+    """The shards, to be spoilt."""
+    return Path(shutil.copytree(tiny_shards, tmp_path / "shards"))
+
+
+def blacken(shards: Path, shard: Shard) -> None:
+    """Put a black image in a shard's first place, of the same size as the one that was there."""
+    import io
+    import tarfile
+
+    from PIL import Image
+
+    path = shards / f"{shard.name}.tar"
+    with tarfile.open(path) as tar:
+        member = next(one for one in tar.getmembers() if one.name.endswith(".jpg"))
+    buffer = io.BytesIO()
+    Image.new("RGB", (16, 16)).save(buffer, "JPEG")
+    data = bytearray(path.read_bytes())
+    room = data[member.offset_data : member.offset_data + member.size]
+    assert len(buffer.getvalue()) <= len(room)
+    black = buffer.getvalue().ljust(len(room), b"\0")
+    data[member.offset_data : member.offset_data + member.size] = black
+    before, after = (hashlib.sha256(image).hexdigest().encode() for image in (room, black))
+    path.write_bytes(bytes(data).replace(before, after))
+    say_again(shards, shard.name)
+
+
+def test_a_shard_that_kills_its_worker_is_set_aside_and_the_rest_is_done(
+    tmp_path: Path, copied: Path, undisturbed: dict[str, bytes]
+) -> None:
+    out, shard, pids = tmp_path / "table", a_shard(copied), tmp_path / "pids"
+    pids.mkdir()
+    blacken(copied, shard)
+    with pytest.raises(
+        Incomplete, match=rf"1 of \d+ shards .* again: {shard.name} \(lost 3 workers: "
+    ):
+        embed_gallery(settings_of(copied, out), network_of_colours(spoil="kill", pids=str(pids)))
+    # Two at first, and one for each death after which there was more to do.
+    assert 3 <= len(list(pids.iterdir())) <= 5
+    [listed] = read_rejected(str(out)).to_pylist()
+    assert (listed["shard"], listed["key"], listed["reason"]) == (
+        shard.name,
+        None,
+        "lost 3 workers",
+    )
+    kept = {
+        name: data
+        for name, data in held(out).items()
+        if name.endswith(".parquet") and "rejected" not in name
+    }
+    parts = {name: data for name, data in undisturbed.items() if name.endswith(".parquet")}
+    assert kept == {name: data for name, data in parts.items() if name != f"{shard.name}.parquet"}
+    assert len(open_table(str(out)).parts) == len(parts) - 1  # what was given up is not missed
+    # The encoder is mended: only that shard is embedded, and the list is gone with its last entry.
+    assert embed_gallery(settings_of(copied, out), network_of_colours()) == shard.samples
+    assert held(out).keys() == undisturbed.keys()
+
+
+def test_an_error_nobody_foresaw_costs_the_shard_and_not_its_neighbours(
+    tmp_path: Path, copied: Path
+) -> None:
+    shard = a_shard(copied)
+    blacken(copied, shard)
+    with pytest.raises(
+        Incomplete, match=rf"{shard.name} \(lost 3 workers: ZeroDivisionError: a kernel failed\)"
+    ):
+        embed_gallery(
+            settings_of(copied, tmp_path / "table", workers=1), network_of_colours(spoil="raise")
+        )
+    assert len(part_names(str(tmp_path / "table"))) == len(read_manifest(str(copied)).shards) - 1
+
+
+def test_an_embedding_that_is_no_number_never_reaches_the_table(
+    tmp_path: Path, copied: Path
+) -> None:
+    shard = a_shard(copied)
+    blacken(copied, shard)
+    with pytest.raises(
+        Incomplete,
+        match=rf"the network gives {shard.split}-{shard.view}-\S+ an embedding of length nan",
+    ):
+        embed_gallery(settings_of(copied, tmp_path / "table"), network_of_colours(spoil="nan"))
+    verify(str(tmp_path / "table"))
+
+
+def test_a_tar_that_is_cut_off_is_set_aside_at_once_and_done_when_it_is_whole(
+    tmp_path: Path, copied: Path, tiny_shards: str, undisturbed: dict[str, bytes]
+) -> None:
+    out, shard, pids = tmp_path / "table", a_shard(copied), tmp_path / "pids"
+    pids.mkdir()
+    tar = copied / f"{shard.name}.tar"
+    whole = tar.read_bytes()
+    tar.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(
+        Incomplete, match=rf"{shard.name} \(unusable: \S+{shard.name}\.tar has \d+ bytes"
+    ):
+        embed_gallery(settings_of(copied, out), network_of_colours(pids=str(pids)))
+    assert len(list(pids.iterdir())) <= 2  # no worker was lost over it
+    assert [row["shard"] for row in read_rejected(str(out)).to_pylist()] == [shard.name]
+    tar.write_bytes(whole)
+    assert embed_gallery(settings_of(copied, out), network_of_colours()) == shard.samples
+    assert held(out) == undisturbed
+
+
+def test_a_shard_without_one_image_becomes_a_part_without_rows(
+    tmp_path: Path, copied: Path
+) -> None:
+    manifest, out = read_manifest(str(copied)), str(tmp_path / "table")
+    shard = min(manifest.shards, key=lambda one: one.samples)
+    tar = copied / f"{shard.name}.tar"
+    tar.write_bytes(tar.read_bytes().replace(b"\xff\xd8\xff", b"\0\0\0"))
+    say_again(copied, shard.name)
+    total = sum(one.samples for one in manifest.shards)
+    assert embed_gallery(settings_of(copied, out), network_of_colours()) == total
+    footer = read_footer(storage.join(out, f"{shard.name}.parquet"))
+    assert (footer.rows, len(footer.rejected)) == (0, shard.samples)
+    assert open_table(out).embeddings().shape == (total - shard.samples, 3)
+    assert len(read_rejected(out)) == shard.samples
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "table").rglob("*")}
+    assert embed_gallery(settings_of(copied, out), network_of_colours()) == 0
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "table").rglob("*")} == before
+
+
+def full_disk() -> Callable[[], None]:
+    """To be called in a worker: after two files, there is no room."""
+
+    def fill() -> None:
+        left, atomic_file = [2], storage.atomic_file
+
+        @contextmanager
+        def limited(path: str) -> Iterator[str]:
+            with atomic_file(path) as local:
+                yield local
+                if not left[0]:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                left[0] -= 1
+
+        setattr(storage, "atomic_file", limited)  # noqa: B010  # mypy will not have a module's function replaced
+
+    return fill
+
+
+def test_a_full_disk_ends_the_stage_with_a_sentence_and_it_goes_on_when_there_is_room(
+    tmp_path: Path, tiny_shards: str, undisturbed: dict[str, bytes]
+) -> None:
+    out = tmp_path / "table"
+    with pytest.raises(
+        Incomplete, match=r"cannot be written \(No space left on device\).*to go on"
+    ):
+        embed_gallery(
+            settings_of(tiny_shards, out, workers=1), network_of_colours(at_start=full_disk())
+        )
+    assert 2 <= len(part_names(str(out))) < len(undisturbed)
+    # A worker that was ended with the stage may leave a hidden half of a file.
+    assert all(
+        data == undisturbed[name] for name, data in held(out).items() if not name.startswith(".")
+    )
+    embed_gallery(settings_of(tiny_shards, out), network_of_colours())
+    assert held(out) == undisturbed
+
+
+def test_what_killed_workers_left_half_written_is_swept_away_and_a_torn_part_made_again(
+    tmp_path: Path, tiny_shards: str, undisturbed: dict[str, bytes]
+) -> None:
+    embed_gallery(settings_of(tiny_shards, tmp_path), network_of_colours())
+    first, second = [name for name in sorted(undisturbed) if name.endswith(".parquet")][:2]
+    (tmp_path / f".{first}.0123abcd").write_bytes(b"half")
+    (tmp_path / second).write_bytes(undisturbed[second][:100])
+    embed_gallery(settings_of(tiny_shards, tmp_path), network_of_colours())
+    assert held(tmp_path) == undisturbed
+
+
+@pytest.mark.parametrize("workers", [2, 3])
+def test_more_workers_than_the_cluster_has_room_for_starve_nobody(
+    workers: int,
+    tmp_path: Path,
+    tiny_shards: str,
+    undisturbed: dict[str, bytes],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(cluster, "nodes", lambda: [Node(cpus=2.0)])
+    embed_gallery(
+        settings_of(tiny_shards, tmp_path, workers=workers), network_of_colours(seconds=0.01)
+    )
+    assert held(tmp_path) == undisturbed
+
+
+def test_a_worker_that_no_node_has_room_for_is_told_and_given_up(
+    tmp_path: Path, tiny_shards: str, ray_cluster: None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    settings = settings_of(tiny_shards, tmp_path, cpus_per_worker=1000, patience=2.0)
+    with pytest.raises(
+        InputError,
+        match=r"each asks for 1000 CPUs, and the largest of 1 nodes has \d+ CPUs; start nodes",
+    ):
+        embed_gallery(settings, network_of_colours())
+
+
+def test_shards_added_later_are_all_that_is_embedded(
+    tmp_path: Path, copied: Path, undisturbed: dict[str, bytes], ray_cluster: None
+) -> None:
+    out, manifest = tmp_path / "table", copied / "manifest.json"
+    said = json_files.read_checksummed(str(manifest))
+    shards = said["shards"]
+    storage.write_json(str(manifest), said | {"shards": shards[:-2]})
+    embed_gallery(settings_of(copied, out), network_of_colours())
+    storage.write_json(str(manifest), said)
+    assert embed_gallery(settings_of(copied, out), network_of_colours()) == sum(
+        one["samples"] for one in shards[-2:]
+    )
+    assert held(out) == undisturbed
+    assert len(open_table(str(out)).labels().keys) == sum(one["samples"] for one in shards)

@@ -1,0 +1,123 @@
+"""Single rows of a table: what pyarrow reads, wherever the rows lie in the file, and nothing from a
+part that has changed.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.core.errors import InputError
+from pipeline.features import row_reader
+from pipeline.features.row_reader import RowReader, readable
+from tests.index.index_tables import clustered, write_table_part
+
+NAME = "gallery-satellite-000000.parquet"
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32"])
+def test_rows_are_what_pyarrow_reads(tmp_path: Path, dtype: str) -> None:
+    """40,000 rows: three row groups, of several pages each."""
+    vectors = clustered(40_000, 24, 0)
+    write_table_part(tmp_path, 0, vectors, dtype=dtype)
+    numbers = np.array([39_999, 0, 16_383, 16_384, 16_384, 7, 32_768, 25_000])
+    found = RowReader(str(tmp_path), 24).read(NAME, "shard 0", numbers)
+    assert found.dtype == dtype
+    assert np.array_equal(found, vectors.astype(dtype)[numbers])
+    assert RowReader(str(tmp_path), 24).read(NAME, "shard 0", numbers[:0]).shape == (0, 24)
+
+
+@given(
+    rows=st.integers(1, 60), dimension=st.integers(1, 40), page=st.sampled_from([64, 100, 1000]), group=st.integers(1, 40),
+    version=st.sampled_from(["1.0", "2.0"]), dtype=st.sampled_from(["float16", "float32"]),
+)  # fmt: skip
+@settings(max_examples=40)
+def test_rows_are_found_whatever_the_pages(
+    tmp_path_factory: pytest.TempPathFactory,
+    rows: int,
+    dimension: int,
+    page: int,
+    group: int,
+    version: str,
+    dtype: str,
+) -> None:
+    """Small pages, small groups, either kind of page; rows may lie across pages."""
+    folder = tmp_path_factory.mktemp("pages")
+    write_table_part(folder, 0, clustered(rows, dimension, 1), dtype=dtype)
+    table = pq.read_table(folder / NAME)
+    pq.write_table(
+        table,
+        folder / NAME,
+        row_group_size=group,
+        data_page_size=page,
+        write_batch_size=7,
+        compression="none",
+        data_page_version=version,
+        use_dictionary=["location"],
+    )
+    expected = (
+        table["embedding"]
+        .combine_chunks()
+        .flatten()
+        .to_numpy(zero_copy_only=False)
+        .reshape(rows, dimension)
+    )
+    numbers = np.arange(rows)[::-1].copy()
+    assert np.array_equal(
+        RowReader(str(folder), dimension).read(NAME, "shard 0", numbers), expected[::-1]
+    )
+
+
+STORED: list[dict[str, object]] = [
+    {"compression": "zstd"},
+    {"compression": "none", "use_dictionary": True},
+    {
+        "compression": "none",
+        "use_dictionary": False,
+        "column_encoding": {"embedding.list.element": "BYTE_STREAM_SPLIT"},
+    },
+]
+
+
+@pytest.mark.parametrize("stored", STORED)
+def test_embeddings_that_are_not_plain_are_refused(
+    tmp_path: Path, stored: dict[str, object]
+) -> None:
+    write_table_part(tmp_path, 0, clustered(20, 8, 1))
+    table = pq.read_table(tmp_path / NAME)
+    pq.write_table(table, tmp_path / NAME, **stored)
+    with pytest.raises(InputError, match="compressed, encoded or damaged, expected plain ones"):
+        RowReader(str(tmp_path), 8).read(NAME, "shard 0", np.array([3]))
+
+
+def test_a_part_that_is_another_shards_or_gone_is_refused(tmp_path: Path) -> None:
+    write_table_part(tmp_path, 0, clustered(20, 8, 1))
+    reader = RowReader(str(tmp_path), 8)
+    with pytest.raises(InputError, match="no longer of the shard"):
+        reader.read(NAME, "another", np.array([3]))
+    with pytest.raises(InputError, match="which is not there"):
+        reader.read("gallery-satellite-000009.parquet", "shard 9", np.array([3]))
+    (tmp_path / NAME).write_bytes((tmp_path / NAME).read_bytes()[:-100])
+    with pytest.raises(InputError, match="not a readable Parquet file"):
+        reader.read(NAME, "shard 0", np.array([3]))
+
+
+def test_few_parts_are_open_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(row_reader, "OPEN_PARTS", 2)
+    for number in range(5):
+        write_table_part(tmp_path, number, clustered(4, 8, number))
+    reader = RowReader(str(tmp_path), 8)
+    for number in (0, 1, 2, 0, 4, 3, 0):
+        found = reader.read(
+            f"gallery-satellite-{number:06d}.parquet", f"shard {number}", np.array([2])
+        )
+        assert np.array_equal(found, clustered(4, 8, number)[2:3])
+        assert len(reader._open) <= 2
+
+
+def test_only_tables_on_this_machine_are_read_by_rows() -> None:
+    assert readable("/somewhere/table")
+    assert not readable("memory://table")

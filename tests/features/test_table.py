@@ -1,0 +1,329 @@
+"""The feature table: round trips, other people's readers, and what is refused."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.dataset
+import pyarrow.parquet as pq
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.core.records import Rejection, Split, View
+from pipeline.features.part import (
+    PartFooter,
+    PartRows,
+    list_rejected,
+    read_footer,
+    read_rejected,
+    write_part,
+)
+from pipeline.features.table import Box, FeatureTable, open_table, verify
+
+FOOTER = PartFooter(fingerprint="f" * 64, shard_sha256="s" * 64, rows=5)
+
+
+def write(
+    folder: Path,
+    split: str,
+    view: str,
+    seed: int,
+    dtype: str = "float32",
+    footer: PartFooter = FOOTER,
+) -> np.ndarray:
+    vectors = np.random.default_rng(seed).normal(size=(5, 8)).astype(np.float32)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    rows = PartRows(
+        keys=[f"{split}-{view}-{n}" for n in range(5)],
+        locations=list("abcde"),
+        views=[view] * 5,
+        splits=[split] * 5,
+        lats=[50.0, None, 1.0, 2.0, 3.0],
+        lons=[4.0, None, 1.0, 2.0, 3.0],
+        embeddings_BD=vectors,
+    )
+    write_part(str(folder / f"{split}-{view}-000000.parquet"), rows, footer, dtype)
+    return vectors
+
+
+def test_what_is_written_is_read_back_by_split_and_view(tmp_path: Path) -> None:
+    drone, satellite = (
+        write(tmp_path, "query", "drone", 0),
+        write(tmp_path, "gallery", "satellite", 1),
+    )
+    table = open_table(str(tmp_path))
+    assert (table.rows, table.dimension, table.fingerprint) == (10, 8, "f" * 64)
+    assert table.counts == {(Split.QUERY, View.DRONE): 5, (Split.GALLERY, View.SATELLITE): 5}
+    assert np.array_equal(table.select(Split.QUERY, View.DRONE).embeddings(), drone)
+    assert np.array_equal(
+        np.concatenate(list(table.select(view=View.SATELLITE).blocks(rows=2))), satellite
+    )
+    labels = table.select(Split.QUERY).labels()
+    assert labels.keys.tolist() == [f"query-drone-{n}" for n in range(5)]
+    assert labels.locations.tolist() == list("abcde")
+    assert np.array_equal(labels.lats, [50, np.nan, 1, 2, 3], equal_nan=True)
+    assert table.select(view=View.STREET).rows == 0
+    assert table.select(view=View.STREET).embeddings().shape == (0, 8)
+    assert table.select(view=View.STREET).labels().keys.tolist() == []
+
+
+def test_a_part_that_mixes_splits_is_filtered_by_row(tmp_path: Path) -> None:
+    rows = PartRows(
+        keys=["a", "b"],
+        locations=["1", "2"],
+        views=["drone", "satellite"],
+        splits=["query", "gallery"],
+        lats=[None, None],
+        lons=[None, None],
+        embeddings_BD=np.eye(2, dtype=np.float32),
+    )
+    write_part(
+        str(tmp_path / "mixed.parquet"), rows, PartFooter(fingerprint="f", shard_sha256="s", rows=2)
+    )
+    assert open_table(str(tmp_path)).select(Split.GALLERY).labels().keys.tolist() == ["b"]
+
+
+def test_half_precision_is_stored_as_such_and_read_as_float32(tmp_path: Path) -> None:
+    vectors = write(tmp_path, "query", "drone", 0, "float16")
+    read = open_table(str(tmp_path)).embeddings()
+    assert read.dtype == np.float32
+    assert np.abs(read - vectors).max() < 5e-4
+
+
+def test_pandas_and_pyarrow_read_the_table_as_it_is(tmp_path: Path) -> None:
+    vectors = write(tmp_path, "query", "drone", 0)
+    frame = pd.read_parquet(tmp_path)
+    assert frame["key"].tolist() == [f"query-drone-{n}" for n in range(5)]
+    assert np.array_equal(np.stack(frame["embedding"].to_numpy()), vectors)
+    assert pyarrow.dataset.dataset(tmp_path).count_rows() == 5
+
+
+def test_the_footer_says_what_made_the_part(tmp_path: Path) -> None:
+    footer = PartFooter(
+        fingerprint="f",
+        shard_sha256="s",
+        rows=5,
+        rejected=(Rejection(path="k", reason="damaged image", found="9 bytes"),),
+    )
+    write(tmp_path, "query", "drone", 0, footer=footer)
+    assert read_footer(str(tmp_path / "query-drone-000000.parquet")) == footer
+
+
+def test_embeddings_are_neither_compressed_nor_given_statistics(tmp_path: Path) -> None:
+    write(tmp_path, "query", "drone", 0)
+    group = pq.ParquetFile(tmp_path / "query-drone-000000.parquet").metadata.row_group(0)
+    columns = {group.column(n).path_in_schema: group.column(n) for n in range(group.num_columns)}
+    embedding = next(column for path, column in columns.items() if path.startswith("embedding"))
+    assert embedding.compression == "UNCOMPRESSED"
+    assert not embedding.is_stats_set
+    assert "PLAIN" in embedding.encodings
+    assert not any("DICTIONARY" in encoding for encoding in embedding.encodings)
+
+
+def test_two_networks_in_one_table_are_refused_with_the_remedy(tmp_path: Path) -> None:
+    write(tmp_path, "query", "drone", 0)
+    write(
+        tmp_path,
+        "gallery",
+        "drone",
+        1,
+        footer=PartFooter(fingerprint="g" * 64, shard_sha256="s", rows=5),
+    )
+    with pytest.raises(InputError, match=r"features of 2 networks.*embed into an empty folder"):
+        open_table(str(tmp_path))
+
+
+def test_no_table_a_foreign_file_and_a_torn_one_are_told_apart(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="found no Parquet part"):
+        open_table(str(tmp_path))
+    (tmp_path / "a.parquet").write_bytes(b"torn")
+    with pytest.raises(InputError, match="not a readable Parquet file"):
+        open_table(str(tmp_path))
+    pd.DataFrame({"x": [1]}).to_parquet(tmp_path / "a.parquet")
+    with pytest.raises(InputError, match="expected a part written by embed_gallery"):
+        open_table(str(tmp_path))
+
+
+def test_a_part_with_fewer_rows_than_it_says_is_refused(tmp_path: Path) -> None:
+    write(
+        tmp_path, "query", "drone", 0, footer=PartFooter(fingerprint="f", shard_sha256="s", rows=6)
+    )
+    with pytest.raises(InputError, match="says version 1 and 6 rows and holds 5"):
+        open_table(str(tmp_path))
+
+
+def table_of_places(folder: Path, dtype: str = "float32") -> np.ndarray:
+    """Two parts of five rows each; positions on both sides of 180 degrees, the last unknown."""
+    vectors = np.random.default_rng(7).normal(size=(10, 8)).astype(np.float32)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    lons: list[float | None] = [179.0, -179.0, 180.0, -180.0, None]
+    for number, view in enumerate(("drone", "satellite")):
+        rows = PartRows(
+            keys=[f"{view}-{n}" for n in range(5)],
+            locations=list("abcde"),
+            views=[view] * 5,
+            splits=["gallery"] * 5,
+            lats=[10.0, 20.0, 30.0, -40.0, None],
+            lons=lons,
+            embeddings_BD=vectors[5 * number : 5 * number + 5],
+        )
+        write_part(str(folder / f"gallery-{view}-000000.parquet"), rows, FOOTER, dtype)
+    return vectors
+
+
+def keys_of(table: FeatureTable) -> list[str]:
+    assert table.rows == len(table.labels().keys) == len(table.embeddings())
+    found: list[str] = table.labels().keys.tolist()
+    return found
+
+
+def test_rows_are_selected_by_location_and_by_rectangle_and_by_both(tmp_path: Path) -> None:
+    vectors = table_of_places(tmp_path)
+    table = open_table(str(tmp_path))
+    assert keys_of(table.select(locations="b")) == ["drone-1", "satellite-1"]
+    assert keys_of(table.select(view=View.DRONE, locations=["a", "e", "nowhere"])) == [
+        "drone-0",
+        "drone-4",
+    ]
+    assert keys_of(table.select(locations=[])) == []
+    across = Box(south=0, north=90, west=178, east=-178)
+    assert keys_of(table.select(view=View.DRONE, box=across)) == ["drone-0", "drone-1", "drone-2"]
+    assert keys_of(table.select(box=across).select(view=View.DRONE).select(locations="b")) == [
+        "drone-1"
+    ]
+    # 180 degrees east and 180 degrees west are one meridian.
+    assert keys_of(
+        table.select(view=View.DRONE, box=Box(south=-90, north=90, west=179.5, east=180))
+    ) == [
+        "drone-2",
+        "drone-3",
+    ]
+    assert keys_of(table.select(box=Box(south=-90, north=90, west=0, east=10))) == []
+    chosen = table.select(view=View.SATELLITE, box=across).embeddings()
+    assert np.array_equal(chosen, vectors[5:8])
+    with pytest.raises(InputError, match="south 5, north 4"):
+        Box(south=5, north=4, west=0, east=1)
+
+
+def test_a_second_selection_narrows_the_first(tmp_path: Path) -> None:
+    table_of_places(tmp_path)
+    table = open_table(str(tmp_path)).select(view=View.DRONE)
+    assert table.select(view=View.SATELLITE).rows == 0
+    assert table.select(Split.GALLERY).rows == 5
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float16"])
+def test_blocks_come_as_stored_or_as_asked_for(tmp_path: Path, dtype: str) -> None:
+    vectors = table_of_places(tmp_path, dtype)
+    table = open_table(str(tmp_path))
+    assert table.dtype == dtype
+    assert {block_BD.dtype for block_BD in table.blocks(dtype="stored")} == {np.dtype(dtype)}
+    assert {block_BD.dtype for block_BD in table.blocks(dtype="float16")} == {np.dtype("float16")}
+    assert [len(block_BD) for block_BD in table.blocks(rows=3)] == [3, 2, 3, 2]
+    assert np.allclose(table.embeddings(), vectors, atol=1e-3)
+
+
+def test_a_part_of_many_rows_is_read_in_little_memory(tmp_path: Path) -> None:
+    rows, dimension = 60_000, 256  # 61 MB
+    vectors = np.zeros((rows, dimension), np.float32)
+    vectors[np.arange(rows), np.arange(rows) % dimension] = 1
+    write_part(
+        str(tmp_path / "a.parquet"),
+        PartRows(
+            keys=[str(n) for n in range(rows)],
+            locations=["a"] * rows,
+            views=["drone"] * rows,
+            splits=["train"] * rows,
+            lats=[None] * rows,
+            lons=[None] * rows,
+            embeddings_BD=vectors,
+        ),
+        PartFooter(fingerprint="f", shard_sha256="s", rows=rows),
+    )
+    table, before, most = open_table(str(tmp_path)), pa.total_allocated_bytes(), 0
+    for _ in table.blocks(rows=1000):
+        most = max(most, pa.total_allocated_bytes() - before)
+    assert most < 12e6
+
+
+@pytest.mark.parametrize("length", [np.nan, 0.0, 1.1])
+def test_an_embedding_that_is_no_unit_vector_is_refused_with_its_part(
+    tmp_path: Path, length: float
+) -> None:
+    write(tmp_path, "gallery", "satellite", 1)
+    rows = PartRows(
+        keys=["k"], locations=["a"], views=["drone"], splits=["query"], lats=[None], lons=[None],
+        embeddings_BD=np.eye(1, 8, dtype=np.float32) * length,
+    )  # fmt: skip
+    footer = PartFooter(fingerprint="f" * 64, shard_sha256="s", rows=1)
+    write_part(str(tmp_path / "query-drone-000000.parquet"), rows, footer)
+    table = open_table(str(tmp_path))
+    with pytest.raises(
+        InputError, match=r"query-drone-000000\.parquet holds 1 embeddings like one of length"
+    ):
+        table.embeddings()
+    with pytest.raises(InputError, match=r"query-drone-000000\.parquet"):
+        verify(str(tmp_path))
+    assert table.select(Split.GALLERY).embeddings().shape == (5, 8)
+
+
+def test_a_key_that_is_there_twice_is_refused_with_both_parts(tmp_path: Path) -> None:
+    write(tmp_path, "query", "drone", 0)
+    shutil.copy(tmp_path / "query-drone-000000.parquet", tmp_path / "query-drone-000001.parquet")
+    said = r"query-drone-000001\.parquet holds key query-drone-0, which query-drone-000000\.parquet holds too"
+    for opened in (open_table, verify):
+        with pytest.raises(InputError, match=said):
+            opened(str(tmp_path))
+
+
+def test_parts_of_other_numbers_are_refused(tmp_path: Path) -> None:
+    write(tmp_path, "query", "drone", 0, "float16")
+    write(tmp_path, "gallery", "drone", 1)
+    with pytest.raises(
+        InputError,
+        match=r"query-drone-000000\.parquet holds float16 of 8 dimensions and gallery-drone",
+    ):
+        open_table(str(tmp_path))
+
+
+def test_the_list_of_what_has_no_row_is_beside_the_parts_and_in_nobodys_way(tmp_path: Path) -> None:
+    write(tmp_path, "query", "drone", 0)
+    assert list_rejected(
+        str(tmp_path), [("s", "k", "not an image", "9 bytes"), ("r", None, "unusable", "cut off")]
+    )
+    assert not list_rejected(
+        str(tmp_path), [("r", None, "unusable", "cut off"), ("s", "k", "not an image", "9 bytes")]
+    )
+    assert read_rejected(str(tmp_path))["shard"].to_pylist() == ["r", "s"]
+    assert (
+        len(pd.read_parquet(tmp_path))
+        == pyarrow.dataset.dataset(tmp_path).count_rows()
+        == open_table(str(tmp_path)).rows
+    )
+    assert list_rejected(str(tmp_path), [])
+    assert len(read_rejected(str(tmp_path))) == 0
+
+
+def test_the_snippets_of_the_docs_run(tmp_path: Path) -> None:
+    vectors = write(tmp_path, "query", "drone", 0)
+    list_rejected(str(tmp_path), [("s", "k", "not an image", "9 bytes")])
+    frame = pd.read_parquet(tmp_path, filters=[("view", "==", "drone")])
+    assert np.array_equal(np.stack(frame.embedding.to_list()), vectors)
+    duckdb = pytest.importorskip("duckdb")
+    connection = duckdb.connect()
+    connection.execute("set enable_progress_bar = false")
+    counted = connection.sql(
+        f"select split, view, count(*) from '{tmp_path}/*.parquet' group by all"
+    ).fetchall()
+    assert counted == [("query", "drone", 5)]
+    nearest = connection.sql(f"""
+        with photo as (select embedding from '{tmp_path}/*.parquet' where key = 'query-drone-2')
+        select t.key, list_inner_product(t.embedding, photo.embedding) as score
+        from '{tmp_path}/*.parquet' t, photo order by score desc limit 1""").fetchall()
+    assert nearest[0][0] == "query-drone-2"
+    rejected = connection.sql(
+        f"select shard, key, reason from '{tmp_path}/_rejected/*.parquet'"
+    ).fetchall()
+    assert rejected == [("s", "k", "not an image")]

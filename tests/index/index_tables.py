@@ -1,0 +1,53 @@
+"""Feature tables for the tests of the index: unit vectors in clusters, as embeddings of places lie."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.features.table import Floats, PartFooter, PartRows, write_part
+
+
+def clustered(count: int, dimension: int, seed: int, clusters: int = 30) -> Floats:
+    """Unit vectors (count, dimension) around common centres."""
+    rng = np.random.default_rng(seed)
+    centres = np.random.default_rng(99).normal(size=(clusters, dimension))
+    vectors = centres[rng.integers(0, clusters, count)] + 0.6 * rng.normal(size=(count, dimension))
+    unit: Floats = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
+    return unit
+
+
+def write_table_part(
+    table: Path, number: int, vectors: Floats, split: str = "gallery", view: str = "satellite", fingerprint: str = "f" * 64,
+    dtype: str = "float32", locations: Sequence[str] | None = None, shard: str | None = None,
+) -> None:  # fmt: skip
+    """A part whose i-th row lies i thousandths of a degree north of the equator, at the part's
+    number in degrees east.
+    """
+    count = len(vectors)
+    rows = PartRows(
+        keys=[f"{split}-{number}-{n}" for n in range(count)],
+        locations=locations or [f"{number}{n:04d}" for n in range(count)],
+        views=[view] * count, splits=[split] * count, lats=[n / 1000 for n in range(count)],
+        lons=[float(number) if n % 5 else None for n in range(count)], embeddings_BD=vectors,
+    )  # fmt: skip
+    footer = PartFooter(
+        fingerprint=fingerprint, shard_sha256=shard or f"shard {number}", rows=count
+    )
+    write_part(str(table / f"{split}-{view}-{number:06d}.parquet"), rows, footer, dtype)
+
+
+def write_gallery(
+    table: Path,
+    parts: int = 3,
+    rows: int = 200,
+    dimension: int = 32,
+    first: int = 0,
+    dtype: str = "float32",
+) -> Path:
+    """`parts` parts of satellite rows, and one of UAV queries."""
+    for number in range(first, first + parts):
+        write_table_part(table, number, clustered(rows, dimension, number), dtype=dtype)
+    if not first:
+        write_table_part(table, 0, clustered(40, dimension, 1000), "query", "drone", dtype=dtype)
+    return table

@@ -1,0 +1,166 @@
+"""A damaged index is refused before FAISS sees it; of what a killed build left, whole files alone
+are believed.
+"""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.core.records import Split, View
+from pipeline.evaluation.evaluate import EvaluationSettings, plan
+from pipeline.features.table import open_table
+from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.searcher import Index
+from pipeline.index.units import is_whole, vouch
+from pipeline.index.update import extend_index, verify_index
+from tests.damaging import damages, found_or_equal, look_or_say_gone
+from tests.index.index_tables import write_gallery
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(write_gallery(tmp_path_factory.mktemp("table"), parts=4, rows=100))
+
+
+def settings(table: str, out: Path, **changes: Any) -> IndexSettings:
+    given: dict[str, Any] = {
+        "table": table,
+        "out": str(out),
+        "split": Split.GALLERY,
+        "view": View.SATELLITE,
+        "target_recall": 0.5,
+        "factory": "IVF8,SQ8",
+        "refine": True,
+    }
+    return IndexSettings(**(given | changes))
+
+
+@pytest.fixture(scope="module")
+def built(table: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("index")
+    build_index(settings(table, out))
+    return out
+
+
+def answers(out: Path, table: str) -> list[Any]:
+    found = Index(str(out)).search(open_table(table).select(Split.QUERY).embeddings()[:3], 5)
+    return [[(hit.key, hit.location, hit.lat, hit.score) for hit in hits] for hits in found]
+
+
+@pytest.mark.parametrize("name", ["index.faiss", "ids.arrow", "ids.parquet"])
+def test_a_damaged_file_of_an_index_is_refused_before_it_is_opened(
+    name: str, table: str, built: Path, tmp_path: Path
+) -> None:
+    out = Path(shutil.copytree(built, tmp_path / "index"))
+    assert found_or_equal(out / name, lambda: answers(out, table), 40) == 41
+
+
+def test_the_trained_index_is_looked_at_where_it_is_used(
+    table: str, built: Path, tmp_path: Path
+) -> None:
+    out = Path(shutil.copytree(built, tmp_path / "index"))
+    path = out / "trained.faiss"
+    assert found_or_equal(path, lambda: verify_index(str(out)).rows, 20) == 21
+    good = path.read_bytes()
+    path.write_bytes(good[:100] + bytes([good[100] ^ 1]) + good[101:])
+    more = Path(shutil.copytree(table, tmp_path / "table"))
+    write_gallery(more, parts=1, rows=100, first=7)
+    with pytest.raises(
+        InputError, match=r"trained.faiss holds other bytes than were written.*jobs/build_index.py"
+    ):
+        extend_index(str(more), str(out))
+
+
+def test_an_index_too_large_to_hash_is_looked_at_when_asked(
+    table: str, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.index.searcher.LOOKED_AT", 0)
+    out = Path(shutil.copytree(built, tmp_path / "index"))
+    ids = out / "ids.arrow"
+    ids.write_bytes(ids.read_bytes().replace(b"gallery", b"gallary", 1))
+    answers(out, table)
+    with pytest.raises(
+        InputError, match=r"ids.arrow holds other bytes than were written.*build the index again"
+    ):
+        Index(str(out), whole=True)
+
+
+class Killed(Exception):
+    pass
+
+
+@pytest.mark.parametrize(
+    "name", ["unit-000001.faiss", "unit-000001.faiss.json", "trained.faiss", "plan.json"]
+)
+def test_damage_to_what_a_killed_build_left_costs_work_and_nothing_else(
+    name: str, table: str, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.index.plan.LEAST_UNIT_ROWS", 100)
+    monkeypatch.setattr("pipeline.index.plan.UNIT_SHARE", 0)
+    left, expected = tmp_path / "left", answers(built, table)
+
+    def killed(*arguments: Any) -> Any:
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pipeline.index.workspace.Workshop._merge", killed)
+        with pytest.raises(Killed):
+            build_index(settings(table, left))
+    good = (left / "_building" / name).read_bytes()
+    *_, cut = damages(good, 10)
+    for number, data in enumerate(
+        (None, good[: len(good) // 2] + b"?" + good[len(good) // 2 + 1 :], cut)
+    ):
+        out = Path(shutil.copytree(left, tmp_path / f"{number}"))
+        (out / "_building" / name).unlink()
+        if data is not None:
+            (out / "_building" / name).write_bytes(data)
+        build_index(settings(table, out))
+        assert answers(out, table) == expected
+        assert (out / "index.faiss").read_bytes() == (built / "index.faiss").read_bytes()
+
+
+def test_a_file_is_whole_as_long_as_it_is_what_was_vouched_for(tmp_path: Path) -> None:
+    path = tmp_path / "unit.faiss"
+    path.write_bytes(np.random.default_rng(0).bytes(500))
+    assert not is_whole(str(path))
+    vouch(str(path))
+    look = look_or_say_gone(path, lambda: is_whole(str(path)))
+    assert look()
+    good = path.read_bytes()
+    for data in damages(good, 40):
+        if data is not None:
+            path.write_bytes(data)
+            assert is_whole(str(path)) == (data == good)
+
+
+def test_a_table_is_looked_at_before_an_index_is_built_of_it(table: str, tmp_path: Path) -> None:
+    spoilt = Path(shutil.copytree(table, tmp_path / "table"))
+    build_index(settings(str(spoilt), tmp_path / "index", verify=True))
+    path = next(spoilt.glob("gallery*"))
+    data = bytearray(path.read_bytes())
+    data[60] ^= 1
+    path.write_bytes(data)
+    for out in ("index", "another"):
+        with pytest.raises(
+            InputError, match=rf"{path} is not a readable Parquet file .*embed its shard again"
+        ):
+            build_index(settings(str(spoilt), tmp_path / out, verify=True))
+
+
+def test_an_evaluation_looks_at_every_byte_of_its_tables_when_asked(
+    table: str, tmp_path: Path
+) -> None:
+    spoilt = Path(shutil.copytree(table, tmp_path / "table"))
+    asked = EvaluationSettings(table=str(spoilt), out=str(tmp_path / "out"), verify=True)
+    plan(asked)
+    path = next(spoilt.glob("query*"))
+    path.write_bytes(path.read_bytes().replace(b"query", b"quary", 1))
+    with pytest.raises(
+        InputError, match=rf"{path} is not a readable Parquet file .*embed its shard again"
+    ):
+        plan(asked)

@@ -1,0 +1,74 @@
+"""An index spread over actors answers as one in this process does, and what is wrong with it is
+said as there.
+"""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.core.geo import Near
+from pipeline.core.records import Split, View
+from pipeline.features.table import open_table
+from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.distributed import SpreadIndex
+from pipeline.index.filters import Where
+from pipeline.index.searcher import Index
+from pipeline.index.update import remove_locations
+from tests.index.index_tables import write_gallery
+
+
+@pytest.fixture(scope="module")
+def index(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    """A table, and its index in three parts with a location removed."""
+    folder = tmp_path_factory.mktemp("spread")
+    table = str(write_gallery(folder / "table"))
+    build_index(
+        IndexSettings(
+            table=table,
+            out=str(folder / "index"),
+            split=Split.GALLERY,
+            view=View.SATELLITE,
+            factory="IVF8,SQ8",
+            parts=3,
+        )
+    )
+    remove_locations(str(folder / "index"), ["00003"])
+    return table, str(folder / "index")
+
+
+def test_actors_answer_together_what_one_process_answers(
+    index: tuple[str, str], ray_cluster: None
+) -> None:
+    table, path = index
+    queries_QD = open_table(table).select(Split.QUERY).embeddings()
+    here = Index(path)
+    with SpreadIndex(path, actors=2) as spread:
+        assert len(here.told.parts) == 3
+        assert (len(spread), spread.dimension, spread.facts["fingerprint"]) == (
+            599,
+            32,
+            here.facts["fingerprint"],
+        )
+        for where in (
+            None,
+            Where(near=Near(lat=0.1, lon=1, radius_m=5_000)),
+            Where(locations=frozenset(["00003"])),
+        ):
+            assert spread.search(queries_QD, 12, where) == here.search(queries_QD, 12, where)
+        with pytest.raises(InputError, match=r"expected \(queries, 32\)"):
+            spread.search(queries_QD[:, :5])
+
+
+def test_a_damaged_part_is_refused_before_any_question(
+    index: tuple[str, str], ray_cluster: None
+) -> None:
+    _, path = index
+    file = Path(path) / "index-000001.faiss"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-1])
+    try:
+        with pytest.raises(InputError, match=r"index-000001\.faiss has"):
+            SpreadIndex(path, actors=3)
+    finally:
+        file.write_bytes(whole)

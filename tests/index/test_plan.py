@@ -1,0 +1,133 @@
+"""The planner, by what must hold of any gallery: within the budget, more memory never worse, no
+where it is impossible.
+"""
+
+from dataclasses import replace
+
+import faiss
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.core.errors import InputError
+from pipeline.index.plan import EXACT_ROWS, FAMILIES, Gallery, Plan, plan_factory, plan_index
+
+galleries = st.builds(
+    Gallery,
+    rows=st.integers(1, 10**9),
+    dimension=st.sampled_from([16, 100, 512, 768, 2048]),
+    budget=st.floats(1e8, 1e12),
+    target_recall=st.floats(0.5, 1),
+    workers=st.integers(0, 16),
+    effective_dimension=st.sampled_from([None, 16, 96, 256]),
+    rows_readable=st.booleans(),
+)
+
+
+def planned(gallery: Gallery) -> Plan | None:
+    try:
+        return plan_index(gallery)
+    except InputError:
+        return None
+
+
+@given(galleries)
+def test_a_plan_is_never_over_the_budget(gallery: Gallery) -> None:
+    plan = planned(gallery)
+    if plan is not None:
+        assert plan.search_bytes <= gallery.budget
+        assert plan.build_bytes <= gallery.budget
+        assert 4 * plan.training_rows * gallery.dimension <= gallery.budget
+        assert 1 <= plan.unit_rows <= max(plan.part_rows, gallery.rows)
+
+
+@given(galleries, st.floats(1, 100))
+def test_more_memory_never_means_less_recall(gallery: Gallery, more: float) -> None:
+    plan = planned(gallery)
+    if plan is not None:
+        richer = plan_index(replace(gallery, budget=gallery.budget * more))
+        reached = [min(gallery.target_recall, each.expected_recall) for each in (plan, richer)]
+        assert reached[1] >= reached[0]
+
+
+@given(galleries)
+def test_what_fits_into_no_budget_is_refused_with_what_it_would_take(gallery: Gallery) -> None:
+    starved = replace(gallery, budget=1e6)
+    with pytest.raises(InputError, match=r"GB at least, by .*raise --memory-budget"):
+        plan_index(starved)
+
+
+@given(galleries)
+def test_every_plan_is_one_that_faiss_builds(gallery: Gallery) -> None:
+    plan = planned(replace(gallery, rows=min(gallery.rows, 10**7)))
+    if plan is not None:
+        index = faiss.index_factory(gallery.dimension, plan.factory, faiss.METRIC_INNER_PRODUCT)
+        assert index.is_trained == (plan.training_rows == 0)
+        lists = faiss.try_extract_index_ivf(index)
+        assert lists is None or lists.nlist <= max(1, plan.training_rows)
+
+
+@given(galleries)
+def test_vectors_that_cannot_be_read_singly_are_not_reckoned_with(gallery: Gallery) -> None:
+    plan = planned(replace(gallery, rows_readable=False))
+    assert plan is None or plan.refine == "none"
+
+
+def test_few_rows_are_searched_exactly_and_the_sentence_says_so() -> None:
+    plan = plan_index(Gallery(rows=EXACT_ROWS, dimension=2048, budget=4e9, target_recall=0.95))
+    assert (plan.factory, plan.training_rows, plan.expected_recall) == ("Flat", 0, 1.0)
+    assert plan.why == "exact search: 100,000 rows are few enough to look at each"
+    assert (
+        plan_index(
+            Gallery(rows=EXACT_ROWS + 1, dimension=2048, budget=4e9, target_recall=0.95)
+        ).factory
+        != "Flat"
+    )
+
+
+def test_memory_is_what_it_comes_to() -> None:
+    """Lists of 8-bit codes of 1,000,000 x 2048 with their ids: 2.056 GB, beside the process and the
+    centroids.
+    """
+    plan = plan_index(
+        Gallery(rows=10**6, dimension=2048, budget=8e9, target_recall=0.95, rows_readable=False)
+    )
+    assert plan.factory == "IVF2048,SQ8"
+    assert plan.search_bytes == pytest.approx(2.056e9 + 2048 * 2048 * 4 + 300e6, rel=0.01)
+    assert plan.why == "lists of 8-bit codes: 2,056 bytes a row"
+
+
+def test_a_tight_budget_leaves_the_lists_on_the_disk_or_takes_smaller_codes() -> None:
+    gallery = Gallery(rows=10**7, dimension=2048, budget=4e9, target_recall=0.95)
+    assert (plan_index(gallery).factory, plan_index(gallery).refine) == (
+        "IVF2048,PQ256x4fs",
+        "table",
+    )
+    tight = plan_index(replace(gallery, budget=2e9))
+    elsewhere = plan_index(replace(gallery, budget=2e9, rows_readable=False))
+    assert (tight.factory, elsewhere.factory) == ("IVF1024,RaBitQ", "IVF1024,SQ8")
+    for plan in (tight, elsewhere):
+        assert plan.on_disk
+        assert plan.part_rows < gallery.rows, "what does not fit the memory cannot be merged in it"
+
+
+def test_few_strong_directions_are_made_use_of() -> None:
+    gallery = Gallery(rows=10**6, dimension=2048, budget=4e9, target_recall=0.95)
+    assert plan_index(replace(gallery, effective_dimension=256)).factory.startswith("PCA256,IVF")
+    assert not plan_index(replace(gallery, effective_dimension=1500)).factory.startswith("PCA")
+
+
+def test_recall_beyond_every_family_is_approached_as_far_as_it_goes() -> None:
+    best = max(family.ceiling for family in FAMILIES)
+    gallery = Gallery(rows=10**6, dimension=2048, budget=64e9, target_recall=1.0)
+    assert plan_index(gallery).expected_recall == best
+    assert plan_index(replace(gallery, target_recall=0.99)).factory == "IVF2048,SQfp16"
+
+
+def test_a_factory_of_the_users_is_taken_as_it_is() -> None:
+    plan = plan_factory(
+        Gallery(rows=10**6, dimension=2048, budget=64e9, target_recall=1.0),
+        "IVF16384,PQ64",
+        "table",
+    )
+    assert (plan.factory, plan.refine, plan.training_rows) == ("IVF16384,PQ64", "table", 819_200)

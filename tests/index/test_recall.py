@@ -1,0 +1,118 @@
+"""Recall as it is meant, and the least effort that reaches it."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from pipeline.core.records import Split
+from pipeline.features.table import open_table
+from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.metadata import Effort
+from pipeline.index.recall import Held, efforts, exact_search, recall, tuned, without
+from pipeline.index.searcher import Index
+from pipeline.index.train import effective_dimension, new_index, sample
+from pipeline.index.workspace import rows_by_part
+from tests.index.index_tables import clustered, write_gallery
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Index]:
+    folder = tmp_path_factory.mktemp("measured")
+    table = str(write_gallery(folder / "table"))
+    build_index(
+        IndexSettings(
+            table=table,
+            out=str(folder / "index"),
+            split=Split.GALLERY,
+            factory="IVF16,PQ4x4fs",
+            refine=True,
+        )
+    )
+    return table, Index(str(folder / "index"))
+
+
+def test_a_query_is_not_credited_with_itself() -> None:
+    found = np.array([[5, 7, 9], [1, 2, 3], [4, 0, 6]])
+    assert without(found, np.array([7, -1, 4])).tolist() == [[5, 9], [1, 2], [0, 6]]
+
+
+def test_exact_search_is_brute_force_whatever_the_blocks(
+    built: tuple[str, Index], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = open_table(built[0])
+    queries, gallery = (table.select(split).embeddings() for split in (Split.QUERY, Split.GALLERY))
+    best = np.argsort(-(queries @ gallery.T), axis=1)[:, :5]
+    assert np.array_equal(exact_search(queries, table.select(Split.GALLERY), 5), best)
+    monkeypatch.setattr("pipeline.features.table.BLOCK_BYTES", 4 * 32 * 7)
+    assert np.array_equal(exact_search(queries, table.select(Split.GALLERY), 5), best)
+
+
+def test_recall_by_hand(built: tuple[str, Index]) -> None:
+    """Of ten rows that exact search is said to find, the index finds those that are really the
+    nearest.
+    """
+    table, index = built
+    queries = open_table(table).select(Split.QUERY).embeddings()[:2]
+    most = Effort(breadth=16, candidates=60)
+    nearest = index.search_rows(queries, 10, effort=most)[1]
+    wrong = nearest.copy()
+    wrong[0, :4] = [10_000, 10_001, 10_002, 10_003]
+    held = Held(queries_QD=queries, exact_QK=wrong, own_Q=np.array([-1, -1]), source="")
+    assert recall(index, held, most) == (0.5, 0.8)
+
+
+def test_efforts_grow_from_the_least_to_the_most() -> None:
+    lists = list(efforts(new_index("IVF12,SQ8", 32), "none"))
+    assert [effort.breadth for effort in lists] == [1, 2, 4, 8, 12]
+    graph = list(efforts(new_index("HNSW8,SQ8", 32), "none"))
+    assert graph[0].breadth == 16
+    assert all(later.breadth > earlier.breadth for earlier, later in pairwise(graph))
+    assert len(list(efforts(new_index("Flat", 32), "none"))) == 1
+    refined = list(efforts(new_index("PCA16,IVF4,SQ8", 32), "table"))
+    assert [(e.breadth, e.candidates) for e in refined] == [
+        (1, 10),
+        (2, 10),
+        (4, 10),
+        (4, 20),
+        (4, 40),
+        (4, 80),
+    ]
+
+
+def test_the_least_effort_that_reaches_the_target_is_taken(built: tuple[str, Index]) -> None:
+    table, index = built
+    queries, gallery = (
+        open_table(table).select(Split.QUERY).embeddings(),
+        open_table(table).select(Split.GALLERY),
+    )
+    exact = exact_search(queries, gallery, 10)
+    held = Held(queries_QD=queries, exact_QK=exact, own_Q=np.full(len(queries), -1), source="")
+    ladder = list(efforts(new_index("IVF16,PQ4x4fs", 32), "table"))
+    effort, _, at_10 = tuned(index, held, iter(ladder), 0.9)
+    assert at_10 >= 0.9
+    less = [step for step in ladder if step.breadth < effort.breadth]
+    assert all(recall(index, held, step)[1] < 0.9 for step in less)
+    assert (
+        effort.candidates == 1
+        or recall(index, held, Effort(breadth=effort.breadth, candidates=effort.candidates // 2))[1]
+        < 0.9
+    )
+    best, _, most = tuned(index, held, iter(ladder), 1.01)
+    assert most == max(recall(index, held, step)[1] for step in ladder)
+    assert best in ladder
+
+
+def test_a_sample_has_of_each_part_its_share(built: tuple[str, Index]) -> None:
+    table = open_table(built[0]).select(Split.GALLERY)
+    numbers, vectors = sample(table, rows_by_part(table), 30)
+    assert numbers.tolist() == [*range(10), *range(200, 210), *range(400, 410)]
+    assert np.array_equal(vectors, table.embeddings()[numbers])
+    assert len(sample(table, rows_by_part(table), 10**6)[0]) == 600
+
+
+def test_directions_are_counted_by_the_length_they_hold() -> None:
+    flat = np.zeros((2_000, 128), np.float32)
+    flat[:, 5:20] = clustered(2_000, 15, 3)
+    assert effective_dimension(flat) == 32, "15 directions, rounded up"
+    assert effective_dimension(np.eye(128, dtype=np.float32)) == 128

@@ -1,0 +1,224 @@
+"""Searching: finds what brute force finds, under any filter, in any kind of index; opens with plain
+FAISS.
+"""
+
+from pathlib import Path
+
+import faiss
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.core.geo import Box, Near
+from pipeline.core.records import Split, View
+from pipeline.features.table import Floats, open_table
+from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.filters import Where
+from pipeline.index.metadata import Effort
+from pipeline.index.part import EXACT_ROWS, NOBODY
+from pipeline.index.searcher import Index, merged
+from tests.index.index_tables import write_gallery
+
+FACTORIES = [
+    "Flat",
+    "SQ8",
+    "HNSW16,SQ8",
+    "IVF8,SQ8",
+    "IVF8,PQ8x4fs",
+    "IVF8,RaBitQ",
+    "PCA16,IVF8,SQ8",
+    "IVF8,PQ8x4,Refine(SQ8)",
+]
+FILTERS = {
+    "view": Where(view=View.SATELLITE),
+    "another view": Where(view=View.STREET),
+    "locations": Where(locations=frozenset(["00003", "20007", "unheard-of"])),
+    "box": Where(box=Box(south=0.05, north=0.12, west=0, east=1.5)),
+    "circle": Where(near=Near(lat=0.1, lon=2, radius_m=4_000)),
+    "all of them": Where(
+        view=View.SATELLITE,
+        box=Box(south=0, north=1, west=-1, east=5),
+        near=Near(lat=0.1, lon=1, radius_m=9_000),
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """600 satellite rows of the gallery in three parts and 40 UAV queries, 32 dimensions."""
+    return str(write_gallery(tmp_path_factory.mktemp("table")))
+
+
+def build(table: str, out: Path, **changes: object) -> str:
+    given = {"table": table, "out": str(out), "split": Split.GALLERY, "view": View.SATELLITE}
+    build_index(IndexSettings(**(given | changes)))  # type: ignore[arg-type]
+    return str(out)
+
+
+def brute_force(table: str, where: Where | None, k: int) -> tuple[Floats, list[list[str]], Floats]:
+    """The queries, and the keys and scores that a loop over all rows finds for each."""
+    opened = open_table(table)
+    gallery, queries_QD = opened.select(Split.GALLERY), opened.select(Split.QUERY).embeddings()
+    scores_QN = queries_QD @ gallery.embeddings().T
+    masks = [
+        (where or Where()).mask(rows.combine_chunks().to_batches()[0])
+        for _, rows in gallery.numbered(["view", "location", "lat", "lon"])
+    ]
+    scores_QN[:, ~np.concatenate(masks)] = -np.inf
+    best_QK = np.argsort(-scores_QN, axis=1, kind="stable")[
+        :, : min(k, int(np.concatenate(masks).sum()))
+    ]
+    return (
+        queries_QD,
+        gallery.labels().keys[best_QK].tolist(),
+        np.take_along_axis(scores_QN, best_QK, 1),
+    )
+
+
+def test_searching_finds_what_brute_force_finds(table: str, tmp_path: Path) -> None:
+    index = Index(build(table, tmp_path / "index"))
+    queries_QD, keys, scores = brute_force(table, None, 5)
+    found = index.search(queries_QD, k=5)
+    assert [[hit.key for hit in hits] for hits in found] == keys
+    assert np.allclose([[hit.score for hit in hits] for hits in found], scores, atol=1e-6)
+    best = found[0][0]
+    assert (best.view, best.location, len(index)) == (
+        View.SATELLITE,
+        best.key.split("-")[1] + f"{int(best.key.split('-')[2]):04d}",
+        600,
+    )
+    assert best.lat == int(best.key.split("-")[2]) / 1000
+
+
+@pytest.mark.parametrize("factory", FACTORIES)
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_filter_leaves_what_brute_force_leaves(
+    table: str, tmp_path_factory: pytest.TempPathFactory, factory: str, name: str
+) -> None:
+    """Few rows are left, so each is scored by the table's own vectors, however rough the index's
+    codes are.
+    """
+    out = tmp_path_factory.getbasetemp() / f"filtered-{factory}"
+    index = (
+        Index(str(out))
+        if (out / "index.json").exists()
+        else Index(build(table, out, factory=factory, target_recall=0.01))
+    )
+    queries_QD, keys, scores = brute_force(table, FILTERS[name], 7)
+    found = index.search(queries_QD, 7, FILTERS[name])
+    assert [[hit.key for hit in hits] for hits in found] == keys
+    assert np.allclose([[hit.score for hit in hits] for hits in found], scores, atol=1e-6)
+
+
+@pytest.mark.parametrize("factory", ["Flat", "HNSW16,SQ8", "IVF8,SQ8", "IVF8,PQ16x4fs"])
+def test_a_filter_finds_enough_where_too_many_are_left_to_look_at_each(
+    table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factory: str
+) -> None:
+    """A third of the rows may answer, and the effort is that for all: lists are looked through
+    three times as many.
+    """
+    out = build(table, tmp_path / "index", factory=factory, refine=True, target_recall=0.9)
+    monkeypatch.setattr("pipeline.index.part.EXACT_ROWS", 0)
+    where = Where(box=Box(south=0, north=1, west=0.5, east=1.5))
+    queries_QD, keys, _ = brute_force(table, where, 10)
+    found = [[hit.key for hit in hits] for hits in Index(out).search(queries_QD, 10, where)]
+    assert all(key.startswith("gallery-1-") for hits in found for key in hits)
+    assert np.mean([len({*a} & {*b}) / 10 for a, b in zip(found, keys, strict=True)]) >= 0.9
+
+
+@pytest.mark.parametrize("factory", ["HNSW16,SQ8", "IVF8,SQ8"])
+def test_a_table_that_is_elsewhere_is_answered_by_codes(
+    table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factory: str
+) -> None:
+    """Single vectors cannot be read from an object store: a narrow filter then looks at every code."""
+    out = build(table, tmp_path / "index", factory=factory)
+    monkeypatch.setattr("pipeline.index.searcher.readable", lambda path: False)
+    where = FILTERS["locations"]
+    queries_QD, keys, scores = brute_force(table, where, 2)
+    found = Index(out).search(queries_QD, 2, where)
+    assert [[hit.key for hit in hits] for hits in found] == keys
+    assert np.allclose([[hit.score for hit in hits] for hits in found], scores, atol=0.02)
+
+
+def test_candidates_scored_again_have_exact_scores_and_better_order(
+    table: str, tmp_path: Path
+) -> None:
+    out = build(table, tmp_path / "index", factory="IVF4,PQ4x4fs", refine=True, target_recall=0.01)
+    queries_QD, keys, scores = brute_force(table, None, 10)
+    rough = Index(out).search(queries_QD, 10, effort=Effort(breadth=4))
+    refined = Index(out).search(queries_QD, 10, effort=Effort(breadth=4, candidates=30))
+    right = [
+        np.mean(
+            [
+                len({hit.key for hit in hits} & {*best}) / 10
+                for hits, best in zip(found, keys, strict=True)
+            ]
+        )
+        for found in (rough, refined)
+    ]
+    assert right[0] < 0.7
+    assert right[1] > 0.95
+    for hits, best, exact in zip(refined, keys, scores, strict=True):
+        for hit in hits:
+            if hit.key in best:
+                assert hit.score == pytest.approx(exact[best.index(hit.key)], abs=1e-6)
+
+
+def test_plain_faiss_opens_the_index_and_ids_are_row_numbers(table: str, tmp_path: Path) -> None:
+    out = build(table, tmp_path / "index")
+    plain = faiss.read_index(storage.join(out, "index.faiss"))
+    vectors = open_table(table).select(Split.GALLERY).embeddings()
+    assert plain.ntotal == 600
+    assert plain.search(vectors[7:8], 1)[1][0, 0] == 7
+    rows = pq.read_table(storage.join(out, "ids.parquet")).to_pylist()
+    assert rows[205] == {
+        "row": 205,
+        "key": "gallery-1-5",
+        "location": "10005",
+        "view": "satellite",
+        "lat": 0.005,
+        "lon": None,
+        "table_part": 1,
+        "part_row": 5,
+    }
+    facts = storage.read_json(storage.join(out, "index.json"))
+    assert (facts["factory"], facts["rows"], facts["recall_at_1"], facts["recall_at_10"]) == (
+        "Flat",
+        600,
+        1.0,
+        1.0,
+    )
+
+
+def test_what_parts_find_is_merged_by_score_then_row() -> None:
+    one = np.array([[0.9, 0.5, -np.inf]], np.float32), np.array([[4, 2, NOBODY]])
+    other = np.array([[0.9, 0.7, 0.5]], np.float32), np.array([[3, 9, 1]])
+    scores, rows = merged([one, other], 5)
+    assert rows.tolist() == [[3, 4, 9, 1, 2]]
+    assert scores.tolist() == [[np.float32(s) for s in (0.9, 0.9, 0.7, 0.5, 0.5)]]
+    assert merged([one], 3)[1].tolist() == [[4, 2, NOBODY]]
+
+
+def test_more_rows_than_there_are_cannot_be_found(table: str, tmp_path: Path) -> None:
+    index = Index(build(table, tmp_path / "index"))
+    queries_QD = open_table(table).select(Split.QUERY).embeddings()
+    assert [len(hits) for hits in index.search(queries_QD[:3], 1000)] == [600, 600, 600]
+    assert index.search(queries_QD[:2], 3, Where(locations=frozenset(["nowhere"]))) == [[], []]
+    assert index.search(queries_QD[:0], 3) == []
+    assert EXACT_ROWS > 600, "the filters above are to be searched exactly"
+
+
+@pytest.mark.parametrize("shape", [(32,), (1, 31), (2, 3, 32)])
+def test_queries_of_another_network_are_refused(
+    table: str, tmp_path: Path, shape: tuple[int, ...]
+) -> None:
+    index = Index(build(table, tmp_path / "index"))
+    with pytest.raises(InputError, match=r"expected \(queries, 32\)"):
+        index.search(np.zeros(shape, np.float32))
+
+
+def test_no_index_is_said_to_be_none(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no index at"):
+        Index(str(tmp_path))

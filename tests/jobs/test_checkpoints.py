@@ -1,0 +1,312 @@
+"""Checkpoints that outlive any kill: on after one within an epoch, after a damaged file, after a
+worker's death.
+"""
+
+import json
+import os
+import random
+import signal
+import threading
+import time
+from dataclasses import asdict, replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from jobs.train import Settings, train
+from jobs.training.checkpoints import Checkpoints, Conduct, Run, find_checkpoint, older_names
+from jobs.training.metrics import NotFinite, Tally
+from jobs.training.recipes import Recipe, smoke
+from model.checkpoint import Checkpoint, CheckpointError, loads
+from model.pvda import FeatureEncoder
+from model.training import Training
+from pipeline.core import storage
+from pipeline.core.errors import InputError, Unfinished
+from tests.launcher import Job, Launcher
+from tests.processes import below, named, strike
+
+TIMES = {"seconds", "images_per_second"}
+FLAGS = (
+    "--epochs",
+    3,
+    "--batch-size",
+    2,
+    "--part-dim",
+    16,
+    "--discriminator-channels",
+    16,
+    "--dropout",
+    0.5,
+)
+
+
+def tiny(epochs: int = 3) -> Recipe:
+    """Three steps an epoch on the tiny world's six satellite images."""
+    recipe = smoke(epochs)
+    network = replace(recipe.network, part_dim=16, discriminator_channels=16, dropout=0.5)
+    return replace(recipe, network=network, batch_size=2)
+
+
+def settings(shards: str, out: Path, **changes: Any) -> Settings:
+    """Every step leaves a checkpoint."""
+    given: dict[str, Any] = {
+        "recipe": tiny(),
+        "shards": shards,
+        "out": str(out),
+        "workers": 0,
+        "checkpoint_minutes": 0.0,
+    }
+    return Settings(**(given | changes))
+
+
+def rows(out: Path) -> list[dict[str, Any]]:
+    """metrics.jsonl without its times."""
+    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    return [{name: value for name, value in line.items() if name not in TIMES} for line in lines]
+
+
+def weights(out: Path) -> dict[str, torch.Tensor]:
+    modules = loads((out / "last.pt").read_bytes()).state["modules"]
+    return {
+        f"{name}.{key}": tensor for name, state in modules.items() for key, tensor in state.items()
+    }
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    first, second = weights(one), weights(other)
+    assert first.keys() == second.keys()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert rows(one) == rows(other)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tiny_shards: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("undisturbed")
+    train(settings(tiny_shards, out))
+    return out
+
+
+class Killed(BaseException):
+    pass
+
+
+def kill_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+    """The process dies in its nth step."""
+    real, taken = Training.step, iter(range(step))
+
+    def mortal(self: Training, *arguments: Any) -> Any:
+        if next(taken, None) is None:
+            raise Killed
+        return real(self, *arguments)
+
+    monkeypatch.setattr(Training, "step", mortal)
+
+
+@pytest.mark.parametrize(("minutes", "epochs", "step"), [(0.0, 1, 4), (60.0, 1, 5), (60.0, 2, 8)])
+def test_a_run_that_was_killed_goes_on_to_the_same_bits(
+    tiny_shards: str, tmp_path: Path, undisturbed: Path, minutes: float, epochs: int, step: int
+) -> None:
+    changes: dict[str, Any] = {"checkpoint_minutes": minutes, "checkpoint_epochs": epochs}
+    with pytest.MonkeyPatch.context() as patch:
+        kill_at(patch, step)
+        with pytest.raises(Killed):
+            train(settings(tiny_shards, tmp_path, **changes))
+    held = loads((tmp_path / "last.pt").read_bytes())
+    assert (held.epoch, held.step) == {(0.0, 1): (1, 1), (60.0, 1): (1, 0), (60.0, 2): (2, 0)}[
+        minutes, epochs
+    ]
+    train(settings(tiny_shards, tmp_path, **changes))
+    assert_same_run(tmp_path, undisturbed)
+
+
+def test_a_process_killed_at_a_random_moment_and_run_again_ends_as_if_nothing_had_happened(
+    tiny_shards: str, tmp_path: Path, prepared: Launcher
+) -> None:
+    def begin(out: Path) -> Job:
+        flags = (
+            "--shards",
+            tiny_shards,
+            "--out",
+            out,
+            "--workers",
+            0,
+            "--checkpoint-minutes",
+            0,
+            *FLAGS,
+        )
+        return prepared.start("train", ["smoke", *map(str, flags)])
+
+    assert begin(tmp_path / "whole").end().code == 0
+    job = begin(tmp_path / "killed")
+    while not (tmp_path / "killed" / "last.pt").exists():
+        assert job.code is None
+        time.sleep(0.01)
+    job.end(job.seconds + random.uniform(0, 1.5))
+    time.sleep(1)  # TensorBoard orders a run's files by the second in which each was begun
+    assert begin(tmp_path / "killed").end().code == 0
+    assert_same_run(tmp_path / "killed", tmp_path / "whole")
+    assert on_board(tmp_path / "killed") == [1, 2, 3]
+
+
+@pytest.mark.parametrize("written", [False, True])
+def test_killed_as_an_epochs_checkpoint_is_written_a_run_has_that_epochs_row_once(
+    tiny_shards: str, tmp_path: Path, undisturbed: Path, written: bool
+) -> None:
+    write = Checkpoints.write
+
+    def killed(checkpoints: Checkpoints, checkpoint: Checkpoint) -> None:
+        if checkpoint.epoch < 1 or written:
+            write(checkpoints, checkpoint)
+        if checkpoint.epoch == 1:
+            raise Killed
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Checkpoints, "write", killed)
+        with pytest.raises(Killed):
+            train(settings(tiny_shards, tmp_path))
+    time.sleep(1)  # TensorBoard orders a run's files by the second in which each was begun
+    train(settings(tiny_shards, tmp_path))
+    assert_same_run(tmp_path, undisturbed)
+    assert on_board(tmp_path) == [1, 2, 3]
+
+
+def on_board(out: Path) -> list[int]:
+    """The epochs that TensorBoard shows."""
+    board = EventAccumulator(str(out / "tensorboard"))
+    board.Reload()
+    return [event.step for event in board.Scalars("location_loss")]
+
+
+def test_a_ray_worker_killed_is_replaced_and_the_run_goes_on_from_the_last_checkpoint(
+    tiny_shards: str, tmp_path: Path, ray_cluster: None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    victims: list[int] = []
+    out = tmp_path / "killed"
+
+    def murder() -> None:
+        while not (out / "last.pt").exists():
+            time.sleep(0.01)
+        ours = below(os.getpid())  # another session's Ray may run on this machine
+        victims.extend(
+            one for one in ours if "RayTrainWorker" in named(one) and strike(one, signal.SIGKILL)
+        )
+
+    killer = threading.Thread(target=murder, daemon=True)
+    killer.start()
+    train(settings(tiny_shards, out, recipe=tiny(8), workers=1))
+    killer.join()
+    assert len(victims) == 1
+    assert "lost a worker" in capfd.readouterr().err
+    assert [row["epoch"] for row in rows(out)] == list(range(1, 9))
+    train(settings(tiny_shards, tmp_path / "whole", recipe=tiny(8), workers=1))
+    assert_same_run(out, tmp_path / "whole")
+
+
+def test_the_last_checkpoints_are_kept_and_a_damaged_one_gives_way_to_the_one_before(
+    tiny_shards: str, tmp_path: Path, undisturbed: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        kill_at(patch, 5)
+        with pytest.raises(Killed):
+            train(settings(tiny_shards, tmp_path, keep=3))
+    assert older_names(str(tmp_path)) == ["checkpoint-0001-00001.pt", "checkpoint-0001-00000.pt"]
+    last = tmp_path / "last.pt"
+    last.write_bytes(last.read_bytes()[:-1000])
+    train(settings(tiny_shards, tmp_path))
+    said = capsys.readouterr().err
+    assert "last.pt is damaged" in said
+    assert "taking checkpoint-0001-00001.pt, the one before it" in said
+    assert "going on after epoch 1 of 3 and 1 of 3 steps" in said
+    assert_same_run(tmp_path, undisturbed)
+    assert older_names(str(tmp_path)) == ["checkpoint-0002-00002.pt"]
+
+
+def made(epoch: int, step: int = 0) -> Checkpoint:
+    recipe = tiny()
+    return Checkpoint(
+        network=recipe.network,
+        recipe=json.loads(json.dumps(asdict(recipe))),
+        locations=[],
+        epoch=epoch,
+        step=step,
+        history=[],
+        state={"modules": {"encoder": FeatureEncoder(recipe.network).state_dict()}},
+        running={"x": torch.tensor(0.1)},
+    )
+
+
+def test_checkpoints_are_kept_on_any_storage() -> None:
+    run = Run(shards="nowhere", out="memory://run-folder/run", recipe=tiny(), keep=2)
+    assert find_checkpoint(run) is None
+    checkpoints = Checkpoints(run, None)
+    for epoch in (1, 2, 3):
+        checkpoints.write(made(epoch, step=epoch))
+    assert storage.names(run.out) == ["checkpoint-0002-00002.pt", "last.pt"]
+    storage.write_bytes(storage.join(run.out, "last.pt"), b"torn")
+    said: list[str] = []
+    found = find_checkpoint(run, said.append)
+    assert found is not None
+    assert (found[0], found[1].epoch, found[1].step) == ("checkpoint-0002-00002.pt", 2, 2)
+    assert len(said) == 1
+    Checkpoints(run, found).write(made(4))  # a damaged file is not kept
+    assert storage.names(run.out) == ["checkpoint-0002-00002.pt", "last.pt"]
+    storage.remove(storage.join(run.out, "last.pt"))
+    assert find_checkpoint(run, said.append) is not None
+    assert "last.pt is missing" in said[-1]
+    storage.write_bytes(storage.join(run.out, "checkpoint-0002-00002.pt"), b"torn")
+    with pytest.raises(CheckpointError, match="is not a checkpoint"):
+        find_checkpoint(run)
+
+
+def test_a_run_that_diverges_stops_with_one_sentence_and_keeps_the_last_good_checkpoint(
+    tiny_shards: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = Training.step
+
+    def poisoned(self: Training, *arguments: Any) -> Any:
+        if next(steps) == 6:  # the first of the third epoch
+            with torch.no_grad():
+                next(self.learner.classifier.parameters()).fill_(float("inf"))
+        return real(self, *arguments)
+
+    steps = count()
+    monkeypatch.setattr(Training, "step", poisoned)
+    with pytest.raises(
+        Unfinished,
+        match=r"diverged in epoch 3, by step 1 of 3: location_loss\S* is nan, expected a finite",
+    ):
+        train(settings(tiny_shards, tmp_path))
+    held = loads((tmp_path / "last.pt").read_bytes())
+    assert [row["epoch"] for row in rows(tmp_path)] == [1, 2]
+    assert (held.epoch, held.step) == (2, 0)
+
+
+def test_a_tally_goes_on_to_the_same_sums_and_tells_what_is_not_finite() -> None:
+    steps = [{"a": torch.tensor(0.1 * n), "b": torch.tensor(1.0 / (n + 1))} for n in range(6)]
+    whole, first = Tally(), Tally()
+    for step in steps:
+        whole.add(step)
+    for step in steps[:3]:
+        first.add(step)
+    held = first.running()
+    second = Tally(first.steps, held)
+    for step in steps[3:]:
+        second.add(step)
+    assert whole.means() == second.means()
+    assert second.seconds >= float(held["seconds"]) > 0
+    whole.add({"a": torch.tensor(float("inf")), "b": torch.tensor(0.0)})
+    whole.add({"a": torch.tensor(float("-inf")), "b": torch.tensor(0.0)})
+    with pytest.raises(NotFinite, match="a is nan"):
+        whole.means()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"keep": 0}, {"checkpoint_epochs": 0}, {"checkpoint_minutes": -1.0}]
+)
+def test_a_conduct_that_keeps_nothing_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=r"expected (at least 1|0 or more)"):
+        Conduct(**wrong)

@@ -1,0 +1,99 @@
+"""A checkpoint with a damaged bit is not loaded: torch itself compares none of its checksums."""
+
+import zipfile
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from model.checkpoint import SEAL_BYTES, Checkpoint, CheckpointError, dumps, loads, refuse_damaged
+from model.pvda import FeatureEncoder, PVDAConfig
+from model.weights.load import read_state_dict
+from tests.damaging import damages, found_or_equal, look_or_say_gone, sentence_of
+
+
+@pytest.fixture
+def held() -> Checkpoint:
+    torch.manual_seed(0)
+    network = PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=16)
+    weights = FeatureEncoder(network).state_dict()
+    return Checkpoint(
+        network=network,
+        recipe={"name": "tiny"},
+        locations=["a", "b"],
+        epoch=1,
+        history=[{"epoch": 1}],
+        state={"modules": {"encoder": weights}},
+    )
+
+
+def unsealed(data: bytes) -> bytes:
+    """As it was written before there were seals."""
+    return data[: -SEAL_BYTES - 2] + bytes(2)
+
+
+def plain(value: Any) -> Any:
+    """A checkpoint as what can be compared."""
+    if isinstance(value, Checkpoint):
+        return plain(vars(value))
+    if isinstance(value, dict):
+        return {name: plain(one) for name, one in value.items()}
+    return value.numpy().tobytes() if isinstance(value, torch.Tensor) else value
+
+
+def test_a_damaged_checkpoint_is_refused(held: Checkpoint, tmp_path: Path) -> None:
+    path = tmp_path / "last.pt"
+    path.write_bytes(dumps(held))
+    look = look_or_say_gone(
+        path, lambda: plain(loads(path.read_bytes(), str(path))), CheckpointError
+    )
+    assert found_or_equal(path, look, 120, CheckpointError) == 121
+
+
+def test_damaged_bytes_of_the_zips_own_directory_are_found(held: Checkpoint) -> None:
+    """No checksum of the zip covers them, and torch takes other weights for them without a word."""
+    data = dumps(held)
+    end = data[zipfile.ZipFile(BytesIO(data)).start_dir :]
+    for number, damaged in enumerate(damages(end, 300)):
+        if damaged is not None and damaged != end:
+            said = sentence_of(
+                partial(refuse_damaged, data[: -len(end)] + damaged, "x"), CheckpointError
+            )
+            assert said is not None, number
+
+
+def test_a_checkpoint_from_before_there_were_seals_is_loaded_and_its_weights_are_checked(
+    held: Checkpoint, tmp_path: Path
+) -> None:
+    data = unsealed(dumps(held))
+    assert plain(loads(data)) == plain(held)
+    path = tmp_path / "last.pt"
+    path.write_bytes(data)
+    begin = len(data) // 3
+    for place in range(begin, begin + 40):
+        with pytest.raises(CheckpointError, match=r"x is damaged .*copy it again"):
+            loads(data[:place] + bytes([data[place] ^ 16]) + data[place + 1 :], "x")
+
+
+def test_others_read_a_sealed_checkpoint(held: Checkpoint, tmp_path: Path) -> None:
+    path = tmp_path / "last.pt"
+    path.write_bytes(dumps(held))
+    for mapped in (False, True):
+        assert torch.load(path, weights_only=True, mmap=mapped)["epoch"] == 1
+    assert zipfile.ZipFile(path).testzip() is None
+
+
+def test_damaged_weights_to_start_from_are_refused(held: Checkpoint, tmp_path: Path) -> None:
+    path = tmp_path / "resnet.pth"
+    torch.save(held.encoder_weights, path)
+    look = look_or_say_gone(path, lambda: plain(read_state_dict(str(path))), CheckpointError)
+    good, expected, refused = path.read_bytes(), look(), 0
+    for place in range(len(good) // 2, len(good) // 2 + 40):
+        path.write_bytes(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :])
+        refused += sentence_of(look, CheckpointError) is not None
+    assert refused == 40
+    path.write_bytes(good)
+    assert look() == expected

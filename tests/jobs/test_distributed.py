@@ -1,0 +1,101 @@
+"""Two workers compute what one computes on their images together: gradients of two processes
+against one's.
+
+BatchNorm's statistics are apart: each worker has its own unless `sync_bn` joins them on GPUs, so
+they are frozen here.
+"""
+
+import socket
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.multiprocessing import spawn  # type: ignore[attr-defined]
+
+from jobs.train import distribute, share
+from model.checkpoint import Checkpoint
+from model.pvda import PVDAConfig
+from model.schedule import Phase
+from model.training import Optimisation, Training
+
+CONFIG = PVDAConfig(
+    depth=18, width=0.25, image_size=64, parts=2, part_dim=8, dropout=0.0, discriminator_channels=16
+)
+STILL = Phase(alpha=0.9, rate_scale=0.0)
+"""Rates of zero: gradients are computed and nothing moves, so D's first Adam step cannot blow up a
+last bit."""
+WORKERS, EACH, LOCATIONS = 2, 3, 5
+
+
+def frozen(training: Training) -> Training:
+    for module in training.modules.values():
+        for layer in module.modules():
+            if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d):
+                layer.eval()
+    return training
+
+
+def batch() -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The images of all workers."""
+    source, count = torch.Generator().manual_seed(0), WORKERS * EACH
+    views = [
+        torch.randint(0, 256, (count, 3, 64, 64), dtype=torch.uint8, generator=source)
+        for _ in range(2)
+    ]
+    labels = [torch.randint(0, LOCATIONS, (count,), generator=source) for _ in range(2)]
+    return views[0], labels[0], views[1], labels[1]
+
+
+def gradients(training: Training) -> dict[str, Tensor]:
+    return {
+        f"{network}.{name}": parameter.grad
+        for network, module in training.modules.items()
+        for name, parameter in module.named_parameters()
+        if parameter.grad is not None
+    }
+
+
+def checkpoint(epoch: int) -> Checkpoint:
+    return Checkpoint(
+        network=CONFIG, recipe={}, locations=[], epoch=epoch, history=[], state={"modules": {}}
+    )
+
+
+def work(rank: int, port: int, out: str) -> None:
+    torch.set_num_threads(1)
+    address = f"tcp://127.0.0.1:{port}"
+    torch.distributed.init_process_group("gloo", init_method=address, rank=rank, world_size=WORKERS)
+    torch.manual_seed(rank)  # DDP gives all workers the weights of rank 0
+    training = frozen(Training(CONFIG, Optimisation(), LOCATIONS, distribute=distribute))
+    drone, location1_B, satellite, location2_B = (
+        tensor[rank * EACH : (rank + 1) * EACH] for tensor in batch()
+    )
+    for _ in range(2):  # a second step: nothing of the first one's bookkeeping is left over
+        training.step(drone, location1_B, satellite, location2_B, STILL)
+    found = share(("last.pt", checkpoint(epoch=7)) if rank == 0 else None)
+    assert found is not None
+    torch.save((gradients(training), found[1].epoch), f"{out}/{rank}.pt")
+    torch.distributed.destroy_process_group()
+
+
+def test_gradients_of_two_workers_are_those_of_one_with_all_their_images_and_all_go_on_from_rank_zero(
+    tmp_path: Path,
+) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = int(free.getsockname()[1])
+    spawn(work, (port, str(tmp_path)), nprocs=WORKERS)  # type: ignore[no-untyped-call]
+    torch.manual_seed(0)
+    alone = frozen(Training(CONFIG, Optimisation(), LOCATIONS))
+    for _ in range(2):
+        alone.step(*batch(), STILL)
+    wanted = gradients(alone)
+    assert {name.split(".")[0] for name in wanted} == {"encoder", "classifier", "discriminator"}
+    for rank in range(WORKERS):
+        found, epoch = torch.load(tmp_path / f"{rank}.pt", weights_only=True)
+        assert epoch == 7
+        assert found.keys() == wanted.keys()
+        for name, gradient in wanted.items():
+            torch.testing.assert_close(
+                found[name], gradient, rtol=1e-3, atol=1e-5, msg=f"{name} of rank {rank}"
+            )

@@ -1,0 +1,117 @@
+"""A checkpoint as the embedder's workers build it: the same images to check it by each time, and a
+fingerprint that tells.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from jobs.encoding import encoder as encoders
+from jobs.encoding.encoder import PROBES, EncoderSettings, network_of, some_images
+from jobs.training.checkpoints import Run
+from jobs.training.loop import untrained
+from jobs.training.recipes import smoke
+from model.checkpoint import build_encoder, loads
+from model.inference.embed import embed
+from model.inference.int8 import PrecisionError
+from pipeline.core.errors import InputError
+from pipeline.core.records import Split
+from pipeline.features.embed import EmbeddingSettings, embed_gallery
+from pipeline.features.table import open_table
+from pipeline.images.transforms import Resizer
+from pipeline.shards.external import open_manifest
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tiny_shards: str) -> bytes:
+    return untrained(Run(shards=tiny_shards, out="none", recipe=replace(smoke(1), batch_size=2)))
+
+
+def asked(shards: str, **changes: object) -> EmbeddingSettings:
+    return EmbeddingSettings(**({"shards": shards, "out": "none"} | changes))  # type: ignore[arg-type]
+
+
+def images_of(
+    embedding: EmbeddingSettings, size: int, resizer: Resizer, count: int
+) -> encoders.Bytes:
+    manifest = open_manifest(embedding.shards, embedding.split, embedding.view)
+    return some_images(embedding.shards, manifest, size, resizer, count)
+
+
+def test_the_images_to_check_by_are_the_same_each_time_and_of_every_split_and_view(
+    tiny_shards: str,
+) -> None:
+    first, again = (images_of(asked(tiny_shards), 32, "torch", 12) for _ in range(2))
+    assert first.shape == (12, 3, 32, 32)
+    assert np.array_equal(first, again)
+    # Queries and gallery may be embedded one after the other: what calibrates int8 must not depend
+    # on it.
+    assert np.array_equal(first, images_of(asked(tiny_shards, split=Split.QUERY), 32, "torch", 12))
+
+
+def test_a_shard_without_one_image_that_can_be_decoded_is_said_beforehand(
+    tiny_shards: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(encoders, "decoded", lambda samples, *given: iter([]))
+    with pytest.raises(InputError, match="none of the first images of"):
+        images_of(asked(tiny_shards), 32, "torch", PROBES)
+
+
+def test_the_fast_encoder_of_a_worker_computes_what_the_plain_one_does(
+    tiny_shards: str, checkpoint: bytes
+) -> None:
+    made = network_of(checkpoint, "it", asked(tiny_shards)).factory(1)
+    images = images_of(asked(tiny_shards), 64, "torch", 5)
+    plain = embed(build_encoder(loads(checkpoint)), torch.from_numpy(images)).numpy()
+    assert np.abs(made(images) - plain).max() < 1e-4
+    assert "folded encoder in float32: cosine with the plain one 1.0" in made.remarks[-1]  # type: ignore[attr-defined]
+
+
+def test_how_it_was_made_is_in_the_fingerprint_unless_it_makes_no_difference(
+    tiny_shards: str, checkpoint: bytes
+) -> None:
+    def fingerprint(**changes: Any) -> str:
+        return network_of(
+            checkpoint, "it", asked(tiny_shards), EncoderSettings(**changes)
+        ).fingerprint
+
+    assert fingerprint() == fingerprint(precision="float32") == fingerprint(compiling="never")
+    assert (
+        len(
+            {
+                fingerprint(),
+                fingerprint(mirror=False),
+                fingerprint(resizer="pillow"),
+                fingerprint(precision="bfloat16"),
+            }
+        )
+        == 4
+    )
+
+
+def test_int8_where_it_cannot_be_had_is_refused_before_any_worker_starts(
+    tiny_shards: str, checkpoint: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without(device: str) -> None:
+        raise PrecisionError("this CPU has none; choose --precision float32")
+
+    monkeypatch.setattr(encoders, "require_int8", without)
+    with pytest.raises(InputError, match="choose --precision float32"):
+        network_of(checkpoint, "it", asked(tiny_shards), EncoderSettings(precision="int8"))
+
+
+def test_what_an_encoder_says_of_itself_reaches_the_terminal(
+    tmp_path: Path,
+    tiny_shards: str,
+    checkpoint: bytes,
+    ray_cluster: None,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    embedding = asked(tiny_shards, out=str(tmp_path), split=Split.QUERY)
+    embed_gallery(embedding, network_of(checkpoint, "it", embedding))
+    assert "folded encoder in float32" in capsys.readouterr().err
+    assert open_table(str(tmp_path)).rows > 0

@@ -1,0 +1,97 @@
+"""What the probes say of features made here, and that looking changes nothing."""
+
+from dataclasses import replace
+from itertools import count
+
+import numpy as np
+import pytest
+import torch
+
+from jobs.training.probes import look, see, view_gap
+from jobs.training.recipes import smoke
+from model.pvda import FeatureEncoder
+from pipeline.batches.training import Reading, TrainingStream
+from pipeline.core.errors import InputError
+from pipeline.core.records import View
+from pipeline.features.table import Floats
+from pipeline.images.decode import DecodeError, Pixels, decode
+
+
+def features(shift: float, count: int = 80, channels: int = 40) -> tuple[Floats, Floats]:
+    """Two views of unit noise in every channel, one of them shifted along the first."""
+    rng = np.random.default_rng(0)
+    drone, satellite = rng.standard_normal((2, count, channels)).astype(np.float32)
+    satellite[:, 0] += shift
+    return drone, satellite
+
+
+def test_views_that_nothing_tells_apart_have_no_gap() -> None:
+    gap = view_gap(*features(0.0))
+    assert 0.35 < gap["view_gap/accuracy"] < 0.65
+    assert gap["view_gap/distance"] < 0.3
+
+
+def test_a_shift_between_the_views_is_found_and_measured() -> None:
+    gap = view_gap(*features(6.0))
+    assert gap["view_gap/accuracy"] > 0.95
+    assert gap["view_gap/distance"] == pytest.approx(6 / 40**0.5, rel=0.1)
+
+
+def test_the_gap_does_not_depend_on_the_scale_of_the_features_and_constant_channels_are_harmless() -> (
+    None
+):
+    drone, satellite = features(1.0)
+    drone[:, 7] = satellite[:, 7] = 3.0
+    once, again = view_gap(drone, satellite), view_gap(drone * 100, satellite * 100)
+    assert once["view_gap/accuracy"] == again["view_gap/accuracy"]
+    assert once["view_gap/distance"] == pytest.approx(again["view_gap/distance"], rel=1e-4)
+
+
+def test_views_of_different_counts_are_compared_on_as_many_images_of_each() -> None:
+    drone, satellite = features(6.0)
+    assert view_gap(drone, satellite[:21]) == view_gap(drone[:21], satellite[:21])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_look_at_training_places_leaves_the_encoder_as_it_was(
+    tiny_shards: str, share: float
+) -> None:
+    torch.manual_seed(0)
+    encoder = FeatureEncoder(replace(smoke().network, part_dim=16)).train()
+    before = {name: tensor.clone() for name, tensor in encoder.state_dict().items()}
+    stream = TrainingStream(tiny_shards, Reading(batch_size=2, image_size=64, hold_out=share))
+    found = look(encoder, stream)
+    assert encoder.training
+    assert all(torch.equal(before[name], tensor) for name, tensor in encoder.state_dict().items())
+    names = {"view_gap/accuracy", "view_gap/distance"}
+    if share:
+        tasks = ("drone_to_satellite", "satellite_to_drone")
+        names |= {f"held_out/{task}/{measure}" for task in tasks for measure in ("r1", "ap")}
+    assert set(found) == names
+    assert all(value >= 0 for value in found.values())
+    assert found == look(encoder, stream)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_look_leaves_out_damaged_images_and_says_where_all_are(
+    tiny_shards: str, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encoder = FeatureEncoder(replace(smoke().network, part_dim=16))
+    stream = TrainingStream(
+        tiny_shards, Reading(batch_size=2, image_size=64, hold_out=share, threads=1)
+    )
+    whole = see(encoder, stream, View.DRONE)
+    drawn, every = count(), 2
+
+    def failing(data: bytes) -> Pixels:
+        if next(drawn) % every == 0:
+            raise DecodeError("damaged image", "here")
+        return decode(data)
+
+    monkeypatch.setattr("pipeline.batches.training.decode", failing)
+    found = see(encoder, stream, View.DRONE)
+    assert found.locations == whole.locations[1::2]
+    assert np.allclose(found.pooled_NC, whole.pooled_NC[1::2], atol=1e-5)
+    every = 1
+    with pytest.raises(InputError, match="not one drone image"):
+        see(encoder, stream, View.DRONE)

@@ -1,0 +1,213 @@
+"""Recipes are the paper's and LPN's; what is resolved from them is shown before training, and told
+apart from their own.
+"""
+
+import io
+import math
+import shutil
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from jobs.training.config_table import config_table, show_config
+from jobs.training.recipes import (
+    RECIPES,
+    Recipe,
+    alpha_zero,
+    constant_alpha,
+    lpn,
+    no_restart,
+    paper,
+    paper_384,
+    smoke,
+)
+from model.backbones.resnet import ResNet
+from model.checkpoint import loads
+from model.pvda import PVDAConfig
+from model.schedule import phase
+from model.training import Training
+from tests.launcher import Launcher
+
+
+def shown(recipe: Recipe, **run: object) -> str:
+    screen = io.StringIO()
+    Console(width=400, file=screen).print(config_table(recipe, run))
+    return screen.getvalue()
+
+
+def differing(recipe: Recipe) -> set[str]:
+    """The parts in which a recipe is not `paper`, its name apart."""
+    return {
+        field.name
+        for field in fields(Recipe)
+        if getattr(recipe, field.name) != getattr(paper(), field.name)
+    } - {"name"}
+
+
+def test_every_recipe_is_known_by_its_own_name() -> None:
+    assert list(RECIPES) == [
+        "paper",
+        "paper_384",
+        "lpn",
+        "constant_alpha",
+        "no_restart",
+        "alpha_zero",
+        "smoke",
+    ]
+    assert all(make().name == name for name, make in RECIPES.items())
+    assert all((make.__doc__ or "").splitlines()[0].endswith(".") for make in RECIPES.values())
+
+
+def test_paper_384_is_the_paper_on_larger_images() -> None:
+    assert differing(paper_384()) == {"network"}
+    assert paper_384().network == replace(paper().network, image_size=384)
+
+
+def test_lpn_has_no_discriminator_and_ends_after_120_epochs_with_a_tenth_of_its_rates() -> None:
+    recipe = lpn()
+    assert not recipe.adversary
+    tiny = PVDAConfig(depth=18, width=0.25, part_dim=8)
+    training = Training(tiny, recipe.optimisation, 3, adversary=recipe.adversary)
+    assert list(training.rates) == ["backbone", "head", "classifier"]
+    rates = recipe.optimisation
+    assert (rates.kind, rates.backbone_rate, rates.head_rate, rates.classifier_rate) == (
+        "sgd",
+        0.001,
+        0.01,
+        0.01,
+    )
+    assert recipe.schedule.epochs == 120
+    scales = [phase(recipe.schedule, epoch).rate_scale for epoch in range(120)]
+    assert scales == pytest.approx([1.0] * 80 + [0.1] * 40)
+    assert differing(recipe) == {"schedule", "adversary"}
+
+
+def test_constant_alpha_keeps_alpha_and_restarts() -> None:
+    schedule = constant_alpha().schedule
+    assert differing(constant_alpha()) == {"schedule"}
+    assert {phase(schedule, epoch).alpha for epoch in range(560)} == {0.9}
+    assert [phase(schedule, epoch).rate_scale for epoch in range(560)] == [
+        phase(paper().schedule, epoch).rate_scale for epoch in range(560)
+    ]
+
+
+def test_no_restart_grows_alpha_as_the_paper_does_and_its_rates_only_fall() -> None:
+    schedule = no_restart().schedule
+    assert differing(no_restart()) == {"schedule"}
+    for epoch in range(560):
+        assert phase(schedule, epoch).alpha == phase(paper().schedule, epoch).alpha
+        assert phase(schedule, epoch).rate_scale == pytest.approx(0.8 ** (epoch // 140))
+
+
+def test_the_control_is_the_paper_with_alpha_zero_throughout() -> None:
+    schedule = alpha_zero().schedule
+    assert differing(alpha_zero()) == {"schedule"}
+    assert alpha_zero().adversary
+    for epoch in range(560):
+        assert phase(schedule, epoch).alpha == 0
+        assert phase(schedule, epoch).rate_scale == phase(paper().schedule, epoch).rate_scale
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_the_table_shows_every_setting_and_marks_none_of_a_recipe_as_it_is(name: str) -> None:
+    recipe = RECIPES[name]()
+    text = shown(recipe, shards="s3://bucket/shards", weights=None)
+    for part in (recipe, recipe.network, recipe.optimisation, recipe.schedule, recipe.augmentation):
+        for field in fields(part):
+            value = getattr(part, field.name)
+            assert hasattr(value, "__dataclass_fields__") or f"{field.name}={value}" in text
+    assert f"recipe {name}, as it is" in text
+    assert "shards=s3://bucket/shards" in text
+    assert "weights=None" in text
+    assert "*" not in text
+
+
+def test_the_table_marks_what_differs_from_the_named_recipe_and_says_from_what() -> None:
+    recipe = paper()
+    changed = replace(recipe, batch_size=2, network=replace(recipe.network, image_size=128))
+    text = shown(changed)
+    assert "recipe paper, 2 changed (*)" in text
+    assert "*image_size=128 (not 256)" in text
+    assert "*batch_size=2 (not 8)" in text
+    assert text.count("*") == 3  # in the title, and one each
+    assert "*epochs=3 (not 80)" in shown(smoke(epochs=3))
+
+
+def test_a_recipe_of_no_known_name_has_nothing_to_differ_from() -> None:
+    text = shown(replace(paper(), name="mine", batch_size=2))
+    assert "recipe mine, none of the named ones" in text
+    assert "batch_size=2" in text
+    assert "*" not in text
+
+
+def test_the_table_goes_to_standard_error_and_keeps_to_the_screen(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    show_config(paper(), shards="/data/" + "deep/" * 40)
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "image_size=256" in said.err
+    assert max(map(len, said.err.splitlines())) <= 80
+
+
+def test_recipe_paper_trains_a_whole_resnet50_from_torchvisions_weights(
+    tmp_path: Path, tiny_shards: str, prepared: Launcher
+) -> None:
+    """Two real steps by command line, on small images and a narrow D; the backbone has all its
+    layers at full width.
+    """
+    torch.manual_seed(5)
+    # As trained residual blocks do, each adds a little; at random they would add so much that one
+    # step throws conv1 far off.
+    given = {
+        name: tensor / 5 if name.endswith("bn3.weight") else tensor
+        for name, tensor in ResNet(50).state_dict().items()
+    }
+    torch.save(
+        given | {"fc.weight": torch.zeros(1000, 2048), "fc.bias": torch.zeros(1000)},
+        tmp_path / "resnet50.pth",
+    )
+    small = [
+        "--image-size",
+        "128",
+        "--batch-size",
+        "3",
+        "--epochs",
+        "1",
+        "--discriminator-channels",
+        "64",
+    ]
+    paths = [
+        "--shards",
+        tiny_shards,
+        "--out",
+        str(tmp_path / "run"),
+        "--weights",
+        str(tmp_path / "resnet50.pth"),
+    ]
+    ended = prepared.start("train", ["paper", *paths, *small, "--workers", "0"]).end()
+    assert ended.code == 0, ended.said
+    assert "recipe paper, 4 changed (*)" in ended.said
+    assert "*image_size=128 (not 256)" in ended.said
+    checkpoint = loads((tmp_path / "run" / "last.pt").read_bytes())
+    shutil.rmtree(tmp_path / "run")  # hundreds of megabytes, which pytest would keep
+    assert (checkpoint.network.depth, checkpoint.network.width, checkpoint.network.parts) == (
+        50,
+        1.0,
+        4,
+    )
+    assert (checkpoint.recipe["name"], checkpoint.recipe["batch_size"]) == ("paper", 3)
+    assert (checkpoint.history[0]["step"], checkpoint.history[0]["alpha"]) == (2, 0.9)
+    assert all(
+        math.isfinite(checkpoint.history[0][f"{loss}_loss"])
+        for loss in ("location", "view", "adversarial")
+    )
+    for name in ("conv1.weight", "layer4.2.conv3.weight"):
+        now, before = checkpoint.encoder_weights[f"backbone.{name}"], given[name]
+        assert not torch.equal(now, before)
+        assert (
+            torch.cosine_similarity(now.flatten(), before.flatten(), dim=0) > 0.9
+        )  # it started from there

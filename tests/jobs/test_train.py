@@ -1,0 +1,337 @@
+"""The training job: in this process and on Ray, to the end, on after a kill, and refused where it
+cannot run.
+"""
+
+import json
+import os
+import signal
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import ray
+import torch
+from ray.exceptions import RayActorError
+from ray.util.queue import Queue
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from jobs.train import Settings, known_recipe, listen, train
+from jobs.training.checkpoints import Run, read_checkpoint
+from jobs.training.loop import Place, train_worker, untrained
+from jobs.training.recipes import Recipe, paper, smoke
+from model.checkpoint import CheckpointError, build_encoder, dumps, loads
+from pipeline.core.errors import InputError, Unfinished
+from pipeline.core.progress import progress
+from pipeline.images.decode import DecodeError, Pixels, decode
+from pipeline.shards.samples import read_shard
+
+
+def tiny(epochs: int = 2) -> Recipe:
+    """Three steps an epoch on the tiny world's six satellite images."""
+    recipe = smoke(epochs)
+    network = replace(
+        recipe.network, width=0.25, part_dim=16, discriminator_channels=16, dropout=0.5
+    )
+    return replace(recipe, network=network, batch_size=2)
+
+
+def settings(shards: str, out: Path, recipe: Recipe, **changes: object) -> Settings:
+    given = {
+        "recipe": recipe,
+        "shards": shards,
+        "out": str(out),
+        "workers": 0,
+        "checkpoint_minutes": 0.0,
+    }
+    return Settings(**(given | changes))  # type: ignore[arg-type]
+
+
+def rows(out: Path) -> list[dict[str, object]]:
+    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+def rows_of(shards: str, out: Path) -> list[dict[str, object]]:
+    train(settings(shards, out, tiny(1)))
+    return rows(out)
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return loads((path / "last.pt").read_bytes()).encoder_weights
+
+
+def test_a_run_ends_with_a_checkpoint_curves_and_an_encoder(
+    tiny_shards: str, tmp_path: Path
+) -> None:
+    path = train(settings(tiny_shards, tmp_path, tiny()))
+    checkpoint = loads(Path(path).read_bytes())
+    assert checkpoint.epoch == 2
+    assert checkpoint.recipe["name"] == "smoke"
+    assert len(checkpoint.locations) == 6
+    assert build_encoder(checkpoint)(torch.zeros(2, 3, 64, 64, dtype=torch.uint8))[1].shape == (
+        2,
+        2,
+        16,
+    )
+    assert [row["epoch"] for row in rows(tmp_path)] == [1, 2]
+    wanted = {
+        "alpha",
+        "location_loss",
+        "view_loss",
+        "adversarial_loss",
+        "discriminator_accuracy",
+        "learning_rates",
+    }
+    assert wanted <= set(rows(tmp_path)[0])
+    board = EventAccumulator(str(tmp_path / "tensorboard"))
+    board.Reload()
+    assert [event.step for event in board.Scalars("location_loss")] == [1, 2]
+
+
+def test_the_untrained_network_is_the_one_before_the_first_step_even_when_the_run_is_over(
+    tiny_shards: str, tmp_path: Path
+) -> None:
+    run = Run(shards=tiny_shards, out=str(tmp_path), recipe=tiny(1))
+    before = loads(untrained(run))
+    train(settings(tiny_shards, tmp_path, tiny(1)))
+    after = loads(untrained(run))
+    assert after.epoch == 0
+    assert all(
+        torch.equal(before.encoder_weights[name], tensor)
+        for name, tensor in after.encoder_weights.items()
+    )
+    assert not torch.equal(
+        after.encoder_weights["backbone.conv1.weight"], weights(tmp_path)["backbone.conv1.weight"]
+    )
+
+
+def test_a_finished_run_is_left_alone_and_another_recipe_refused(
+    tiny_shards: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = Path(train(settings(tiny_shards, tmp_path, tiny(1))))
+    before = path.stat().st_mtime_ns
+    train(settings(tiny_shards, tmp_path, tiny(1)))
+    assert path.stat().st_mtime_ns == before
+    assert "nothing to do" in capsys.readouterr().err
+    with pytest.raises(InputError, match="with another schedule; choose another --out"):
+        train(settings(tiny_shards, tmp_path, tiny(3)))
+
+
+def test_a_run_from_before_the_resizer_was_a_setting_goes_on_with_pillows(
+    tiny_shards: str, tmp_path: Path
+) -> None:
+    path = Path(train(settings(tiny_shards, tmp_path, replace(tiny(1), resizer="pillow"))))
+    held = loads(path.read_bytes())
+    path.write_bytes(
+        dumps(
+            replace(
+                held, recipe={name: held.recipe[name] for name in held.recipe if name != "resizer"}
+            )
+        )
+    )
+    train(settings(tiny_shards, tmp_path, replace(tiny(1), resizer="pillow")))  # nothing to do
+    with pytest.raises(InputError, match="with another resizer"):
+        train(settings(tiny_shards, tmp_path, tiny(1)))
+
+
+def test_damaged_images_are_counted_in_the_row_and_said_once_an_epoch(
+    tiny_shards: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert [row["damaged_images"] for row in rows_of(tiny_shards, tmp_path / "whole")] == [0]
+    bad = next(sample for sample in read_shard(tiny_shards, "train-drone-000000")).data
+
+    def failing(data: bytes) -> Pixels:
+        if data == bad:
+            raise DecodeError("damaged image", "here")
+        return decode(data)
+
+    monkeypatch.setattr("pipeline.batches.training.decode", failing)
+    told: list[dict[str, object]] = []
+    run = Run(shards=tiny_shards, out=str(tmp_path / "run"), recipe=tiny(4), probe_epochs=0)
+    train_worker(run, Place(gather=lambda damage: [damage, (2, "another-worker's")]), told.append)
+    counts = [row["damaged_images"] for row in rows(tmp_path / "run")]
+    assert set(counts) == {
+        2,
+        3,
+    }  # 6 of the 18 UAV images are drawn in an epoch, and another worker's come in addition
+    notes = [str(facts["note"]) for facts in told if "note" in facts]
+    assert len(notes) == 4
+    assert all(note.startswith(f"epoch {number}: ") for number, note in enumerate(notes, start=1))
+    for number, note in zip(counts, notes, strict=True):
+        assert f": {number} images could not be decoded" in note
+        assert ("the first of them is train-drone-" in note) == (number == 3)
+
+
+def test_ray_train_takes_the_same_steps_as_this_process(
+    tiny_shards: str, tmp_path: Path, ray_cluster: None
+) -> None:
+    train(settings(tiny_shards, tmp_path / "here", tiny(1)))
+    train(settings(tiny_shards, tmp_path / "ray", tiny(1), workers=1))
+    here, there = weights(tmp_path / "here"), weights(tmp_path / "ray")
+    # Another number of threads may sum in another order, and AdamW makes whole steps of a last
+    # bit's sign.
+    assert all(
+        torch.allclose(here[name].float(), there[name].float(), atol=1e-3, rtol=1e-3)
+        for name in here
+    )
+    [one], [other] = rows(tmp_path / "here"), rows(tmp_path / "ray")
+    assert one["location_loss"] == pytest.approx(other["location_loss"], rel=1e-4)
+    assert [row["epoch"] for row in rows(tmp_path / "ray")] == [1]
+
+
+def test_synchronised_batchnorm_without_gpus_is_refused(
+    tiny_shards: str, tmp_path: Path, ray_cluster: None
+) -> None:
+    recipe = replace(tiny(1), sync_bn=True)
+    with pytest.raises(InputError, match="2 workers have no GPUs, expected GPUs"):
+        train(settings(tiny_shards, tmp_path, recipe, workers=2))
+
+
+def test_what_a_ray_worker_refuses_comes_back_as_it_was_said_and_is_not_tried_again(
+    tiny_shards: str, tmp_path: Path, ray_cluster: None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rates = replace(tiny(1).optimisation, backbone_rate=1e30, head_rate=1e30, classifier_rate=1e30)
+    with pytest.raises(Unfinished, match="training diverged in epoch 1"):
+        train(
+            settings(
+                tiny_shards,
+                tmp_path,
+                replace(tiny(1), optimisation=rates),
+                workers=1,
+                checkpoint_minutes=60.0,
+            )
+        )
+    assert "lost a worker" not in capfd.readouterr().err
+    assert not (tmp_path / "last.pt").exists()
+
+
+def test_a_row_tells_each_loss_by_view_and_ring_gradients_and_the_view_gap_and_tensorboard_shows_it(
+    tiny_shards: str, tmp_path: Path
+) -> None:
+    train(settings(tiny_shards, tmp_path, replace(tiny(2), hold_out=0.5), probe_epochs=2))
+    first, second = rows(tmp_path)
+    wanted = {
+        f"location_loss/{view}/ring{ring}" for view in ("drone", "satellite") for ring in (1, 2)
+    }
+    wanted |= {
+        f"{loss}/{view}"
+        for loss in ("location_loss", "view_loss", "adversarial_loss", "discriminator_accuracy")
+        for view in ("drone", "satellite")
+    }
+    wanted |= {f"gradient_norm/{network}" for network in ("encoder", "classifier", "discriminator")}
+    assert wanted <= set(first)
+    looked = {
+        "view_gap/accuracy",
+        "view_gap/distance",
+        "held_out/drone_to_satellite/r1",
+        "held_out/satellite_to_drone/ap",
+    }
+    assert not looked & set(first)
+    assert looked <= set(second)
+    board = EventAccumulator(str(tmp_path / "tensorboard"))
+    board.Reload()
+    assert wanted | looked <= set(board.Tags()["scalars"])
+
+
+def test_two_ray_workers_train_one_network(
+    tiny_shards: str, tmp_path: Path, ray_cluster: None
+) -> None:
+    path = train(settings(tiny_shards, tmp_path, replace(tiny(1), batch_size=3), workers=2))
+    assert loads(Path(path).read_bytes()).history[0]["step"] == 1
+
+
+def test_training_starts_from_given_weights(tiny_shards: str, tmp_path: Path) -> None:
+    recipe = tiny(1)
+    run = Run(shards=tiny_shards, out=str(tmp_path), recipe=replace(recipe, seed=9))
+    other = build_encoder(loads(untrained(run))).backbone.state_dict()
+    torch.save(other | {"fc.weight": torch.zeros(3)}, tmp_path / "other.pth")
+    still = replace(recipe, optimisation=replace(recipe.optimisation, backbone_rate=0.0))
+    train(settings(tiny_shards, tmp_path / "run", still, weights=str(tmp_path / "other.pth")))
+    trained = weights(tmp_path / "run")
+    assert torch.equal(trained["backbone.layer4.0.conv1.weight"], other["layer4.0.conv1.weight"])
+    with pytest.raises(CheckpointError, match="no weights at"):
+        train(settings(tiny_shards, tmp_path / "run2", recipe, weights=str(tmp_path / "none.pth")))
+
+
+def test_a_damaged_checkpoint_is_named(tiny_shards: str, tmp_path: Path) -> None:
+    (tmp_path / "last.pt").write_bytes(b"PK\x03\x04 torn")
+    with pytest.raises(CheckpointError, match=r"last.pt is damaged .*copy it again"):
+        read_checkpoint(Run(shards=tiny_shards, out=str(tmp_path), recipe=tiny()))
+
+
+def test_too_few_images_for_a_batch_are_told_before_anything_starts(
+    tiny_shards: str, tmp_path: Path
+) -> None:
+    with pytest.raises(
+        InputError,
+        match="has 6 satellite and 18 UAV training images; expected at least one batch of 8",
+    ):
+        train(settings(tiny_shards, tmp_path, paper()))
+
+
+def test_an_unknown_recipe_is_answered_with_the_known_ones() -> None:
+    with pytest.raises(
+        InputError, match="unknown recipe 'papr', expected one of: paper, paper_384, lpn, "
+    ):
+        known_recipe(["papr", "--shards", "x"])
+    assert known_recipe(["--help"]) == ["--help"]
+
+
+def test_the_paper_recipe_is_the_papers() -> None:
+    recipe = paper()
+    assert (
+        recipe.network.depth,
+        recipe.network.width,
+        recipe.network.image_size,
+        recipe.network.parts,
+    ) == (
+        50,
+        1.0,
+        256,
+        4,
+    )
+    assert (
+        recipe.network.part_dim,
+        recipe.network.dropout,
+        recipe.network.discriminator_channels,
+    ) == (512, 0.75, 1024)
+    rates = recipe.optimisation
+    assert (rates.kind, rates.momentum, rates.weight_decay) == ("sgd", 0.9, 5e-4)
+    assert (
+        rates.backbone_rate,
+        rates.head_rate,
+        rates.classifier_rate,
+        rates.discriminator_rate,
+    ) == (
+        0.001,
+        0.01,
+        0.01,
+        0.002,
+    )
+    assert (recipe.schedule.epochs, recipe.schedule.period, recipe.schedule.decay_epochs) == (
+        560,
+        140,
+        (60, 120),
+    )
+    assert (recipe.batch_size, recipe.augmentation.pad, recipe.augmentation.rotation) == (8, 10, 90)
+
+
+def test_whoever_tells_a_queue_that_is_being_ended_hears_of_it(ray_cluster: None) -> None:
+    """SIGTERM lets an actor finish what it was asked; asked without an end, it neither went nor
+    answered (seed 22).
+    """
+    told = Queue(actor_options={"num_cpus": 0})
+    actor: Any = told.actor
+    pid: int = ray.get(actor.__ray_call__.remote(lambda queue: os.getpid()))
+    with progress(None, "training", "steps") as meter:
+        listener = threading.Thread(target=listen, args=(told, meter, []), daemon=True)
+        listener.start()
+        time.sleep(0.5)  # it asks
+        os.kill(pid, signal.SIGTERM)
+        time.sleep(0.5)  # the actor has heard
+        with pytest.raises(RayActorError):
+            ray.get(actor.put.remote({"steps": 1}), timeout=20)
+        listener.join(20)
+    assert not listener.is_alive()

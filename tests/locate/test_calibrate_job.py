@@ -1,0 +1,107 @@
+"""An index calibrated by the photos of places held out: which photos count, what is left behind,
+and what is refused.
+"""
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jobs.calibrate import Settings, calibrate_index
+from jobs.encoding.photo_encoder import PhotoEncoder
+from model.checkpoint import Checkpoint, dumps, fingerprint, loads
+from model.pvda import FeatureEncoder, PVDAConfig
+from pipeline.core.errors import InputError
+from pipeline.features.table import PartFooter, PartRows, write_part
+from pipeline.images.transforms import preprocessing, resize
+from pipeline.index.build import IndexSettings, build_index
+from pipeline.locate.confidence import find_confidence
+from pipeline.shards.pack import PackingSettings, pack
+from pipeline.sources.university1652 import University1652
+
+HELD, TRAINED, GALLERY = 20, 3, 40
+
+
+def image(seed: int, size: int = 64) -> bytes:
+    cells = np.random.default_rng(seed).integers(0, 256, size=(6, 6, 3), dtype=np.uint8)
+    stream = io.BytesIO()
+    Image.fromarray(resize(cells, size)).save(stream, "JPEG", quality=95)
+    return stream.getvalue()
+
+
+@pytest.fixture
+def world(tmp_path: Path, ray_cluster: None, lively_encoder: FeatureEncoder) -> dict[str, Any]:
+    """Shards of 23 training locations, of which three were trained on; each shows in one photo what
+    its satellite image shows, and in another something else. An index of forty other places."""
+    for place in range(HELD + TRAINED):
+        for view, seeds in (("satellite", [place]), ("drone", [place, 1000 + place])):
+            folder = tmp_path / "raw" / "train" / view / f"{place:04d}"
+            folder.mkdir(parents=True)
+            for number, seed in enumerate(seeds):
+                (folder / f"{number}.jpg").write_bytes(
+                    image(seed, 64 if view == "satellite" else 70)
+                )
+    pack(
+        University1652(), PackingSettings(root=str(tmp_path / "raw"), out=str(tmp_path / "shards"))
+    )
+    network = PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=16)
+    state = {"modules": {"encoder": lively_encoder.state_dict()}}
+    plain = Checkpoint(network=network, recipe={}, locations=[], epoch=0, history=[], state=state)
+    data = dumps(replace(plain, locations=[f"{place:04d}" for place in range(TRAINED)]))
+    (tmp_path / "last.pt").write_bytes(data)
+    mark = fingerprint(loads(data), f"{preprocessing()}, mirror True")
+    rows_ND, _ = PhotoEncoder(data, "last.pt", {"fingerprint": mark}).encode(
+        [image(5000 + n) for n in range(GALLERY)]
+    )
+    names = [f"g{number}" for number in range(GALLERY)]
+    rows = PartRows(
+        keys=names,
+        locations=names,
+        views=["satellite"] * GALLERY,
+        splits=["gallery"] * GALLERY,
+        lats=[None] * GALLERY,
+        lons=[None] * GALLERY,
+        embeddings_BD=rows_ND,
+    )
+    footer = PartFooter(fingerprint=mark, shard_sha256="s", rows=GALLERY)
+    write_part(str(tmp_path / "table" / "gallery-satellite-000000.parquet"), rows, footer)
+    build_index(IndexSettings(table=str(tmp_path / "table"), out=str(tmp_path / "index")))
+    return {
+        "checkpoint": str(tmp_path / "last.pt"),
+        "shards": str(tmp_path / "shards"),
+        "index": str(tmp_path / "index"),
+    }
+
+
+def test_photos_of_places_not_trained_on_calibrate_an_index(
+    world: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = calibrate_index(Settings(**world))
+    assert (made.photos, made.locations) == (2 * HELD, HELD)
+    assert made.right == pytest.approx(0.5, abs=0.1)  # a photo of something else may hit by chance
+    assert (made.gallery, made.spacing_m, made.within_m) == (GALLERY, None, 0)
+    facts = json.loads((tmp_path / "index" / "index.json").read_text())
+    assert find_confidence(world["index"], facts) == made
+    assert (tmp_path / "index" / "calibration.svg").read_text().startswith("<svg")
+    capsys.readouterr()
+    assert calibrate_index(Settings(**world)) == made
+    assert "nothing to do" in capsys.readouterr().err
+    assert calibrate_index(Settings(**world, outside=0.2)).outside == 0.2
+    assert calibrate_index(Settings(**world, outside=0.2, photos=30)).photos == 30
+    (tmp_path / "index" / "calibration.json").write_text("{}")
+    assert calibrate_index(Settings(**world)) == made
+
+
+def test_few_photos_are_enough_to_ask_for_but_not_few_places(
+    world: dict[str, Any], tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match="5 photos of"):
+        calibrate_index(Settings(**world, photos=5))
+    with pytest.raises(InputError, match="no checkpoint at nowhere"):
+        calibrate_index(Settings(**world | {"checkpoint": "nowhere.pt"}))
+    assert not (tmp_path / "index" / "calibration.json").exists()

@@ -1,0 +1,257 @@
+"""What a calibration learns from made galleries: who is right, where the threshold lies, how far
+apart candidates may agree.
+"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.core.records import View
+from pipeline.features.table import Floats
+from pipeline.index.filters import Where
+from pipeline.index.searcher import Hit
+from pipeline.locate.calibration import (
+    Example,
+    Gallery,
+    Judging,
+    best_radius,
+    best_threshold,
+    calibrate,
+    is_right,
+    out_of_fold,
+)
+from pipeline.locate.calibration_data import Labelled, examples
+from pipeline.locate.confidence import Confidence
+from pipeline.locate.locate import answers, judged, scores_of
+from pipeline.locate.logistic import sigmoid
+from pipeline.locate.track import TRACKED
+
+METRE = 1 / 111_195.08  # degrees of latitude
+GALLERY = Gallery(fingerprint="f" * 64, rows=40, spacing_m=300.0)
+
+
+def hit(location: str, score: float, north_m: float | None = 0.0) -> Hit:
+    lat, lon = (None, None) if north_m is None else (north_m * METRE, 8.0)
+    return Hit(
+        key=f"gallery-satellite-{location}",
+        location=location,
+        view=View.SATELLITE,
+        lat=lat,
+        lon=lon,
+        score=score,
+    )
+
+
+def made(count: int, rng: np.random.Generator) -> list[Example]:
+    """Photos whose own place scores about 0.6, and 39 others about 0.35: right answers are those
+    with high scores.
+    """
+    found = []
+    for number in range(count):
+        others = sorted(
+            (hit(f"z{n}", float(rng.normal(0.35, 0.1)), 9000.0 * n) for n in range(1, 40)),
+            key=lambda h: -h.score,
+        )
+        own = hit(f"p{number % 30}", float(rng.normal(0.6, 0.12)))
+        inside = sorted([own, *others], key=lambda h: -h.score)
+        found.append(
+            Example(
+                location=own.location, lat=0.0, lon=8.0, inside=tuple(inside), outside=tuple(others)
+            )
+        )
+    return found
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Confidence:
+    return calibrate(made(900, np.random.default_rng(0)), Judging(), GALLERY)
+
+
+def test_probabilities_of_photos_never_seen_mean_what_they_say(fitted: Confidence) -> None:
+    fresh = made(900, np.random.default_rng(1))
+    for low, high in ((0, 0.2), (0.2, 0.8), (0.8, 1)):
+        inside = answers([one.inside for one in fresh], 5, fitted)
+        outside = answers([one.outside for one in fresh], 5, fitted)
+        told = [
+            (a.probability or 0, a.location == one.location)
+            for a, one in zip(inside, fresh, strict=True)
+        ]
+        told += [(a.probability or 0, False) for a in outside]
+        here = [(said, right) for said, right in told if low <= said < high]
+        assert np.mean([said for said, _ in here]) == pytest.approx(
+            np.mean([right for _, right in here]), abs=0.05
+        )
+
+
+def test_photos_from_elsewhere_are_unknown_at_the_threshold_and_what_it_costs_is_told(
+    fitted: Confidence,
+) -> None:
+    fresh = made(900, np.random.default_rng(2))
+    outside = np.mean([not one.known for one in answers([one.outside for one in fresh], 5, fitted)])
+    right = [
+        a.known
+        for a, one in zip(answers([e.inside for e in fresh], 5, fitted), fresh, strict=True)
+        if a.location == one.location
+    ]
+    assert outside == pytest.approx(fitted.outside_unknown, abs=0.05)
+    assert np.mean(right) == pytest.approx(fitted.right_kept, abs=0.05)
+    assert outside > 0.8
+
+
+def test_fewer_photos_from_elsewhere_make_the_same_score_surer(fitted: Confidence) -> None:
+    data = made(900, np.random.default_rng(0))
+    rare = calibrate(data, Judging(outside=0.1), GALLERY)
+    agreed, scores_K = judged(data[0].inside, 0), scores_of(data[0].inside)
+    assert rare.probability(agreed, scores_K) > fitted.probability(agreed, scores_K)
+
+
+def test_the_threshold_keeps_most_right_and_fewest_wrong() -> None:
+    """At 0.6 two of three right ones are kept and no wrong one; at 0.3 all right ones and both
+    wrong ones.
+    """
+    said, yes = np.array([0.9, 0.6, 0.5, 0.4, 0.3]), np.array([1.0, 1, 0, 0, 1])
+    assert best_threshold(said, yes, np.ones(5)) == 0.6
+
+
+def test_an_answer_is_right_by_its_location_or_by_its_distance() -> None:
+    example = Example(location="own", lat=0.0, lon=8.0, inside=(hit("other", 0.9, 20),), outside=())
+    agreed = judged(example.inside, 0)
+    assert is_right(agreed, example, 25)
+    assert not is_right(agreed, example, 15)
+    named = Example(location="own", lat=None, lon=None, inside=(hit("own", 0.9, None),), outside=())
+    assert is_right(judged(named.inside, 0), named, 25)
+
+
+def test_neighbours_agree_only_where_that_surely_places_photos_better() -> None:
+    """Tiles every 40 m that overlap: each photo lies between four, each of which is off by 28 m.
+    One photo proves nothing.
+    """
+    d = 20 * METRE
+    four = [(d, d), (d, -d), (-d, d), (-d, -d)]
+    tiles = [
+        Hit(
+            key=f"k{n}",
+            location=f"t{n}",
+            view=View.SATELLITE,
+            lat=lat,
+            lon=lon,
+            score=0.9 - n / 1000,
+        )
+        for n, (lat, lon) in enumerate(four)
+    ]
+    alone = Hit(key="k", location="far", view=View.SATELLITE, lat=1.0, lon=1.0, score=0.1)
+    overlapping = [
+        Example(location=f"photo{n}", lat=0.0, lon=0.0, inside=(*tiles, alone), outside=())
+        for n in range(5)
+    ]
+    apart = Example(
+        location="a",
+        lat=0.0,
+        lon=8.0,
+        inside=(hit("a", 0.9), hit("b", 0.8, 60), hit("c", 0.7, 50)),
+        outside=(),
+    )
+    assert best_radius(overlapping, 25, 40.0) == 1.5 * 40
+    assert best_radius(overlapping[:1], 25, 40.0) == 0.5 * 40
+    assert best_radius([apart] * 9, 25, 40.0) == 0.5 * 40
+    assert best_radius([apart], 25, None) == 0
+
+
+def test_no_photo_is_judged_by_a_model_that_has_seen_its_location() -> None:
+    """One location's examples are all wrong where the others say right: seen, they would be
+    believed.
+    """
+    rng = np.random.default_rng(0)
+    x_NF = rng.normal(size=(200, 1))
+    locations = np.array([f"place{n % 20}" for n in range(200)])
+    odd = locations == "place7"
+    yes = np.where(odd, x_NF[:, 0] < 0, x_NF[:, 0] > 0).astype(float)
+    said = out_of_fold(x_NF, yes, np.ones(200), locations)
+    assert ((said > 0.5) == (x_NF[:, 0] > 0))[odd].all()
+    assert sigmoid(np.array([0.0]))[0] == 0.5
+
+
+def test_too_few_places_and_answers_that_are_all_right_are_refused() -> None:
+    few = [one for one in made(60, np.random.default_rng(0)) if one.location in {"p1", "p2"}]
+    with pytest.raises(InputError, match=r"4 photos of 2 locations.*--hold-out"):
+        calibrate(few, Judging(), GALLERY)
+    sure = [
+        Example(
+            location=f"p{n}",
+            lat=0.0,
+            lon=8.0,
+            inside=(hit(f"p{n}", 0.9), hit("z", 0.1, 9000)),
+            outside=(hit("z", 0.1),),
+        )
+        for n in range(20)
+    ]
+    with pytest.raises(InputError, match="20 of 20 photos are answered rightly"):
+        calibrate(sure, Judging(), GALLERY)
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [({"tolerance": 0}, "--tolerance is 0"), ({"outside": 1}, "--outside is 1")],
+)
+def test_judging_that_makes_no_sense_is_refused(given: dict[str, float], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        Judging(**given)
+
+
+class Rows:
+    """An index of rows at one location each, but for `own`, which has many; row n scores 1 - n /
+    1000.
+    """
+
+    def __init__(self, own: int, others: int) -> None:
+        names = ["own"] * own + [f"o{n}" for n in range(others)]
+        self.hits = [
+            hit(name, 1 - n / 1000, 0.0 if name == "own" else 5000.0 * n)
+            for n, name in enumerate(names)
+        ]
+        self.facts: dict[str, Any] = {}
+        self.dimension = 2
+
+    def __len__(self) -> int:
+        return len(self.hits)
+
+    def search(
+        self, queries_QD: Floats, k: int = 10, where: Where | None = None
+    ) -> list[list[Hit]]:
+        return [self.hits[:k] for _ in queries_QD]
+
+
+def labelled(location: str, vector: list[float], north_m: float = 0.0) -> Labelled:
+    facts = {
+        "key": f"train-{location}",
+        "location": location,
+        "view": "drone",
+        "geotag": {"lat": north_m * METRE, "lon": 8.0},
+    }
+    return Labelled(facts=[facts], embeddings_QD=np.array([vector], np.float32))
+
+
+def test_a_place_of_many_rows_is_left_out_whole_and_others_take_their_ranks() -> None:
+    (example,) = examples(
+        labelled("own", [1, 0]), labelled("x", [0, 1]), Rows(100, 60), 300.0, 25.0
+    )
+    assert {one.location for one in example.inside} == {"own"}
+    assert [one.location for one in example.outside] == [f"o{n}" for n in range(TRACKED)]
+
+
+def test_a_place_that_the_index_lacks_is_ranked_by_its_own_images() -> None:
+    """Its image scores 0.9975, between the third and the fourth row."""
+    photos, own = labelled("new", [1, 0], -9000), labelled("new", [0.9975, 0], -9000)
+    (example,) = examples(photos, own, Rows(0, 60), 300.0, 25.0)
+    assert [one.location for one in example.inside][:4] == ["o0", "o1", "o2", "new"]
+    assert "new" not in {one.location for one in example.outside}
+
+
+def test_images_near_a_photo_s_place_are_left_out_under_whatever_name() -> None:
+    (example,) = examples(
+        labelled("photo", [1, 0], 5000), labelled("x", [0, 1]), Rows(0, 60), 300.0, 25.0
+    )
+    assert "o1" in {one.location for one in example.inside}
+    assert "o1" not in {one.location for one in example.outside}

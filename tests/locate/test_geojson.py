@@ -1,0 +1,96 @@
+"""Answers as other programs read them: GeoJSON and CSV."""
+
+import csv
+import io
+import json
+
+from pipeline.core.records import Rejection, View
+from pipeline.index.searcher import Hit
+from pipeline.locate.geojson import COLUMNS, Located, geojson, table
+from pipeline.locate.locate import Answer, Position
+
+HIT = Hit(
+    key="gallery-satellite-1", location="1", view=View.SATELLITE, lat=46.0, lon=8.0, score=0.75
+)
+
+
+def answer(known: bool = True, lat: float = 46.0) -> Answer:
+    return Answer(
+        position=Position(lat=lat, lon=8.0, radius_m=20.0),
+        location="1",
+        probability=0.5,
+        known=known,
+        candidates=(HIT,),
+        agreeing=1,
+    )
+
+
+FOUND = Located(name="a.jpg", photos=("a.jpg",), answer=answer(), taken_at="10")
+UNKNOWN = Located(name="b.jpg", photos=("b.jpg",), answer=answer(known=False), taken_at="20")
+DAMAGED = Located(
+    name="c.jpg",
+    photos=("c.jpg",),
+    rejected=(Rejection(path="c.jpg", reason="empty file", found="0 bytes"),),
+)
+LATER = Located(name="d.jpg", photos=("d.jpg",), answer=answer(lat=47.0), taken_at="30")
+
+
+def test_a_known_place_is_a_point_with_its_longitude_first() -> None:
+    said = json.loads(geojson([FOUND], {"index": "i"}, track=False))
+    assert said["type"] == "FeatureCollection"
+    assert said["pvda"] == {"index": "i"}
+    (feature,) = said["features"]
+    assert feature["geometry"] == {"type": "Point", "coordinates": [8.0, 46.0]}
+    assert feature["properties"]["radius_m"] == 20
+    assert feature["properties"]["candidates"] == [
+        {
+            "key": "gallery-satellite-1",
+            "location": "1",
+            "view": "satellite",
+            "lat": 46.0,
+            "lon": 8.0,
+            "score": 0.75,
+        }
+    ]
+
+
+def test_an_unknown_place_is_no_point_on_a_map_but_its_best_guess_is_told() -> None:
+    (feature,) = json.loads(geojson([UNKNOWN], {}, track=False))["features"]
+    assert feature["geometry"] is None
+    assert (feature["properties"]["known"], feature["properties"]["lat"]) == (False, 46.0)
+
+
+def test_a_damaged_photo_is_listed_with_its_reason() -> None:
+    (feature,) = json.loads(geojson([DAMAGED], {}, track=False))["features"]
+    assert feature["geometry"] is None
+    assert feature["properties"]["rejected"] == [
+        {"path": "c.jpg", "reason": "empty file", "found": "0 bytes"}
+    ]
+
+
+def test_a_flight_is_a_line_through_the_known_places_with_their_times() -> None:
+    line = json.loads(geojson([FOUND, UNKNOWN, LATER], {}, track=True))["features"][0]
+    assert line["geometry"] == {"type": "LineString", "coordinates": [[8.0, 46.0], [8.0, 47.0]]}
+    assert line["properties"]["times"] == ["10", "30"]
+
+
+def test_one_known_place_makes_no_line() -> None:
+    assert json.loads(geojson([FOUND, UNKNOWN], {}, track=True))["features"][0]["geometry"] is None
+
+
+def test_the_table_has_a_row_per_answer_and_nothing_where_nothing_is_known() -> None:
+    rows = list(csv.DictReader(io.StringIO(table([FOUND, DAMAGED]).decode())))
+    assert tuple(rows[0]) == COLUMNS
+    assert (rows[0]["known"], rows[0]["lat"], rows[0]["candidate"]) == (
+        "true",
+        "46.0",
+        "gallery-satellite-1",
+    )
+    assert (rows[1]["known"], rows[1]["lat"], rows[1]["reason"]) == ("false", "", "empty file")
+
+
+def test_names_that_are_no_unicode_are_written_as_they_are() -> None:
+    name = b"caf\xe9.jpg".decode("utf-8", "surrogateescape")
+    odd = Located(name=name, photos=(name,), answer=answer())
+    assert b"caf\xe9.jpg" in table([odd])
+    assert json.loads(geojson([odd], {}, track=False))["features"][0]["properties"]["photo"] == name

@@ -1,0 +1,224 @@
+"""Photos asked of an index: alone, together, near a place, as a flight; damaged ones are told and
+stop nobody.
+"""
+
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jobs.encoding.photo_encoder import PhotoEncoder
+from jobs.locate import Settings, locate_photos, main
+from model.checkpoint import Checkpoint, dumps, fingerprint, loads
+from model.pvda import FeatureEncoder, PVDAConfig
+from pipeline.core import storage
+from pipeline.core.errors import InputError, Unfinished
+from pipeline.core.geo import Near
+from pipeline.features.table import PartFooter, PartRows, write_part
+from pipeline.images.transforms import preprocessing, resize
+from pipeline.index.build import IndexSettings, build_index
+from pipeline.locate.confidence import Confidence, write_confidence
+from pipeline.locate.logistic import Logistic
+
+PLACES = 12
+STEP = 1e-3  # degrees between places, about 111 m
+
+
+def photo(place: int, blur: int = 80) -> bytes:
+    """A place's own colours, and as another camera sees them where `blur` is another."""
+    cells = np.random.default_rng(place).integers(0, 256, size=(6, 6, 3), dtype=np.uint8)
+    stream = io.BytesIO()
+    Image.fromarray(resize(cells, blur)).save(stream, "JPEG", quality=95)
+    return stream.getvalue()
+
+
+@pytest.fixture
+def world(tmp_path: Path, lively_encoder: FeatureEncoder) -> dict[str, str]:
+    """A checkpoint, an index of places to the north of each other, and a folder with a photo of
+    each of the first four.
+    """
+    network = PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=16)
+    state = {"modules": {"encoder": lively_encoder.state_dict()}}
+    data = dumps(
+        Checkpoint(network=network, recipe={}, locations=[], epoch=0, history=[], state=state)
+    )
+    (tmp_path / "last.pt").write_bytes(data)
+    mark = fingerprint(loads(data), f"{preprocessing()}, mirror True")
+    rows_ND, _ = PhotoEncoder(data, "last.pt", {"fingerprint": mark}).encode(
+        [photo(place) for place in range(PLACES)]
+    )
+    names = [f"{place:04d}" for place in range(PLACES)]
+    rows = PartRows(
+        keys=[f"gallery-satellite-{name}-{name}" for name in names],
+        locations=names,
+        views=["satellite"] * PLACES,
+        splits=["gallery"] * PLACES,
+        lats=[46 + STEP * place for place in range(PLACES)],
+        lons=[8.0] * PLACES,
+        embeddings_BD=rows_ND,
+    )
+    footer = PartFooter(fingerprint=mark, shard_sha256="s", rows=PLACES)
+    write_part(str(tmp_path / "table" / "gallery-satellite-000000.parquet"), rows, footer)
+    build_index(IndexSettings(table=str(tmp_path / "table"), out=str(tmp_path / "index")))
+    (tmp_path / "photos").mkdir()
+    for place in range(4):
+        (tmp_path / "photos" / f"{place}.jpg").write_bytes(photo(place, 96))
+    paths = {name: str(tmp_path / name) for name in ("index", "photos")}
+    return paths | {
+        "checkpoint": str(tmp_path / "last.pt"),
+        "out": str(tmp_path / "out.geojson"),
+        "mark": mark,
+    }
+
+
+def settings(world: dict[str, str], **changes: Any) -> Settings:
+    given = {"photos": (world["photos"],)} | {
+        name: world[name] for name in ("checkpoint", "index", "out")
+    }
+    return Settings(**(given | changes))
+
+
+def calibrated(world: dict[str, str]) -> None:
+    sure = Logistic(mean_F=(0,) * 4, scale_F=(1,) * 4, coefficient_F=(0,) * 4, intercept=2.0)
+    confidence = Confidence(
+        fingerprint=world["mark"],
+        gallery=PLACES,
+        asked="",
+        spacing_m=111.0,
+        within_m=50.0,
+        tolerance_m=25.0,
+        outside=0.5,
+        model=sure,
+        threshold=0.4,
+        sharpness=5000.0,
+        elsewhere=0.0,
+        photos=100,
+        locations=20,
+        right=0.7,
+        right_kept=0.8,
+        outside_unknown=0.9,
+        calibration_error=0.02,
+        bins=(),
+    )
+    write_confidence(f"{world['index']}/calibration.json", confidence)
+
+
+def test_each_photo_is_placed_where_it_was_taken(world: dict[str, str], tmp_path: Path) -> None:
+    located = locate_photos(
+        settings(world, csv=str(tmp_path / "out.csv"), page=str(tmp_path / "out.html"))
+    )
+    assert [one.answer and one.answer.location for one in located] == [
+        "0000",
+        "0001",
+        "0002",
+        "0003",
+    ]
+    points = [
+        feature["geometry"]["coordinates"]
+        for feature in json.loads(Path(world["out"]).read_text())["features"]
+    ]
+    assert np.allclose(points, [[8.0, 46 + STEP * place] for place in range(4)])
+    assert len(list(csv.DictReader(io.StringIO((tmp_path / "out.csv").read_text())))) == 4
+    page = (tmp_path / "out.html").read_text()
+    assert "46.003000, 8.000000" in page
+    assert "Not calibrated" in page
+
+
+def test_the_number_of_candidates_is_the_one_asked_for(world: dict[str, str]) -> None:
+    located = locate_photos(settings(world, top=3))
+    assert [len(one.answer.candidates) for one in located if one.answer] == [3] * 4
+
+
+def test_photos_of_one_folder_are_one_query_together(world: dict[str, str]) -> None:
+    (one,) = locate_photos(settings(world, together=True))
+    assert one.name == world["photos"]
+    assert len(one.photos) == 4
+    assert one.answer is not None
+
+
+def test_near_a_place_only_what_lies_there_answers(world: dict[str, str]) -> None:
+    located = locate_photos(settings(world, near=Near(lat=46 + STEP * 2, lon=8.0, radius_m=150.0)))
+    found = {hit.location for one in located if one.answer for hit in one.answer.candidates}
+    assert found == {"0001", "0002", "0003"}
+
+
+def test_a_damaged_photo_is_told_the_others_are_answered_and_the_exit_code_is_1(
+    world: dict[str, str],
+) -> None:
+    (Path(world["photos"]) / "0a.jpg").write_bytes(b"\xff\xd8\xff no image")
+    with pytest.raises(Unfinished, match=r"1 of 5 photos could not be decoded: .*out.geojson"):
+        main(settings(world))
+    said = json.loads(Path(world["out"]).read_text())["features"]
+    assert [len(feature["properties"]["rejected"]) for feature in said] == [0, 1, 0, 0, 0]
+    assert [feature["geometry"] is None for feature in said] == [False, True, False, False, False]
+
+
+def test_a_photo_that_cannot_be_read_is_told_like_a_damaged_one(
+    world: dict[str, str], monkeypatch: Any
+) -> None:
+    plain = storage.read_bytes
+
+    def failing(path: str) -> bytes:
+        if path.endswith("1.jpg"):
+            raise PermissionError("not yours")
+        return plain(path)
+
+    monkeypatch.setattr(storage, "read_bytes", failing)
+    located = locate_photos(settings(world))
+    assert [[(one.reason, one.found) for one in photo.rejected] for photo in located] == [
+        [], [("unreadable file", "not yours")], [], [],
+    ]  # fmt: skip
+
+
+def test_a_flight_is_placed_as_one_in_the_order_of_its_times(world: dict[str, str]) -> None:
+    """100 m in 10 s are within 25 m/s, so the track is the photos' own; written from the earliest
+    on.
+    """
+    calibrated(world)
+    times = Path(world["photos"]).with_name("times.csv")
+    times.write_text(
+        "photo,time\n" + "".join(f"{place}.jpg,{100 - 10 * place}\n" for place in range(4))
+    )
+    located = locate_photos(settings(world, track=True, times=str(times)))
+    assert [one.taken_at for one in located] == ["70", "80", "90", "100"]
+    assert [one.answer and one.answer.location for one in located] == [
+        "0003",
+        "0002",
+        "0001",
+        "0000",
+    ]
+    line = json.loads(Path(world["out"]).read_text())["features"][0]
+    assert line["geometry"]["type"] == "LineString"
+    assert len(line["geometry"]["coordinates"]) == 4
+
+
+def test_a_flight_without_times_or_without_a_calibration_is_refused(world: dict[str, str]) -> None:
+    with pytest.raises(InputError, match=r"no calibration beside .*--track"):
+        locate_photos(settings(world, track=True))
+    calibrated(world)
+    with pytest.raises(InputError, match=r"4 of 4 photos do not say when .*--interval"):
+        locate_photos(settings(world, track=True))
+    assert len(locate_photos(settings(world, track=True, interval=5.0))) == 4
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"top": 0}, "--top is 0"),
+        ({"together": True, "track": True}, "both --together and --track"),
+        ({"interval": -1.0}, "--interval is -1"),
+        ({"max_speed": 0.0}, "--max-speed is 0"),
+        ({"checkpoint": "nowhere.pt"}, "no checkpoint at nowhere.pt"),
+    ],
+)
+def test_a_wrong_call_is_refused_before_any_work(
+    world: dict[str, str], changes: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(InputError, match=sentence):
+        locate_photos(settings(world, **changes))
+    assert not Path(world["out"]).exists()

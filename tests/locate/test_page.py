@@ -1,0 +1,226 @@
+"""The page of answers: whole in one file, silent in a browser, true on the map, and unharmed by
+names.
+"""
+
+import io
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.core.geo import haversine_m
+from pipeline.core.records import Rejection, View
+from pipeline.index.searcher import Hit
+from pipeline.locate.gallery_map import GalleryMap
+from pipeline.locate.geojson import Located
+from pipeline.locate.locate import Answer, Position
+from pipeline.locate.page import SHOWN, Surroundings, away_m, render, short, told_m
+from pipeline.locate.page_map import (
+    SIDE,
+    Frame,
+    frame_of,
+    keys_around,
+    matrix,
+    overview,
+    place_map,
+    square,
+)
+
+CHROMIUM = next(
+    (found for name in ("chromium", "chromium-browser") if (found := shutil.which(name))), None
+)
+HOSTILE = "<script>alert(1)</script>\"'&-that-does-not-end" * 3
+METRE = 1 / 111_195.08
+
+
+def gallery(lon: float = 8.0) -> GalleryMap:
+    """Nine places 100 m apart around latitude 0."""
+    at = [
+        (100 * METRE * row, (lon + 100 * METRE * column + 180) % 360 - 180)
+        for row in (-1, 0, 1)
+        for column in (-1, 0, 1)
+    ]
+    names = np.array([f"gallery-satellite-{number}" for number in range(9)])
+    return GalleryMap(keys=names, places_N2=np.array(at), rows=9)
+
+
+def answer(known: bool = True, lat: float = 0.0, lon: float = 8.0, location: str = "4") -> Answer:
+    hits = [
+        Hit(
+            key=f"gallery-satellite-{n}",
+            location=location if n == 4 else HOSTILE,
+            view=View.SATELLITE,
+            lat=lat,
+            lon=lon,
+            score=0.5,
+        )
+        for n in (4, 5, 8)
+    ]
+    return Answer(
+        position=Position(lat=lat, lon=lon, radius_m=50.0),
+        location=location,
+        probability=0.75,
+        known=known,
+        candidates=tuple(hits),
+        agreeing=1,
+    )
+
+
+def picture() -> bytes:
+    stream = io.BytesIO()
+    Image.new("RGB", (120, 120), "olive").save(stream, "JPEG")
+    return stream.getvalue()
+
+
+LOCATED = [
+    Located(name="flight/a.jpg", photos=("flight/a.jpg",), answer=answer(), taken_at="10"),
+    Located(name=HOSTILE, photos=(HOSTILE,), answer=answer(known=False)),
+    Located(
+        name="c.jpg",
+        photos=("c.jpg",),
+        rejected=(Rejection(path="c.jpg", reason="empty file", found=HOSTILE),),
+    ),
+]
+
+
+def page(located: list[Located] = LOCATED, **changes: Any) -> str:
+    given: dict[str, Any] = {
+        "title": "Where?",
+        "gallery": gallery(),
+        "confidence": None,
+        "fingerprint": "f" * 64,
+    } | changes
+    return render(
+        located,
+        Surroundings(**given),
+        lambda names: {},
+        lambda keys: dict.fromkeys(keys, picture()),
+    )
+
+
+def test_the_page_tells_places_what_is_unknown_and_what_is_damaged() -> None:
+    text = page(truths={"flight/a.jpg": (30 * METRE, 8.0)})
+    assert "0.000000, 8.000000" in text
+    assert "truly 30 m away" in text
+    assert "1 of 3 photos" in re.sub(r"\s+", " ", text)
+    assert "Unknown" in text
+    assert "empty file" in text
+
+
+def test_names_run_nothing_and_nothing_leaves_the_page() -> None:
+    text = page()
+    assert "<script" not in text
+    assert "default-src 'none'" in text
+    assert not re.search(r'(?:src|href)="(?!data:|#)', text)
+
+
+def test_a_picture_on_many_maps_is_held_once() -> None:
+    """Nine tiles, however many answers show them."""
+    assert page([LOCATED[0]] * 5).count("<image id=") == 9
+
+
+def test_long_lists_are_shown_in_part_and_it_is_said() -> None:
+    text = page([LOCATED[0]] * (SHOWN + 20))
+    assert text.count('<article class="photo">') == SHOWN
+    assert f"{SHOWN} of them are shown" in text
+
+
+def test_the_map_puts_metres_where_they_belong() -> None:
+    """100 m north and east of the middle of a map of 400 m: three quarters across, a quarter down."""
+    frame = Frame(lat=60.0, lon=8.0, half_m=200)
+    x, y = frame.pixels(np.array([[60 + 100 * METRE, 8 + 200 * METRE]]))[0]
+    assert (x, y) == pytest.approx((0.75 * SIDE, 0.25 * SIDE), abs=0.1)
+    assert frame.length(200) == SIDE / 2
+    assert [Frame(lat=0, lon=0, half_m=half).bar_m for half in (200, 3700, 9, 101)] == [
+        100,
+        1000,
+        2,
+        50,
+    ]
+
+
+def test_the_map_crosses_the_meridian_of_180_degrees() -> None:
+    around = gallery(lon=180.0)
+    view = place_map(answer(lon=180.0), around, {})
+    assert view is not None
+    assert len(view.tiles) == 9
+    frame = frame_of(around.places_N2)
+    assert abs(frame.lon) == pytest.approx(180)
+    assert frame.half_m < 200
+
+
+def test_tiles_lie_on_their_footprints_where_these_are_known() -> None:
+    corners = square(0.0, 8.0, 40.0)
+    turned = (*corners[1:], corners[0])
+    view = place_map(answer(), gallery(), {"gallery-satellite-4": turned})
+    assert view is not None
+    (tile,) = [one for one in view.tiles if one.key == "gallery-satellite-4"]
+    assert tile.matrix == matrix(view.frame.pixels(np.array(turned))[[0, 1, 3]])
+    a, b, *_ = map(float, tile.matrix.removeprefix("matrix(").removesuffix(")").split())
+    assert (a, b) == pytest.approx((0, view.frame.length(40)), abs=0.1)
+    assert "gallery-satellite-4" in keys_around(answer(), gallery())
+
+
+def test_a_square_has_sides_as_long_as_asked_for() -> None:
+    corners = np.array(square(60.0, 8.0, 40.0))
+    assert haversine_m(corners, np.roll(corners, -1, axis=0)) == pytest.approx([40] * 4, rel=1e-3)
+
+
+def test_the_overview_has_a_mark_for_each_known_place_and_a_line_for_a_flight() -> None:
+    answers = [("a", answer()), ("b", answer(known=False)), ("c", answer(lat=100 * METRE))]
+    view = overview(answers, gallery(), track=True)
+    assert view is not None
+    assert (len(view.dots), len(view.marks), len(view.line.split())) == (9, 2, 2)
+    assert (
+        place_map(
+            Answer(
+                position=None, location="a", probability=None, known=True, candidates=(), agreeing=1
+            ),
+            gallery(),
+            {},
+        )
+        is None
+    )
+
+
+def test_distances_and_names_are_told_briefly() -> None:
+    assert [told_m(metres) for metres in (None, 0.2, 99.6, 2345)] == [
+        "",
+        "here",
+        "100 m away",
+        "2.3 km away",
+    ]
+    assert away_m(answer(), None) is None
+    assert short("/long/way/0001/image.jpg") == "0001/image.jpg"
+
+
+@pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"
+)
+def test_the_page_opens_in_silence_and_fits(tmp_path: Path) -> None:
+    sync_api = pytest.importorskip(
+        "playwright.sync_api", reason="needs Playwright: install the project with [dev]"
+    )
+    (tmp_path / "page.html").write_text(page())
+    address = (tmp_path / "page.html").as_uri()
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=CHROMIUM,
+            args=["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking"],
+        )
+        for width, scheme in ((375, "dark"), (1300, "light")):
+            tab = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
+            said: list[str] = []
+            asked: list[str] = []
+            tab.on("console", lambda message, said=said: said.append(message.text))
+            tab.on("request", lambda request, asked=asked: asked.append(request.url))
+            tab.goto(address)
+            assert said == []
+            assert [url for url in asked if not url.startswith("data:")] == [address]
+            assert tab.evaluate("document.documentElement.scrollWidth") <= width
+            assert tab.locator("svg use").first.bounding_box()["width"] > 10
+        browser.close()

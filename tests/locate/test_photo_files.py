@@ -1,0 +1,70 @@
+"""Which photos are meant, and when they were taken."""
+
+import io
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from pipeline.core.errors import InputError
+from pipeline.locate.photo_files import find_photos, folder_of, read_times, seconds, taken_at
+
+
+def test_folders_are_looked_through_and_each_photo_is_named_once(tmp_path: Path) -> None:
+    for name in ("b.jpg", "a.jpg", "notes.txt", "deep/c.PNG"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    found = find_photos([f"{tmp_path}/b.jpg", str(tmp_path)])
+    assert [path.removeprefix(f"{tmp_path}/") for path in found] == ["b.jpg", "a.jpg", "deep/c.PNG"]
+    assert folder_of(found[2]) == f"{tmp_path}/deep"
+    assert folder_of("a.jpg") == "."
+
+
+def test_what_is_not_there_is_refused_by_its_name(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no photo or folder at .*gone.jpg"):
+        find_photos([str(tmp_path / "gone.jpg")])
+    with pytest.raises(InputError, match="no images below"):
+        find_photos([str(tmp_path)])
+    with pytest.raises(InputError, match="no photo was named"):
+        find_photos([])
+
+
+def test_the_camera_says_when() -> None:
+    stream, exif = io.BytesIO(), Image.Exif()
+    exif.get_ifd(0x8769)[0x9003] = "2026:11:24 09:30:05"
+    Image.new("RGB", (16, 16)).save(stream, "JPEG", exif=exif)
+    assert taken_at(stream.getvalue()) == "2026-11-24T09:30:05"
+    assert taken_at(b"no image") is None
+
+
+def test_times_are_seconds_or_iso_8601() -> None:
+    assert seconds("12.5") == 12.5
+    assert seconds("2026-11-24T09:30:05.5") - seconds("2026-11-24T09:30:00") == 5.5
+    assert seconds("2026-11-24T10:30:00+01:00") == seconds("2026-11-24T09:30:00")
+    with pytest.raises(ValueError, match="nan"):
+        seconds("nan")
+
+
+def test_a_table_gives_times_by_path_or_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "times.csv"
+    path.write_text("photo,time\nb.jpg,20\n/x/a.jpg,10\n")
+    assert read_times(str(path), ["/x/a.jpg", "/x/b.jpg"]) == {"/x/a.jpg": "10", "/x/b.jpg": "20"}
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (None, "no table at"),
+        ("name,when\na.jpg,1\n", "no rows with the columns photo and time"),
+        ("photo,time\nb.jpg,1\n", "says nothing of /x/a.jpg"),
+        ("photo,time\na.jpg,noon\n", "says 'noon' of /x/a.jpg"),
+    ],
+)
+def test_a_table_that_does_not_say_is_refused(
+    tmp_path: Path, text: str | None, sentence: str
+) -> None:
+    path = tmp_path / "times.csv"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(InputError, match=sentence):
+        read_times(str(path), ["/x/a.jpg"])

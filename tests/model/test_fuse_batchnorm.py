@@ -1,0 +1,96 @@
+"""Folding computes the same, and the backbone that it folds keeps torchvision's names."""
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from model.backbones.resnet import Depth, ResNet
+from model.inference.fuse_batchnorm import fold
+from model.pvda import FeatureEncoder, PVDAConfig
+
+
+def images(count: int) -> Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return torch.randint(0, 256, (count, 3, 64, 64), dtype=torch.uint8, generator=generator)
+
+
+@torch.no_grad()
+def test_a_folded_encoder_has_no_batch_norm_and_computes_the_same(
+    lively_encoder: FeatureEncoder,
+) -> None:
+    folded = fold(lively_encoder)
+    kinds = {type(module) for module in folded.modules()}
+    assert not kinds & {nn.BatchNorm1d, nn.BatchNorm2d}
+    for own, other in zip(folded(images(4)), lively_encoder(images(4)), strict=True):
+        torch.testing.assert_close(own, other, rtol=1e-4, atol=1e-4)
+
+
+@torch.no_grad()
+def test_every_batch_norm_is_felt_so_that_folding_one_wrongly_would_show(
+    lively_encoder: FeatureEncoder,
+) -> None:
+    expected_BPD = lively_encoder(images(2))[1]
+    for module in lively_encoder.modules():
+        if isinstance(module, nn.modules.batchnorm._BatchNorm):
+            module.bias.add_(0.5)
+            assert not torch.allclose(
+                lively_encoder(images(2))[1], expected_BPD, rtol=1e-3, atol=1e-3
+            )
+            module.bias.sub_(0.5)
+
+
+@torch.no_grad()
+def test_bottlenecks_are_folded_too() -> None:
+    torch.manual_seed(0)
+    encoder = FeatureEncoder(PVDAConfig(depth=50, width=0.25, image_size=64, parts=2, part_dim=8))
+    encoder(images(4))  # statistics of a batch
+    encoder.eval()
+    torch.testing.assert_close(
+        fold(encoder)(images(4))[1], encoder(images(4))[1], rtol=1e-4, atol=1e-4
+    )
+
+
+def test_folding_leaves_the_encoder_as_it_was(lively_encoder: FeatureEncoder) -> None:
+    before = {name: tensor.clone() for name, tensor in lively_encoder.state_dict().items()}
+    fold(lively_encoder)
+    after = lively_encoder.state_dict()
+    assert list(before) == list(after)
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert all(parameter.requires_grad for parameter in lively_encoder.parameters())
+
+
+def test_an_encoder_in_training_mode_and_a_norm_that_cannot_be_folded_are_refused(
+    lively_encoder: FeatureEncoder,
+) -> None:
+    with pytest.raises(ValueError, match=r"is in training mode, .*; call eval\(\)"):
+        fold(lively_encoder.train())
+    lively_encoder.eval().backbone.maxpool = nn.Sequential(nn.BatchNorm2d(16).eval())  # type: ignore[assignment]
+    with pytest.raises(
+        ValueError,
+        match=r"backbone\.maxpool\.0 cannot be folded; expected each BatchNorm straight after",
+    ):
+        fold(lively_encoder)
+
+
+@pytest.mark.parametrize(("depth", "convolutions"), [(18, 20), (34, 36), (50, 53), (101, 104)])
+def test_each_relu_is_a_module_of_its_own_and_has_no_name_in_the_state_dict(
+    depth: Depth, convolutions: int
+) -> None:
+    """A quantiser tells them apart by the module. The names are torchvision's: nothing but
+    convolutions and norms.
+    """
+    with torch.device("meta"):
+        backbone = ResNet(depth)
+    shortcuts = sum(
+        name.endswith("downsample")
+        for name, module in backbone.named_modules()
+        if module is not None
+    )
+    relus = [module for module in backbone.modules() if isinstance(module, nn.ReLU)]
+    assert len(relus) == convolutions - shortcuts  # each convolution of the main path has one
+    seen: list[nn.Module] = []
+    for module in relus:
+        module.register_forward_hook(lambda own, given, result: seen.append(own))
+    backbone(torch.empty(1, 3, 64, 64, device="meta"))
+    assert len(seen) == len({id(module) for module in seen}) == len(relus)
+    assert not any("relu" in name for name in backbone.state_dict())

@@ -1,0 +1,267 @@
+"""A fast encoder computes what the plain one does, is checked for it, and says what it is.
+
+Shapes: B images, E numbers of an embedding.
+"""
+
+import shutil
+import sys
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from model.inference import int8, optimise
+from model.inference.compile import NotCompiled, compile_frozen
+from model.inference.embed import OneBatch, effective_precision, embed, with_precision
+from model.inference.fuse_batchnorm import fold
+from model.inference.int8 import INSTRUCTIONS, PrecisionError, calibration_digest, require_int8
+from model.inference.optimise import LEAST_COSINE, make_fast
+from model.pvda import FeatureEncoder
+
+needs_compiler = pytest.mark.skipif(
+    shutil.which("g++") is None, reason="torch.compile needs g++, which is not here"
+)
+
+
+def images(count: int, seed: int = 0) -> Tensor:
+    """Bytes of soft noise, so that images differ in more than their grain."""
+    coarse = torch.rand(count, 3, 4, 4, generator=torch.Generator().manual_seed(seed))
+    fine = torch.rand(count, 3, 64, 64, generator=torch.Generator().manual_seed(seed + 1000))
+    soft = torch.nn.functional.interpolate(coarse, (64, 64), mode="bicubic") * 200 + fine * 55
+    return soft.clamp(0, 255).to(torch.uint8)
+
+
+def fast(encoder: FeatureEncoder, **settings: Any) -> tuple[Any, list[str]]:
+    """The fast encoder, with what it said."""
+    said: list[str] = []
+    defaults: dict[str, Any] = {"probe_B3HW": images(6), "batch_size": 4, "compiled": False}
+    return make_fast(encoder, say=said.append, **(defaults | settings)), said
+
+
+def rolled() -> Callable[[OneBatch, Tensor], Tensor]:
+    """A forward pass that computes something else: the embedding's numbers move on by one place."""
+    forward = OneBatch.forward
+    return lambda self, images_B3HW: forward(self, images_B3HW).roll(1, dims=1)
+
+
+@pytest.mark.parametrize("mirror", [True, False])
+def test_the_folded_encoder_embeds_as_the_plain_one_does(
+    lively_encoder: FeatureEncoder, mirror: bool
+) -> None:
+    """With `mirror` this is one batch of images and mirror images against two passes; 6 images are
+    a batch and a half.
+    """
+    encoder, said = fast(lively_encoder, mirror=mirror)
+    assert (encoder.kind, encoder.precision) == ("folded", "float32")
+    assert encoder.agreement > 1 - 1e-5
+    assert said == [
+        "folded encoder in float32: cosine with the plain one 1.000000 in the mean, 1.000000 at worst, over 6 images"
+    ]
+    found_BE = encoder(images(7, seed=5))
+    assert found_BE.dtype == torch.float32
+    torch.testing.assert_close(
+        found_BE, embed(lively_encoder, images(7, seed=5), mirror), rtol=0, atol=1e-5
+    )
+    assert (embed(lively_encoder, images(7, seed=5), not mirror) - found_BE).abs().max() > 1e-3
+    assert encoder(images(0)).shape == (0, 32)
+
+
+def test_a_fast_encoder_that_computes_something_else_is_found_and_the_plain_one_used(
+    lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(OneBatch, "forward", rolled())
+    encoder, said = fast(lively_encoder, compiled=True)
+    assert (encoder.kind, encoder.agreement) == ("plain", pytest.approx(1))
+    assert said[0].startswith(
+        "the folded encoder disagrees with the plain one (cosine with the plain one 0."
+    )
+    assert said[0].endswith("over 6 images); the plain one is used")
+    torch.testing.assert_close(
+        encoder(images(3)), embed(lively_encoder, images(3)), rtol=0, atol=1e-5
+    )
+
+
+def test_a_compiled_encoder_that_computes_something_else_is_found_and_the_folded_one_used(
+    lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def wrong(module: OneBatch, batch_B3HW: Tensor) -> Callable[[Tensor], Tensor]:
+        return lambda images_B3HW: torch.full((len(images_B3HW), 32), torch.nan)
+
+    monkeypatch.setattr(optimise, "compile_frozen", wrong)
+    encoder, said = fast(lively_encoder, compiled=True)
+    assert encoder.kind == "folded"
+    assert (
+        "the compiled encoder disagrees with the plain one (cosine with the plain one nan in the mean"
+        in said[2]
+    )
+
+
+@pytest.mark.parametrize(
+    ("least", "error"), [(0.999, None), (1.1, "bfloat16 embeddings agree .* by a cosine of")]
+)
+def test_bfloat16_is_a_precision_of_its_own_and_never_falls_back_to_float32(
+    lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch, least: float, error: str | None
+) -> None:
+    monkeypatch.setitem(LEAST_COSINE, "bfloat16", least)
+    if error:
+        with pytest.raises(PrecisionError, match=f"{error}.*; choose --precision float32"):
+            fast(lively_encoder, precision="bfloat16")
+        return
+    encoder, _ = fast(lively_encoder, precision="bfloat16")
+    assert (encoder.kind, encoder.precision) == ("folded", "bfloat16")
+    assert 0.999 <= encoder.agreement < 1 - 1e-7
+    monkeypatch.setattr(OneBatch, "forward", rolled())
+    plain, _ = fast(lively_encoder, precision="bfloat16")
+    assert (plain.kind, plain.precision) == ("plain", "bfloat16")
+    assert plain.agreement < 1 - 1e-7
+
+
+def test_compiling_is_left_out_where_it_does_not_pay_and_the_reason_told_where_it_fails(
+    lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise RuntimeError("no C++ compiler\nand a long story")
+
+    monkeypatch.setattr(torch, "compile", lambda *_, **__: fail)
+    for count in (None, 100):
+        assert len(fast(lively_encoder, compiled="auto", images=count)[1]) == 1
+    for compiled, count in (("auto", 10**9), (True, None)):
+        encoder, said = fast(lively_encoder, compiled=compiled, images=count)
+        assert encoder.kind == "folded"
+        assert said[0].startswith("compiling the encoder for batches of 4")
+        assert (
+            said[1]
+            == "the encoder cannot be compiled here (RuntimeError: no C++ compiler); it goes on uncompiled"
+        )
+
+
+@needs_compiler
+def test_a_compiled_encoder_embeds_as_the_plain_one_does(lively_encoder: FeatureEncoder) -> None:
+    encoder, said = fast(lively_encoder, compiled=True)
+    assert (encoder.kind, encoder.precision) == ("compiled", "float32")
+    assert encoder.agreement > 1 - 1e-5
+    assert [line.split(" ")[0] for line in said] == ["compiling", "compiled", "compiled"]
+    with (
+        torch.inference_mode(),
+        torch._dynamo.config.patch(error_on_recompile=True),
+    ):  # whatever the caller is in
+        found_BE = encoder(images(7, seed=5))
+        one_BE = encoder(images(1, seed=9))
+    torch.testing.assert_close(
+        found_BE, embed(lively_encoder, images(7, seed=5)), rtol=0, atol=1e-5
+    )
+    torch.testing.assert_close(one_BE, embed(lively_encoder, images(1, seed=9)), rtol=0, atol=1e-5)
+
+
+def test_a_missing_compiler_is_a_reason_in_one_line(lively_encoder: FeatureEncoder) -> None:
+    module = OneBatch(lively_encoder, mirror=False)
+    with (
+        torch._inductor.config.patch(
+            {"cpp.cxx": ("/there/is/none",), "force_disable_caches": True}
+        ),
+        pytest.raises(NotCompiled, match=r"^[^\n]+$"),
+    ):
+        compile_frozen(module, images(2))
+
+
+@needs_compiler
+def test_int8_agrees_on_images_it_was_not_calibrated_by(lively_encoder: FeatureEncoder) -> None:
+    pytest.importorskip("torchao", reason="int8 is optional: pip install 'pvda[int8]'")
+    if not any(torch.cpu.get_capabilities().get(name) for name in INSTRUCTIONS):
+        pytest.skip("this CPU has no VNNI and no AMX")
+    calibration_B3HW = images(9, seed=50)
+    encoder, said = fast(lively_encoder, precision="int8", calibration_B3HW=calibration_B3HW)
+    assert (encoder.kind, encoder.precision) == ("compiled", "int8")
+    assert 0.99 <= encoder.mean_agreement < 1 - 1e-7
+    assert said[0].startswith("calibrating int8 on 9 images")
+    assert said[1].startswith("int8 encoder, made in ")
+    found_BE = encoder(images(5, seed=5))
+    torch.testing.assert_close(found_BE.norm(dim=1), torch.ones(5))
+    assert (found_BE * embed(lively_encoder, images(5, seed=5))).sum(1).mean() > 0.99
+
+
+def test_int8_has_the_same_ranges_whatever_the_number_of_threads(
+    lively_encoder: FeatureEncoder,
+) -> None:
+    """Two workers that round differently would differ from each other as much as from float32."""
+    pytest.importorskip("torchao", reason="int8 is optional: pip install 'pvda[int8]'")
+    threads, found = torch.get_num_threads(), []
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            module = OneBatch(fold(lively_encoder), mirror=True)
+            int8.quantise(module.encoder, 64, partial(module, images(6)))
+            assert torch.get_num_threads() == count
+            found.append(str(module.encoder.backbone.code))  # the ranges are numbers in it
+    finally:
+        torch.set_num_threads(threads)
+    assert "quantize_per_tensor" in found[0]
+    assert found[0] == found[1]
+
+
+def test_int8_is_refused_where_it_cannot_be_had_with_the_remedy(
+    lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(
+        PrecisionError, match="int8 is for CPUs and the device is cuda; choose --precision bfloat16"
+    ):
+        require_int8("cuda")
+    monkeypatch.setattr(
+        torch.cpu, "get_capabilities", lambda: {"architecture": "x86_64", "avx512_vnni": True}
+    )
+    monkeypatch.setitem(sys.modules, int8.QUANTIZER, None)
+    with pytest.raises(
+        PrecisionError, match=r"int8 needs torchao, .*; pip install 'pvda\[int8\]', or choose"
+    ):
+        require_int8("cpu")
+    monkeypatch.setattr(
+        torch.cpu, "get_capabilities", lambda: {"architecture": "x86_64", "avx2": True}
+    )
+    with pytest.raises(
+        PrecisionError,
+        match=r"this CPU \(x86_64\) has no avx512_vnni.*; choose --precision float32",
+    ):
+        fast(lively_encoder, precision="int8", calibration_B3HW=images(4))
+    monkeypatch.setattr(optimise, "require_int8", lambda device: None)
+    with pytest.raises(
+        PrecisionError, match="int8 without images to calibrate by; expected 64 or more"
+    ):
+        fast(lively_encoder, precision="int8")
+
+
+def test_int8_that_agrees_too_little_stops_with_a_sentence(
+    lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither a slow table nor a wrong one is what was asked for."""
+    monkeypatch.setattr(optimise, "require_int8", lambda device: None)
+    monkeypatch.setattr(optimise, "quantise", lambda *_: None)
+    monkeypatch.setattr(
+        optimise, "compile_frozen", lambda module, _: lambda x: module(x).roll(1, dims=1)
+    )
+    with pytest.raises(
+        PrecisionError,
+        match=r"by a mean cosine of -?0\.\d+, expected at least 0.99; calibrate by more",
+    ):
+        fast(lively_encoder, precision="int8", calibration_B3HW=images(4))
+
+
+def test_precisions_that_change_the_embeddings_have_fingerprints_of_their_own() -> None:
+    one, other = calibration_digest(images(2)), calibration_digest(images(2, seed=1))
+    texts = [with_precision("resized", "float32"), with_precision("resized", "bfloat16")]
+    texts += [with_precision("resized", "int8", digest) for digest in (one, other)]
+    assert len(set(texts)) == 4
+    assert texts[0] == "resized"  # tables made before there was a choice stay what they are
+    assert one == calibration_digest(images(2).to(memory_format=torch.channels_last))
+    with pytest.raises(ValueError, match="int8 without its calibration"):
+        with_precision("resized", "int8")
+
+
+def test_auto_is_decided_by_the_kind_of_device_alone() -> None:
+    assert [effective_precision("auto", device) for device in ("cpu", "cuda")] == [
+        "float32",
+        "bfloat16",
+    ]
+    assert effective_precision("float32", "cuda") == "float32"

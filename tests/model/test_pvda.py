@@ -1,0 +1,313 @@
+"""The networks: sizes, names, strides and initial weights, mostly on the meta device, which
+computes shapes only.
+
+Shapes: B images, C channels of the maps, P rings, D numbers per ring, L locations.
+"""
+
+from typing import Literal
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.utils.flop_counter import FlopCounterMode
+
+from model.backbones.resnet import Depth, ResNet
+from model.inference.embed import embed, unit_embedding
+from model.pvda import FeatureEncoder, LocationClassifier, PVDAConfig, ViewDiscriminator, refinement
+
+PAPER = PVDAConfig()
+TINY = PVDAConfig(
+    depth=18, width=0.25, image_size=64, parts=2, part_dim=8, discriminator_channels=8
+)
+
+
+def on_meta(config: PVDAConfig) -> tuple[FeatureEncoder, LocationClassifier, ViewDiscriminator]:
+    with torch.device("meta"):
+        encoder = FeatureEncoder(config)
+        return (
+            encoder,
+            LocationClassifier(config, 701),
+            ViewDiscriminator(config, encoder.backbone.channels),
+        )
+
+
+def images(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randint(
+        0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(seed)
+    )
+
+
+def parameters(*modules: nn.Module) -> int:
+    return sum(parameter.numel() for module in modules for parameter in module.parameters())
+
+
+def torchvision_resnet50() -> dict[str, tuple[int, ...]]:
+    """Names and shapes of torchvision's resnet50().state_dict() without `fc`, written down by hand."""
+    found: dict[str, tuple[int, ...]] = {}
+
+    def convolution(name: str, outside: int, inside: int, side: int) -> None:
+        found[f"{name}.weight"] = (outside, inside, side, side)
+
+    def norm(name: str, channels: int) -> None:
+        for tensor in ("weight", "bias", "running_mean", "running_var"):
+            found[f"{name}.{tensor}"] = (channels,)
+        found[f"{name}.num_batches_tracked"] = ()
+
+    convolution("conv1", 64, 3, 7)
+    norm("bn1", 64)
+    inside = 64
+    for layer, (blocks, width) in enumerate([(3, 64), (4, 128), (6, 256), (3, 512)], start=1):
+        for block in range(blocks):
+            name = f"layer{layer}.{block}"
+            convolution(f"{name}.conv1", width, inside, 1)
+            norm(f"{name}.bn1", width)
+            convolution(f"{name}.conv2", width, width, 3)
+            norm(f"{name}.bn2", width)
+            convolution(f"{name}.conv3", 4 * width, width, 1)
+            norm(f"{name}.bn3", 4 * width)
+            if block == 0:
+                convolution(f"{name}.downsample.0", 4 * width, inside, 1)
+                norm(f"{name}.downsample.1", 4 * width)
+            inside = 4 * width
+    return found
+
+
+def test_the_backbone_has_the_names_and_shapes_of_torchvisions_resnet50() -> None:
+    with torch.device("meta"):
+        own = {name: tuple(tensor.shape) for name, tensor in ResNet(50).state_dict().items()}
+    wanted = torchvision_resnet50()
+    assert len(wanted) == 318
+    assert own == wanted
+
+
+@pytest.mark.parametrize(
+    ("depth", "count"), [(18, 11_176_512), (34, 21_284_672), (50, 23_508_032), (101, 42_500_160)]
+)
+def test_each_depth_has_as_many_parameters_as_published_without_its_classifier(
+    depth: Depth, count: int
+) -> None:
+    with torch.device("meta"):
+        assert parameters(ResNet(depth)) == count
+
+
+def test_layer4_keeps_its_resolution_in_the_main_path_and_the_shortcut_without_dilation() -> None:
+    with torch.device("meta"):
+        modules = dict(ResNet(50).named_modules())
+    strided = {
+        name
+        for name, module in modules.items()
+        if isinstance(module, nn.Conv2d) and module.stride != (1, 1)
+    }
+    assert strided == {
+        "conv1",
+        "layer2.0.conv2",
+        "layer2.0.downsample.0",
+        "layer3.0.conv2",
+        "layer3.0.downsample.0",
+    }
+    assert all(
+        module.dilation == (1, 1) for module in modules.values() if isinstance(module, nn.Conv2d)
+    )
+
+
+@pytest.mark.parametrize(("size", "cells", "giga_macs"), [(256, 16, 8.1), (384, 24, 18.2)])
+def test_maps_are_a_sixteenth_of_the_image_and_cost_what_they_should(
+    size: int, cells: int, giga_macs: float
+) -> None:
+    encoder = on_meta(PVDAConfig(image_size=size))[0].eval()
+    photo_B3HW = torch.empty(1, 3, size, size, dtype=torch.uint8, device="meta")
+    with FlopCounterMode(display=False) as counter:
+        maps_BCHW, g_BPD = encoder(photo_B3HW)
+    assert maps_BCHW.shape == (1, 2048, cells, cells)
+    assert g_BPD.shape == (1, 4, 512)
+    assert counter.get_total_flops() / 2e9 == pytest.approx(giga_macs, abs=0.05)
+
+
+def test_the_networks_have_the_papers_sizes() -> None:
+    encoder, classifier, discriminator = on_meta(PAPER)
+    assert parameters(encoder) == 23_508_032 + 4 * (2048 * 512 + 512 + 2 * 512) == 27_708_480
+    assert parameters(encoder, classifier) == 27_708_480 + 4 * (512 * 701 + 701) == 29_146_932
+    assert (
+        parameters(discriminator)
+        == 9 * 1024 * (2048 + 1024 + 1024) + 3 * 2 * 1024 + 2050
+        == 37_756_930
+    )
+    assert PAPER.embedding_dim == 2048
+
+
+def test_the_discriminator_is_three_convolutions_two_pools_one_relu_and_a_linear_layer() -> None:
+    discriminator = on_meta(PAPER)[2]
+    kinds = [
+        type(module).__name__ for module in discriminator.modules() if not list(module.children())
+    ]
+    block = ["Conv2d", "BatchNorm2d"]
+    assert kinds == [*block, *block, "AvgPool2d", *block, "AvgPool2d", "ReLU", "Linear"]
+    convolutions = [module for module in discriminator.modules() if isinstance(module, nn.Conv2d)]
+    assert [(c.in_channels, c.out_channels, c.kernel_size, c.padding) for c in convolutions] == [
+        (inside, 1024, (3, 3), (1, 1)) for inside in (2048, 1024, 1024)
+    ]
+
+
+@pytest.mark.parametrize(("cells", "left"), [(16, 4), (24, 6)])
+def test_the_discriminator_halves_the_maps_twice_and_gives_one_verdict_an_image(
+    cells: int, left: int
+) -> None:
+    discriminator = on_meta(PAPER)[2]
+    maps_BCHW = torch.empty(3, 2048, cells, cells, device="meta")
+    assert discriminator.blocks(maps_BCHW).shape == (3, 1024, left, left)
+    assert discriminator(maps_BCHW).shape == (3, 2)
+
+
+@torch.no_grad()
+def test_a_refinement_is_a_linear_layer_and_a_batch_norm_initialised_as_lpns() -> None:
+    torch.manual_seed(0)
+    linear, norm = refinement(2048, 512)
+    assert isinstance(linear, nn.Linear)
+    assert isinstance(norm, nn.BatchNorm1d)
+    assert float(linear.weight.std()) == pytest.approx(
+        (2 / 512) ** 0.5, rel=0.01
+    )  # Kaiming over the 512 outputs
+    assert float(linear.weight.mean()) == pytest.approx(0, abs=1e-3)
+    assert float(norm.weight.mean()) == pytest.approx(1, abs=0.005)
+    assert float(norm.weight.std()) == pytest.approx(0.02, rel=0.15)
+    assert not linear.bias.any()
+    assert not norm.bias.any()
+
+
+@torch.no_grad()
+def test_a_classifier_starts_almost_at_zero_so_that_all_locations_are_equally_likely() -> None:
+    torch.manual_seed(0)
+    classifier = LocationClassifier(PAPER, 701)
+    assert classifier.dropout.p == 0.75
+    assert len(classifier.branches) == 4
+    for branch in classifier.branches:
+        assert isinstance(branch, nn.Linear)
+        assert float(branch.weight.std()) == pytest.approx(0.001, rel=0.01)
+        assert not branch.bias.any()
+
+
+def test_the_classifier_drops_numbers_in_training_and_none_in_evaluation() -> None:
+    torch.manual_seed(0)
+    classifier = LocationClassifier(PVDAConfig(part_dim=512), 3)
+    g_BPD = torch.ones(1, 4, 512)
+    seen: list[Tensor] = []
+    classifier.dropout.register_forward_hook(lambda module, given, result: seen.append(result))
+    classifier(g_BPD)
+    classifier.eval()(g_BPD)
+    assert float((seen[0] == 0).float().mean()) == pytest.approx(0.75, abs=0.04)
+    assert torch.equal(seen[1], g_BPD)
+
+
+def test_each_ring_has_its_own_refinement_and_its_own_classifier() -> None:
+    torch.manual_seed(0)
+    encoder, classifier = FeatureEncoder(TINY).eval(), LocationClassifier(TINY, 3).eval()
+    photo_B3HW = images(1, 3, 64, 64)
+    before_BPD, before_BPL = encoder(photo_B3HW)[1], classifier(torch.ones(1, 2, 8))
+    with torch.no_grad():
+        encoder.refine[1].get_parameter("0.bias").add_(1)
+        classifier.branches[0].get_parameter("bias").add_(1)
+    changed_BPD, changed_BPL = (
+        encoder(photo_B3HW)[1] != before_BPD,
+        classifier(torch.ones(1, 2, 8)) != before_BPL,
+    )
+    assert changed_BPD.any(2).tolist() == [[False, True]]
+    assert changed_BPL.any(2).tolist() == [[True, False]]
+
+
+def test_bytes_are_normalised_by_imagenets_mean_and_deviation() -> None:
+    encoder = FeatureEncoder(TINY).eval()
+    seen: list[Tensor] = []
+    encoder.backbone.register_forward_pre_hook(lambda module, given: seen.append(given[0]))
+    encoder(
+        torch.tensor([0, 128, 255], dtype=torch.uint8)[None, :, None, None].expand(1, 3, 64, 64)
+    )
+    expected = [(0 - 0.485) / 0.229, (128 / 255 - 0.456) / 0.224, (1 - 0.406) / 0.225]
+    assert seen[0][0, :, 5, 7].tolist() == pytest.approx(expected, rel=1e-5)
+    assert not {"mean_31", "std_31"} & set(encoder.state_dict())
+
+
+@pytest.mark.parametrize("divisor", ["box", "ring"])
+def test_the_ring_divisor_is_a_setting_of_the_encoder(divisor: Literal["box", "ring"]) -> None:
+    torch.manual_seed(0)
+    encoder = FeatureEncoder(PVDAConfig(**{**vars(TINY), "ring_divisor": divisor})).eval()
+    seen: list[Tensor] = []
+    encoder.refine[1].register_forward_pre_hook(lambda module, given: seen.append(given[0]))
+    maps_BCHW, _ = encoder(images(1, 3, 64, 64))
+    outer_BC = (maps_BCHW.sum((2, 3)) - maps_BCHW[:, :, 1:3, 1:3].sum((2, 3))) / {
+        "box": 16,
+        "ring": 12,
+    }[divisor]
+    torch.testing.assert_close(seen[0], outer_BC)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        (
+            {"image_size": 112},
+            "image_size is 112, expected at least 128 pixels for 4 parts; use larger",
+        ),
+        ({"image_size": 48, "parts": 1}, "image_size is 48, expected at least 64"),
+        (
+            {"depth": 18, "width": 0.2},
+            "width is 0.2, .* ResNet-18 13 channels; expected at least 16 .* use a larger width",
+        ),
+        ({"depth": 20}, "depth is 20, expected one of 18, 34, 50, 101"),
+    ],
+)
+def test_sizes_that_cannot_be_built_are_refused_with_the_remedy(
+    wrong: dict[str, int], sentence: str
+) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        PVDAConfig(**wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 4])
+def test_the_smallest_images_that_a_config_allows_pass_through_all_networks(parts: int) -> None:
+    least = {1: 64, 2: 64, 3: 96, 4: 128}[parts]
+    config = PVDAConfig(**{**vars(TINY), "parts": parts, "image_size": least})
+    encoder, classifier, discriminator = (module.eval() for module in on_meta(config))
+    maps_BCHW, g_BPD = encoder(torch.empty(2, 3, least, least, dtype=torch.uint8, device="meta"))
+    assert discriminator(maps_BCHW).shape == (2, 2)
+    assert classifier(g_BPD).shape == (2, parts, 701)
+
+
+@pytest.mark.parametrize(("parts", "part_dim"), [(4, 512), (1, 8), (3, 7)])
+def test_an_embedding_has_length_one_and_each_part_one_over_the_root_of_their_number(
+    parts: int, part_dim: int
+) -> None:
+    g_BPD = 100 * torch.randn(5, parts, part_dim, generator=torch.Generator().manual_seed(0))
+    found_BE = unit_embedding(g_BPD)
+    assert found_BE.shape == (5, parts * part_dim)
+    torch.testing.assert_close(found_BE.norm(dim=1), torch.ones(5))
+    lengths_BP = found_BE.view(5, parts, part_dim).norm(dim=2)
+    torch.testing.assert_close(lengths_BP, torch.full((5, parts), parts**-0.5))
+
+
+def test_a_unit_embedding_worked_by_hand() -> None:
+    g_BPD = torch.tensor([[[3.0, 4.0], [0.0, 0.5]]])
+    assert unit_embedding(g_BPD)[0].tolist() == pytest.approx(
+        [0.6 / 2**0.5, 0.8 / 2**0.5, 0, 1 / 2**0.5]
+    )
+
+
+def test_an_image_and_its_mirror_image_have_one_embedding_unless_it_is_asked_otherwise() -> None:
+    torch.manual_seed(0)
+    encoder = FeatureEncoder(TINY).eval()
+    photos_B3HW = images(3, 3, 64, 64)
+    assert torch.equal(embed(encoder, photos_B3HW), embed(encoder, photos_B3HW.flip(3)))
+    assert not torch.allclose(
+        embed(encoder, photos_B3HW, mirror=False), embed(encoder, photos_B3HW.flip(3), mirror=False)
+    )
+
+
+def test_the_mirror_images_vector_is_added_before_the_parts_are_normalised() -> None:
+    torch.manual_seed(0)
+    encoder = FeatureEncoder(TINY).eval()
+    photos_B3HW = images(2, 3, 64, 64)
+    with torch.no_grad():
+        together_BPD = encoder(photos_B3HW)[1] + encoder(photos_B3HW.flip(3))[1]
+    found_BE = embed(encoder, photos_B3HW)
+    torch.testing.assert_close(found_BE, unit_embedding(together_BPD))
+    assert found_BE.dtype == torch.float32
+    torch.testing.assert_close(found_BE.norm(dim=1), torch.ones(2))

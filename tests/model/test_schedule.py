@@ -1,0 +1,109 @@
+"""Alpha and the learning rates at the epochs that the paper names, and the shapes that it does not
+have.
+"""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from model.schedule import Phase, Schedule, phase
+
+PAPER = Schedule()
+
+
+@pytest.mark.parametrize(
+    ("epoch", "alpha"),
+    [(0, 0.9), (139, 0.9), (140, 1.0), (279, 1.0), (280, 1.1), (419, 1.1), (420, 1.2), (559, 1.2)],
+)
+def test_alpha_starts_at_nine_tenths_and_grows_by_a_tenth_every_140_epochs(
+    epoch: int, alpha: float
+) -> None:
+    assert phase(PAPER, epoch).alpha == alpha
+
+
+@pytest.mark.parametrize("start", [0, 140, 280, 420])
+def test_the_rates_fall_to_four_fifths_after_60_and_120_epochs_of_each_period_and_start_anew_with_the_next(
+    start: int,
+) -> None:
+    scales = [phase(PAPER, start + within).rate_scale for within in (0, 59, 60, 119, 120, 139)]
+    assert scales == pytest.approx([1, 1, 0.8, 0.8, 0.64, 0.64])
+
+
+def test_the_schedule_ends_with_the_fourth_alpha() -> None:
+    assert PAPER.epochs == 560
+
+
+def test_without_restarts_the_rates_only_fall_at_140_280_and_420_while_alpha_grows() -> None:
+    ablation = Schedule(restart=False, decay_epochs=(140, 280, 420))
+    found = [phase(ablation, epoch) for epoch in (0, 139, 140, 279, 280, 419, 420, 559)]
+    assert [now.rate_scale for now in found] == pytest.approx(
+        [1, 1, 0.8, 0.8, 0.64, 0.64, 0.512, 0.512]
+    )
+    assert [now.alpha for now in found] == [0.9, 0.9, 1.0, 1.0, 1.1, 1.1, 1.2, 1.2]
+
+
+def test_a_constant_alpha_keeps_the_restarts() -> None:
+    ablation = Schedule(alpha_step=0.0)
+    assert [phase(ablation, epoch) for epoch in (0, 60, 140, 200, 420)] == [
+        Phase(alpha=0.9, rate_scale=scale) for scale in (1.0, 0.8, 1.0, 0.8, 1.0)
+    ]
+
+
+def test_the_control_without_an_adversary_has_the_rates_of_the_paper() -> None:
+    control = Schedule(alpha=0.0, alpha_step=0.0)
+    for epoch in range(0, 560, 7):
+        assert phase(control, epoch) == Phase(alpha=0.0, rate_scale=phase(PAPER, epoch).rate_scale)
+
+
+def test_steps_within_an_epoch_change_nothing_on_the_papers_schedule() -> None:
+    assert phase(PAPER, 59.99) == phase(PAPER, 59)
+    assert phase(PAPER, 139.99) == phase(PAPER, 139)
+
+
+def test_a_cosine_falls_from_one_over_a_half_to_zero() -> None:
+    cosine = Schedule(epochs=80, shape="cosine")
+    scales = [phase(cosine, epoch).rate_scale for epoch in (0, 20, 40, 60, 80)]
+    assert scales == pytest.approx([1, (1 + 0.5**0.5) / 2, 0.5, (1 - 0.5**0.5) / 2, 0])
+
+
+def test_warm_up_grows_from_zero_by_steps_and_then_leaves_the_shape_as_it_is() -> None:
+    warm, cold = Schedule(warmup_epochs=4), Schedule()
+    assert [phase(warm, epoch).rate_scale for epoch in (0, 1, 2.5, 4, 60)] == pytest.approx(
+        [0, 0.25, 0.625, 1, 0.8]
+    )
+    cosine = Schedule(epochs=80, shape="cosine", warmup_epochs=4)
+    assert phase(cosine, 2).rate_scale == pytest.approx(
+        phase(Schedule(epochs=80, shape="cosine"), 2).rate_scale / 2
+    )
+    assert phase(warm, 100) == phase(cold, 100)
+
+
+@settings(max_examples=50)
+@given(
+    schedule=st.builds(
+        Schedule,
+        epochs=st.integers(1, 600),
+        period=st.integers(1, 200),
+        alpha=st.floats(0, 2),
+        alpha_step=st.floats(0, 1),
+        shape=st.sampled_from(["step", "cosine"]),
+        restart=st.booleans(),
+        warmup_epochs=st.floats(0, 10),
+    ),
+    share=st.floats(0, 1),
+)
+def test_the_rates_never_leave_zero_to_one_and_alpha_never_falls(
+    schedule: Schedule, share: float
+) -> None:
+    now, later = phase(schedule, share * schedule.epochs), phase(schedule, schedule.epochs)
+    assert 0 <= now.rate_scale <= 1
+    assert now.alpha <= later.alpha
+    assert now == phase(schedule, share * schedule.epochs)
+
+
+@pytest.mark.parametrize("wrong", [{"epochs": 0}, {"period": 0}, {"alpha": -0.1}])
+def test_settings_without_a_meaning_are_refused_with_the_value_found(
+    wrong: dict[str, float],
+) -> None:
+    with pytest.raises(ValueError, match=str(next(iter(wrong.values()))).replace(".", r"\.")):
+        Schedule(**wrong)  # type: ignore[arg-type]

@@ -1,0 +1,392 @@
+"""The two-step update on networks of a few thousand weights: who moves when, along which gradient,
+and how it goes on.
+
+Shapes: B images of a view, C channels of the maps, H x W pixels or cells, L locations.
+"""
+
+import copy
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.optim import SGD, Adam, AdamW
+
+from model.checkpoint import Checkpoint, dumps, loads
+from model.losses import location_loss
+from model.pvda import PVDAConfig
+from model.schedule import Phase
+from model.training import Learner, Optimisation, Training
+
+TINY = PVDAConfig(
+    depth=18, width=0.25, image_size=64, parts=2, part_dim=8, dropout=0.0, discriminator_channels=8
+)
+LOCATIONS = 5
+NOW = Phase(alpha=0.9, rate_scale=1.0)
+
+
+def make(
+    config: PVDAConfig = TINY, optimisation: Optimisation | None = None, adversary: bool = True
+) -> Training:
+    torch.manual_seed(0)
+    training = Training(config, optimisation or Optimisation(), LOCATIONS, adversary=adversary)
+    torch.manual_seed(1)  # as the training loop does: dropout does not depend on what was built
+    return training
+
+
+def batch(
+    seed: int = 0, drones: int = 3, satellites: int = 3
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """UAV images and their locations, satellite images and theirs."""
+    source = torch.Generator().manual_seed(seed)
+    drone, satellite = (
+        torch.randint(low, low + 150, (count, 3, 64, 64), dtype=torch.uint8, generator=source)
+        for count, low in ((drones, 0), (satellites, 100))
+    )
+    location1_B, location2_B = (
+        torch.randint(0, LOCATIONS, (n,), generator=source) for n in (drones, satellites)
+    )
+    return drone, location1_B, satellite, location2_B
+
+
+def weights(training: Training) -> dict[str, dict[str, Tensor]]:
+    """Parameters of each network, as they are now."""
+    return {
+        network: {name: parameter.detach().clone() for name, parameter in module.named_parameters()}
+        for network, module in training.modules.items()
+    }
+
+
+def changed(before: dict[str, dict[str, Tensor]], after: dict[str, dict[str, Tensor]]) -> set[str]:
+    """The networks of which any weight differs."""
+    return {
+        network
+        for network, held in before.items()
+        if any(not torch.equal(held[n], after[network][n]) for n in held)
+    }
+
+
+def assert_same(one: Any, other: Any) -> None:
+    """Two nested states are equal to the last bit."""
+    assert type(one) is type(other)
+    if isinstance(one, Tensor):
+        assert torch.equal(one, other)
+    elif isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for name in one:
+            assert_same(one[name], other[name])
+    elif isinstance(one, list):
+        for mine, its in zip(one, other, strict=True):
+            assert_same(mine, its)
+    else:
+        assert one == other
+
+
+def watched_step(training: Training) -> list[dict[str, dict[str, Tensor]]]:
+    """One iteration; the weights before it, and after each optimiser's step in the order in which
+    they came.
+    """
+    seen = [weights(training)]
+    for optimiser in training.optimisers:
+        optimiser.register_step_post_hook(lambda *_: seen.append(weights(training)))
+    training.step(*batch(), NOW)
+    return seen
+
+
+def test_the_first_step_moves_the_discriminator_alone_and_the_second_all_but_the_discriminator() -> (
+    None
+):
+    before, between, after = watched_step(make())
+    assert changed(before, between) == {"discriminator"}
+    assert changed(between, after) == {"encoder", "classifier"}
+
+
+def test_the_discriminator_can_be_trained_again_after_the_step_that_holds_it() -> None:
+    training = make()
+    training.step(*batch(), NOW)
+    assert training.discriminator is not None
+    assert all(parameter.requires_grad for parameter in training.discriminator.parameters())
+    held = weights(training)
+    training.step(*batch(1), NOW)
+    assert changed(held, weights(training)) == {"encoder", "classifier", "discriminator"}
+
+
+def reference(learner: Learner, discriminator: nn.Module, alpha: float) -> dict[str, Tensor]:
+    """Gradients of Eq. 4 by autograd, with nothing of the training's own code but the networks and
+    Eq. 1.
+    """
+    images1_B3HW, location1_B, images2_B3HW, location2_B = batch()
+    maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = learner(images1_B3HW, images2_B3HW)
+    verdict_B2 = discriminator(torch.cat([maps1_BCHW, maps2_BCHW]))
+    swapped = F.cross_entropy(verdict_B2[:3], torch.ones(3, dtype=torch.long)) + F.cross_entropy(
+        verdict_B2[3:], torch.zeros(3, dtype=torch.long)
+    )
+    total = location_loss(logits1_BPL, location1_B, logits2_BPL, location2_B) + alpha * swapped
+    names, parameters = zip(*learner.named_parameters(), strict=True)
+    return dict(zip(names, torch.autograd.grad(total, parameters), strict=True))
+
+
+def test_the_gradient_of_encoder_and_classifier_is_that_of_equation_4_against_the_discriminator_just_trained() -> (
+    None
+):
+    training = make()
+    learner = copy.deepcopy(training.learner)
+    training.step(*batch(), NOW)
+    assert training.discriminator is not None
+    by_hand = reference(learner, training.discriminator, NOW.alpha)
+    for name, parameter in training.learner.named_parameters():
+        assert parameter.grad is not None
+        torch.testing.assert_close(parameter.grad, by_hand[name], rtol=1e-4, atol=1e-6)
+
+
+def test_no_gradient_reaches_the_discriminator_from_the_second_step() -> None:
+    training = make()
+    seen: list[dict[str, Tensor]] = []
+
+    def gradients(*_: object) -> None:
+        assert training.discriminator is not None
+        seen.append(
+            {
+                n: p.grad.clone()
+                for n, p in training.discriminator.named_parameters()
+                if p.grad is not None
+            }
+        )
+
+    for optimiser in training.optimisers:
+        optimiser.register_step_post_hook(gradients)
+    training.step(*batch(), NOW)
+    assert seen[0]
+    assert_same(seen[0], seen[1])
+
+
+def test_the_encoder_is_pushed_by_swapped_labels_and_not_by_a_reversed_gradient() -> None:
+    adversary, plain = (reference(make().learner, _discriminator(), alpha) for alpha in (1.0, 0.0))
+    training = make()
+    maps1_BCHW, maps2_BCHW, *_ = training.learner(batch()[0], batch()[2])
+    verdict_B2 = _discriminator()(torch.cat([maps1_BCHW, maps2_BCHW]))
+    straight = F.cross_entropy(verdict_B2, torch.tensor([0, 0, 0, 1, 1, 1])) * 2
+    first = training.learner.encoder.backbone.conv1.weight
+    [reversed_gradient] = torch.autograd.grad(-straight, first)
+    swapped_gradient = (
+        adversary["encoder.backbone.conv1.weight"] - plain["encoder.backbone.conv1.weight"]
+    )
+    assert not torch.allclose(swapped_gradient, reversed_gradient, rtol=0.05, atol=1e-5)
+
+
+def _discriminator() -> nn.Module:
+    """Of a training just made, its verdicts made surer so that swapping and reversing differ."""
+    discriminator = make().discriminator
+    assert discriminator is not None
+    with torch.no_grad():
+        discriminator.verdict.weight *= 20
+    return discriminator
+
+
+def test_the_discriminator_sees_both_views_in_one_batch_in_training_mode_twice_an_iteration() -> (
+    None
+):
+    training = make()
+    assert training.discriminator is not None
+    seen: list[tuple[int, bool, bool]] = []
+    training.discriminator.register_forward_pre_hook(
+        lambda module, given: seen.append((len(given[0]), module.training, given[0].requires_grad))
+    )
+    training.step(*batch(), NOW)
+    assert seen == [
+        (6, True, False),
+        (6, True, True),
+    ]  # detached from the encoder first, attached to it second
+
+
+def test_the_encoder_runs_once_on_each_view_alone() -> None:
+    training = make()
+    seen: list[int] = []
+    training.learner.encoder.register_forward_pre_hook(
+        lambda module, given: seen.append(len(given[0]))
+    )
+    training.step(*batch(), NOW)
+    assert seen == [3, 3]
+
+
+@pytest.mark.parametrize(("drones", "satellites"), [(2, 6), (5, 2)])
+def test_views_may_come_in_batches_of_different_sizes(drones: int, satellites: int) -> None:
+    losses = make().step(*batch(0, drones, satellites), NOW)
+    assert all(bool(torch.isfinite(loss)) for loss in losses.values())
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.5])
+def test_with_alpha_zero_encoder_and_classifier_become_what_they_are_without_an_adversary(
+    dropout: float,
+) -> None:
+    config = replace(TINY, dropout=dropout)
+    learned = []
+    for adversary in (True, False):
+        training = make(config, adversary=adversary)
+        for seed in range(3):
+            training.step(*batch(seed), Phase(alpha=0.0, rate_scale=1.0))
+        learned.append(training.learner.state_dict())
+    assert learned[0].keys() == learned[1].keys()
+    for name, tensor in learned[0].items():
+        torch.testing.assert_close(tensor, learned[1][name], rtol=1e-5, atol=1e-7)
+
+
+def test_without_an_adversary_there_is_no_discriminator() -> None:
+    plain = make(adversary=False)
+    assert {name.split("/")[0] for name in plain.step(*batch(), NOW)} == {
+        "location_loss",
+        "gradient_norm",
+    }
+    assert plain.discriminator is None
+    assert len(plain.optimisers) == 1
+    assert set(plain.modules) == {"encoder", "classifier"}
+
+
+def test_alpha_moves_the_encoder_and_leaves_the_classifiers_first_step_alone() -> None:
+    gentle, strong = make(), make()
+    gentle.step(*batch(), Phase(alpha=0.0, rate_scale=1.0))
+    strong.step(*batch(), Phase(alpha=1.0, rate_scale=1.0))
+    assert changed(weights(gentle), weights(strong)) == {"encoder"}
+
+
+def test_each_group_moves_at_its_own_rate_scaled_by_the_schedule() -> None:
+    training = make()
+    training.step(*batch(), Phase(alpha=0.9, rate_scale=0.8))
+    assert training.rates == pytest.approx(
+        {"backbone": 0.0008, "head": 0.008, "classifier": 0.008, "discriminator": 0.0016}
+    )
+    assert {len(g["params"]) for g in training.optimisers[0].param_groups} == {60, 2 * 4, 2 * 2}
+
+
+def test_the_optimisers_are_those_of_the_paper_unless_a_short_run_asks_for_adamw() -> None:
+    of_encoder, of_discriminator = make().optimisers
+    assert type(of_encoder) is SGD
+    assert type(of_discriminator) is Adam
+    for group in of_encoder.param_groups:
+        assert (group["momentum"], group["nesterov"], group["weight_decay"]) == (0.9, True, 5e-4)
+    [group] = of_discriminator.param_groups
+    assert (group["betas"], group["weight_decay"]) == ((0.9, 0.999), 0)
+    assert type(make(optimisation=Optimisation(kind="adamw")).optimisers[0]) is AdamW
+
+
+def test_a_step_tells_its_losses_and_how_often_the_discriminator_was_right() -> None:
+    training = make()
+    measures = training.step(*batch(), NOW)
+    whole = {"location_loss", "view_loss", "adversarial_loss", "discriminator_accuracy"}
+    assert {name for name in measures if "/" not in name} == whole
+    assert not any(measure.requires_grad for measure in measures.values())
+    held = Optimisation(backbone_rate=0, head_rate=0, classifier_rate=0, discriminator_rate=0.01)
+    training = make(optimisation=held)
+    for _ in range(30):  # the same maps again and again, which D learns by heart
+        measures = training.step(*batch(), NOW)
+    for name in (
+        "discriminator_accuracy",
+        "discriminator_accuracy/drone",
+        "discriminator_accuracy/satellite",
+    ):
+        assert float(measures[name]) == 1.0
+
+
+def test_the_losses_of_views_and_rings_add_up_to_the_whole() -> None:
+    measures = {name: float(value) for name, value in make().step(*batch(0, 2, 4), NOW).items()}
+    for name in ("location_loss", "view_loss", "adversarial_loss"):
+        assert measures[f"{name}/drone"] + measures[f"{name}/satellite"] == pytest.approx(
+            measures[name]
+        )
+    for view in ("drone", "satellite"):
+        rings = [measures[f"location_loss/{view}/ring{ring}"] for ring in (1, 2)]
+        assert sum(rings) == pytest.approx(measures[f"location_loss/{view}"])
+    right = [measures[f"discriminator_accuracy/{view}"] for view in ("drone", "satellite")]
+    assert measures["discriminator_accuracy"] == pytest.approx((2 * right[0] + 4 * right[1]) / 6)
+
+
+def test_the_length_of_each_networks_gradient_is_told() -> None:
+    training = make()
+    measures = training.step(*batch(), NOW)
+    for name, module in training.modules.items():
+        gradients = [
+            parameter.grad for parameter in module.parameters() if parameter.grad is not None
+        ]
+        length = torch.cat([gradient.flatten() for gradient in gradients]).norm()
+        torch.testing.assert_close(measures[f"gradient_norm/{name}"], length, rtol=1e-3, atol=0.0)
+
+
+def test_in_bfloat16_weights_and_losses_stay_float32_and_the_step_is_nearly_the_same() -> None:
+    torch.manual_seed(0)
+    half = Training(TINY, Optimisation(), LOCATIONS, precision="bfloat16")
+    whole = make()
+    rough, exact = half.step(*batch(), NOW), whole.step(*batch(), NOW)
+    assert {measure.dtype for measure in rough.values()} == {torch.float32}
+    assert {parameter.dtype for parameter in half.learner.parameters()} == {torch.float32}
+    assert float(rough["location_loss"]) == pytest.approx(float(exact["location_loss"]), rel=0.05)
+    assert rough["location_loss"] != exact["location_loss"]
+    assert not Training(TINY, Optimisation(), LOCATIONS, precision="auto").bfloat16  # on a CPU
+
+
+def test_networks_that_cannot_be_compiled_are_as_they_were_and_the_reason_is_told(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def broken(self: nn.Module) -> None:
+        def fail(*_: Tensor) -> None:
+            self.encoder.backbone.bn1.running_mean.add_(1)  # type: ignore[union-attr, operator]
+            raise RuntimeError("no C++ compiler\nand a long story")
+
+        self._compiled_call_impl = fail
+
+    monkeypatch.setattr(nn.Module, "compile", broken)
+    torch.manual_seed(0)
+    uncompiled = Training(TINY, Optimisation(), LOCATIONS, compile_for=3)
+    assert uncompiled.not_compiled == "RuntimeError: no C++ compiler"
+    plain = make()
+    assert plain.not_compiled is None
+    torch.manual_seed(1)
+    uncompiled.step(*batch(), NOW)
+    plain.step(*batch(), NOW)
+    assert_same(uncompiled.state(), plain.state())
+
+
+def test_the_location_loss_falls_when_the_same_images_come_again_and_again() -> None:
+    training = make()
+    first, *_, last = [float(training.step(*batch(), NOW)["location_loss"]) for _ in range(30)]
+    assert last < first / 2
+
+
+@pytest.mark.parametrize("kind", ["sgd", "adamw"])
+def test_a_run_saved_and_loaded_goes_on_to_the_last_bit(kind: Any) -> None:
+    config, optimisation = replace(TINY, dropout=0.5), Optimisation(kind=kind)
+    whole = make(config, optimisation)
+    for seed in range(2):
+        whole.step(*batch(seed), NOW)
+    held = Checkpoint(
+        network=config, recipe={}, locations=[], epoch=1, history=[], state=whole.state()
+    )
+    data = dumps(held)
+    for seed in range(2, 4):
+        whole.step(*batch(seed), NOW)
+
+    torch.manual_seed(99)
+    resumed = Training(config, optimisation, LOCATIONS)
+    resumed.load_state(loads(data).state)
+    for seed in range(2, 4):
+        resumed.step(*batch(seed), NOW)
+    assert_same(resumed.state(), whole.state())
+
+
+def test_a_run_of_one_adversary_does_not_take_the_state_of_none() -> None:
+    with pytest.raises(KeyError, match="discriminator"):
+        make().load_state(make(adversary=False).state())
+
+
+def test_joint_batchnorm_is_the_encoder_on_both_views_at_once() -> None:
+    torch.manual_seed(0)
+    learner = Learner(TINY, 3, joint_bn=True)
+    images_B3HW = torch.randint(0, 256, (5, 3, 64, 64), dtype=torch.uint8)
+    maps1, maps2, logits1, logits2 = learner(images_B3HW[:2], images_B3HW[2:])
+    maps_BCHW, g_BPD = learner.encoder(images_B3HW)
+    assert torch.equal(torch.cat([maps1, maps2]), maps_BCHW)
+    assert torch.allclose(torch.cat([logits1, logits2]), learner.classifier(g_BPD))
+    apart = Learner(TINY, 3)
+    apart.load_state_dict(learner.state_dict())
+    assert not torch.allclose(apart(images_B3HW[:2], images_B3HW[2:])[0], maps1, atol=1e-3)

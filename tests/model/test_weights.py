@@ -1,0 +1,162 @@
+"""torchvision's weights load by name; what does not fit is listed."""
+
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+from torch import Tensor
+
+from model.backbones.resnet import BLOCKS, Depth, ResNet
+from model.checkpoint import CheckpointError
+from model.weights.load import load_backbone, measure_backbone, read_state_dict
+
+
+def tiny(seed: int) -> ResNet:
+    torch.manual_seed(seed)
+    return ResNet(18, 0.25)
+
+
+def foreign() -> dict[str, Tensor]:
+    """As torchvision would save a network of this size."""
+    return tiny(1).state_dict() | {"fc.weight": torch.ones(1000, 128), "fc.bias": torch.ones(1000)}
+
+
+@pytest.mark.parametrize("name", ["resnet.pth", "resnet.safetensors"])
+def test_a_state_dict_with_torchvisions_names_loads_and_its_classifier_is_left_out(
+    tmp_path: Path, name: str
+) -> None:
+    path = str(tmp_path / name)
+    if name.endswith(".safetensors"):
+        safetensors.torch.save_file(foreign(), path)
+    else:
+        torch.save(foreign(), path)
+    backbone, expected = tiny(0), foreign()
+    load_backbone(backbone, read_state_dict(path), path)
+    for key, tensor in backbone.state_dict().items():
+        assert torch.equal(tensor, expected[key])
+
+
+def test_files_from_before_batch_norm_counted_its_batches_load_too() -> None:
+    old = {
+        name: tensor
+        for name, tensor in foreign().items()
+        if not name.endswith("num_batches_tracked")
+    }
+    backbone = tiny(0)
+    load_backbone(backbone, old, "old.pth")
+    assert torch.equal(backbone.conv1.weight, foreign()["conv1.weight"])
+
+
+def test_all_that_is_missing_unexpected_or_of_another_shape_is_listed_and_nothing_is_loaded() -> (
+    None
+):
+    state = foreign() | {
+        "conv1.weight": torch.ones(16, 3, 3, 3),
+        "module.bn1.weight": torch.ones(16),
+    }
+    del state["bn1.bias"]
+    backbone = tiny(0)
+    with pytest.raises(CheckpointError) as caught:
+        load_backbone(backbone, state, "strange.pth")
+    message = str(caught.value)
+    assert message.startswith("strange.pth does not fit this backbone: ")
+    for fault in (
+        "bn1.bias is missing",
+        "module.bn1.weight is unexpected",
+        "conv1.weight is (16, 3, 3, 3) and not (16, 3, 7, 7)",
+    ):
+        assert fault in message
+    assert "fc." not in message
+    untouched = tiny(0).state_dict()
+    for key, tensor in backbone.state_dict().items():
+        assert torch.equal(tensor, untouched[key])
+
+
+def test_an_absent_file_is_refused_with_the_way_to_make_one(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"no weights at .*none\.pth; expected .*torchvision"):
+        read_state_dict(str(tmp_path / "none.pth"))
+
+
+@pytest.mark.parametrize("name", ["broken.pth", "broken.safetensors"])
+def test_a_damaged_file_is_refused_by_name(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"not weights at all")
+    with pytest.raises(
+        CheckpointError, match=rf"{name} is no state dict \(.*expected \.pth or \.safetensors"
+    ):
+        read_state_dict(str(tmp_path / name))
+
+
+@pytest.mark.parametrize(
+    "value", [[1, 2], torch.ones(3), {"state_dict": {"conv1.weight": torch.ones(1)}, "epoch": 3}]
+)
+def test_a_file_that_holds_something_else_is_refused_with_the_remedy(
+    tmp_path: Path, value: object
+) -> None:
+    torch.save(value, tmp_path / "else.pth")
+    with pytest.raises(
+        CheckpointError, match=r"else\.pth holds something else than tensors by name.*save model"
+    ):
+        read_state_dict(str(tmp_path / "else.pth"))
+
+
+def test_a_folder_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(
+        CheckpointError, match=r"is no state dict \(.*directory.*expected \.pth or \.safetensors"
+    ):
+        read_state_dict(str(tmp_path))
+
+
+def published(depth: Depth) -> dict[str, Tensor]:
+    """Names and shapes of torchvision's ResNet of that depth, without memory."""
+    with torch.device("meta"):
+        fc = {
+            "fc.weight": torch.empty(1000, 512 if depth < 50 else 2048),
+            "fc.bias": torch.empty(1000),
+        }
+        return ResNet(depth).state_dict() | fc
+
+
+@pytest.mark.parametrize(("depth", "tensors"), [(18, 122), (34, 218), (50, 320), (101, 626)])
+def test_a_state_dict_of_each_depth_loads_and_tells_its_depth(depth: Depth, tensors: int) -> None:
+    state = published(depth)
+    assert len(state) == tensors  # as torchvision's have them, the classifier's two included
+    assert measure_backbone(state, "resnet.pth") == (depth, 1.0)
+    with torch.device("meta"):
+        backbone = ResNet(depth)
+    load_backbone(backbone, state, "resnet.pth")
+
+
+@pytest.mark.parametrize("depth", BLOCKS)
+@pytest.mark.parametrize("other", BLOCKS)
+def test_a_state_dict_of_another_depth_is_refused(depth: Depth, other: Depth) -> None:
+    with torch.device("meta"):
+        backbone = ResNet(depth)
+    if depth == other:
+        load_backbone(backbone, published(other), "resnet.pth")
+        return
+    with pytest.raises(
+        CheckpointError,
+        match=r"does not fit this backbone: .*layer.*; choose the depth that it was made",
+    ):
+        load_backbone(backbone, published(other), "resnet.pth")
+
+
+def test_the_width_is_told_too_and_what_is_no_resnet_of_ours_is_refused_by_what_it_has() -> None:
+    assert measure_backbone(foreign(), "thin.pth") == (18, 0.25)
+    resnet152 = published(101) | {
+        f"layer2.{block}.conv3.weight": torch.ones(1) for block in range(4, 8)
+    }
+    with pytest.raises(
+        CheckpointError,
+        match=r"deep\.pth is of no ResNet that we build: .* 3, 8, 23, 3 bottleneck blocks",
+    ):
+        measure_backbone(resnet152, "deep.pth")
+    with pytest.raises(
+        CheckpointError, match=r"conv1\.weight is missing, .*names begin with module\.conv1\.weight"
+    ):
+        measure_backbone(
+            {f"module.{key}": tensor for key, tensor in foreign().items()}, "wrapped.pth"
+        )
+    with pytest.raises(CheckpointError, match="begin with nothing"):
+        measure_backbone({}, "empty.pth")

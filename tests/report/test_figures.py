@@ -1,0 +1,72 @@
+"""Figures for a paper: every one that there is data for, embedded fonts, the same bytes each time."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+from pipeline.report.figures import write_figures
+from tests.report.test_error_map import A, B, query
+from tests.report.test_page import TOWN, jpeg
+from tests.report.test_sections import full, merged
+
+VIEWS = tuple(
+    {"task": "drone->satellite", "views": n, "r1": 0.5, "r1_low": 0.25, "r1_high": 0.75}
+    for n in (1, 2)
+)
+NAMES = {
+    "recall",
+    "scores",
+    "views",
+    "parts",
+    "groups-altitude_m",
+    "view-gap-drone-satellite",
+    "map-drone-satellite",
+    "retrieval-drone-satellite",
+    "multi-query-drone-satellite",
+}
+
+
+FOUND = full(TOWN, [merged(row["location"], 1) for row in TOWN])
+
+
+def test_every_figure_is_written_in_both_formats_with_embedded_fonts_and_no_date(
+    tmp_path: Path,
+) -> None:
+    placed = {
+        name: query("a", A, "b", B)[name]
+        for name in ("lat", "lon", "answer_lat", "answer_lon", "distance_m")
+    }
+    found = full(
+        [row | placed for row in TOWN[:3]], [merged(row["location"], 1) for row in TOWN[:3]]
+    )
+    picture = jpeg("olive")
+    names = write_figures(
+        replace(found, views=VIEWS),
+        lambda keys: dict.fromkeys(keys, picture),
+        str(tmp_path),
+        ("png", "pdf"),
+    )
+    assert set(names) == NAMES
+    assert {path.name for path in tmp_path.iterdir()} == {
+        f"{name}.{kind}" for name in NAMES for kind in ("png", "pdf")
+    }
+    data = (tmp_path / "recall.pdf").read_bytes()
+    assert b"/CIDFontType2" in data  # TrueType, embedded
+    assert b"/Type3" not in data
+    assert not re.search(rb"/(Creation|Mod)Date", data)
+
+
+def test_the_same_evaluation_gives_the_same_bytes_whatever_formats_are_asked_for(
+    tmp_path: Path,
+) -> None:
+    """Without pictures there are none of hits and misses."""
+    names = write_figures(FOUND, lambda keys: {}, str(tmp_path / "both"), ("png", "pdf"))
+    assert names == ["recall", "scores", "parts", "groups-altitude_m", "view-gap-drone-satellite"]
+    assert write_figures(FOUND, lambda keys: {}, str(tmp_path / "one"), ("pdf",)) == names
+    for path in (tmp_path / "one").iterdir():
+        assert (tmp_path / "both" / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+def test_merged_queries_alone_have_a_recall_curve(tmp_path: Path) -> None:
+    alone = replace(FOUND, metrics=FOUND.metrics[1:], groups=(), parts=(), gaps=())
+    assert write_figures(alone, lambda keys: {}, str(tmp_path), ("pdf",)) == ["recall"]

@@ -1,0 +1,287 @@
+"""The report page as text: what it shows, what it chooses, and that hostile names stay names."""
+
+import io
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from PIL import Image
+
+from pipeline.core.errors import InputError
+from pipeline.images.thumbnails import Album, no_pictures, thumbnail
+from pipeline.report import page as report
+from pipeline.report.charts import scores_chart, views_chart
+from pipeline.report.inputs import Extras, Findings, read_training
+from pipeline.report.panels import distance, keys_shown, make_panel, spread, sureness
+from pipeline.report.svg import nice_ticks, recall_chart, training_charts
+from pipeline.retrieval.tasks import RESULTS_SCHEMA
+
+
+def result(
+    location: str, first: int | None, score: float = 0.9, task: str = "drone->satellite"
+) -> dict[str, Any]:
+    """A query whose true match stands at this rank among ten."""
+    tops = [location if rank == first else f"other{rank}" for rank in range(1, 11)]
+    return {
+        "query": f"query-drone-{location}-{score}",
+        "location": location,
+        "task": task,
+        "protocol": "full",
+        "multi_query": False,
+        "matches": 0 if first is None else 1,
+        "first_match_rank": first,
+        "first_match_key": first and f"gallery-{location}",
+        "first_match_score": first and score - 0.01 * first,
+        "ap": 0.0,
+        "top_keys": [f"gallery-{place}" for place in tops],
+        "top_scores": [score - 0.01 * rank for rank in range(1, 11)],
+        "top_locations": tops,
+    }
+
+
+def findings(rows: list[dict[str, Any]], name: str = "out", r1: float = 0.5) -> Findings:
+    metrics = {
+        "task": "drone->satellite",
+        "protocol": "full",
+        "multi_query": False,
+        "queries": len(rows),
+        "gallery": 951,
+        "r1": r1,
+        "r5": 0.75,
+        "r10": 0.8,
+        "r1p": 0.8,
+        "ap": 0.625,
+        "fingerprint": "abcdef0123456789" * 4,
+    }
+    return Findings(
+        name=name, metrics=[metrics], results=pa.Table.from_pylist(rows, RESULTS_SCHEMA)
+    )
+
+
+def jpeg(colour: str, size: tuple[int, int] = (400, 300)) -> bytes:
+    stream = io.BytesIO()
+    Image.new("RGB", size, colour).save(stream, "JPEG")
+    return stream.getvalue()
+
+
+TOWN = [result("0001", 1), result("0002", 3), result("0003", 40), result("0004", None)]
+
+
+def page(rows: list[dict[str, Any]] = TOWN, extras: Extras | None = None) -> str:
+    pictures = {key: jpeg("olive") for key in keys_shown(rows)}
+    return report.render(
+        findings(rows),
+        extras or Extras(title="Town"),
+        lambda keys: {key: pictures[key] for key in keys},
+    )
+
+
+def test_the_page_shows_measures_in_percent_and_chance() -> None:
+    text = page()
+    assert all(
+        figure in text
+        for figure in ("50.00", "75.00", "62.50", "R@11 of 951", f"{100 * 3 / 4 / 951:.2f}")
+    )
+    assert "1 queries have no true match and count as missed" in text
+
+
+def test_the_same_results_give_the_same_page() -> None:
+    assert page() == page()
+
+
+def test_panels_frame_right_and_wrong_and_say_so_in_words() -> None:
+    text = page()
+    assert (
+        len(re.findall(r'class="answer right ', text)) == 3
+    )  # rank 1, rank 3, and the one at rank 40 set apart
+    assert len(re.findall(r'class="answer wrong ', text)) == 4 * 5 - 2
+    assert 'alt="Rank 1, location 0001, a true match"' in text
+    assert "first true match at rank&nbsp;40" in text
+    assert "no true match in the gallery" in text
+
+
+def test_the_best_true_match_is_shown_where_it_is_not_among_the_five() -> None:
+    panel = make_panel(TOWN[2], Album({}))
+    assert panel.truth
+    assert (panel.truth.rank, panel.truth.key, panel.truth.right) == (40, "gallery-0003", True)
+    assert make_panel(TOWN[1], Album({})).truth is None
+
+
+def test_hostile_names_stay_names() -> None:
+    evil = "<script>alert(1)</script>\"'"
+    text = page(
+        [result(evil, 1), result(evil, 2, 0.8)],
+        Extras(title=evil, training=({"epoch": 1, "location_loss": 1.0},)),
+    )
+    assert "<script" not in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+
+
+def test_the_page_needs_nothing_but_itself() -> None:
+    text = page()
+    assert "default-src 'none'" in text
+    assert not re.search(r'(?:src|href)="(?!data:|#)', text)
+    assert "url(" not in text
+    assert "@import" not in text
+
+
+def test_without_pictures_the_page_says_how_to_get_them() -> None:
+    text = report.render(findings(TOWN), Extras(title="Town"), no_pictures)
+    assert "evaluate again with <code>--shards</code>" in text
+    assert "<img" not in text
+
+
+def test_another_evaluation_stands_beside_with_the_difference() -> None:
+    text = page(extras=Extras(title="Town", beside=findings(TOWN, name="untrained", r1=0.125)))
+    assert "12.50" in text
+    assert "+37.50" in text
+    assert "untrained" in text
+
+
+def test_an_evaluation_of_other_images_does_not_stand_beside() -> None:
+    with pytest.raises(
+        InputError, match=r"untrained ranked 3 queries in 951 rows .* this evaluation 4 in 951"
+    ):
+        page(extras=Extras(title="Town", beside=findings(TOWN[:3], name="untrained")))
+
+
+def test_no_hits_and_no_misses_are_said_in_words() -> None:
+    assert "No query has a true match first." in page(TOWN[1:])
+    assert "Every query has a true match first." in page(TOWN[:1])
+
+
+def test_panels_are_spread_over_the_range_and_over_locations() -> None:
+    rows = [result(f"{i % 10:04d}", 1, 0.5 + 0.001 * i) for i in range(100)]
+    chosen = spread(rows, 4, sureness)
+    assert [row["location"] for row in chosen] == ["0009", "0006", "0003", "0000"]
+    assert chosen == spread(rows[::-1], 4, sureness)
+    assert [row["first_match_rank"] for row in spread(TOWN, 3, distance)] == [None, 3, 1]
+    assert len(spread(rows[:2], 4, sureness)) == 2
+    assert len(spread([result("0001", 1, 0.1 * i) for i in range(1, 9)], 4, sureness)) == 4
+
+
+def test_thumbnails_are_small_and_damaged_pictures_are_left_out() -> None:
+    source = thumbnail(jpeg("teal", (900, 450)), 180)
+    assert source
+    assert source.startswith("data:image/webp;base64,")
+    assert len(source) < 4000
+    assert thumbnail(b"damaged", 180) is None
+    assert thumbnail(None, 180) is None
+
+
+def test_training_charts_show_what_the_rows_hold() -> None:
+    rows = [
+        {"epoch": e, "location_loss": 9.0 / e, "alpha": 0.9 if e < 3 else 1.0} for e in range(1, 5)
+    ]
+    loss, alpha = training_charts(rows)
+    assert (loss.title, alpha.title) == ("Location loss", "α")
+    assert len(loss.lines[0].runs[0].split()) == 4
+    assert len(loss.marks) == 1  # alpha grew once
+    assert loss.summary == "Location loss over 4 epochs, from 9 to 2.25"
+
+
+def test_a_loss_that_is_not_a_number_leaves_a_gap() -> None:
+    rows = [{"epoch": e, "view_loss": math.nan if e == 3 else 1.0} for e in range(1, 6)]
+    [chart] = training_charts(rows)
+    assert [len(run.split()) for run in chart.lines[0].runs] == [2, 2]
+    assert training_charts([{"epoch": 1, "view_loss": math.nan}]) == []
+
+
+def test_one_epoch_is_a_dot() -> None:
+    [chart] = training_charts([{"epoch": 1, "alpha": 0.9}])
+    assert len(chart.lines[0].dots) == 1
+    assert all(math.isfinite(tick.at) for tick in (*chart.x_ticks, *chart.y_ticks))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "ticks"),
+    [(0, 1, [0, 0.5, 1]), (0.9, 1.2, [0.9, 1.0, 1.1, 1.2]), (0, 41, [0, 20, 40, 60])],
+)
+def test_ticks_are_round_and_enclose_the_range(low: float, high: float, ticks: list[float]) -> None:
+    assert nice_ticks(low, high) == ticks
+
+
+@pytest.mark.parametrize("value", [0.0, 0.9, -3.0, 1e-12, 1e12])
+def test_ticks_of_a_constant_enclose_it(value: float) -> None:
+    ticks = nice_ticks(value, value)
+    assert ticks[0] < value < ticks[-1]
+
+
+@pytest.mark.parametrize("gallery", [1, 2, 9, 951, 51_355])
+def test_the_recall_curve_spans_the_gallery(gallery: int) -> None:
+    chart = recall_chart("t", "", np.array([1, 2, 0]), gallery, np.array([0, 0, 1]), "other")
+    assert [line.name for line in chart.lines] == ["other", "this network"]
+    assert chart.lines[1].dots[0][2] == "R@1: 33.33 %"
+    assert chart.x_ticks[0].label == "1"
+
+
+def write_lines(run: Path, *lines: str) -> str:
+    (run / "metrics.jsonl").write_text("\n".join(lines))
+    return str(run)
+
+
+def test_training_rows_are_read_by_epoch_and_the_later_of_two_counts(tmp_path: Path) -> None:
+    lines = [
+        json.dumps({"epoch": epoch, "alpha": alpha})
+        for epoch, alpha in ((1, 0.9), (2, 0.9), (2, 1.0), (3, 1.0))
+    ]
+    assert [
+        row["alpha"] for row in read_training(write_lines(tmp_path, *lines, '{"epoch": 4, "al'))
+    ] == [0.9, 1.0, 1.0]
+
+
+def test_training_rows_that_are_none_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"found no metrics.jsonl"):
+        read_training(str(tmp_path))
+    with pytest.raises(InputError, match=r"line 1 of .* expected a JSON object with its epoch"):
+        read_training(write_lines(tmp_path, "[]", '{"epoch": 1}'))
+
+
+SURE = {"r1_low": 0.4, "r1_high": 0.6, "ap_low": 0.5, "ap_high": 0.75}
+CURVE = tuple(
+    {
+        "task": "drone->satellite",
+        "views": n,
+        "queries": 54 // n,
+        "r1": n / 54,
+        "r1_low": n / 60,
+        "r1_high": n / 54,
+    }
+    for n in (1, 6, 54)
+)
+
+
+def test_the_page_shows_intervals_distances_and_what_more_views_bring() -> None:
+    geo = {
+        "geo_queries": 4,
+        "distance_median_m": 12.4,
+        "within_25m": 0.5,
+        "within_50m": 0.75,
+        "within_100m": 1.0,
+    }
+    plain = findings(TOWN)
+    full = Findings(
+        name="out", metrics=[plain.metrics[0] | SURE | geo], results=plain.results, views=CURVE
+    )
+    text = report.render(full, Extras(title="Town"), lambda keys: {})
+    assert "40.0 to 60.0" in text
+    assert "best answer off by 12 m (median); within 25, 50, 100 m: 50.00, 75.00, 100.00" in text
+    assert "R@1 by views a query: 1 views: 1.85 %, 6 views: 11.11 %, 54 views: 100.00 %" in text
+    assert "median score" in text
+    before = report.render(plain, Extras(title="Town"), lambda keys: {})
+    assert "R@1 by views" not in before
+    assert "95 % interval" not in before
+
+
+def test_scores_of_right_and_wrong_answers_are_drawn_apart() -> None:
+    chart = scores_chart("t", TOWN)
+    assert chart
+    assert chart.summary == "t: median score 0.870 of true matches, 0.890 of wrong answers"
+    assert [line.style for line in chart.lines] == ["beside", "main"]
+    assert scores_chart("t", [TOWN[3]]) is None
+    assert views_chart("t", []) is None

@@ -1,0 +1,204 @@
+"""The service's page in a real browser: a photo dropped, chosen or pasted, the answer seen; by
+keyboard, small, in the dark.
+"""
+
+import asyncio
+import base64
+import threading
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from aiohttp import web
+
+from pipeline.service.app import Service
+from pipeline.service.settings import ServiceSettings
+from tests.report.test_browser import ARGUMENTS, CHROMIUM, sync_api
+from tests.service.test_app import TOKEN, Engine
+from tests.service.test_question import photo
+
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"
+)
+DROP = """([name, kind, data]) => {
+    const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
+    const dropped = new DataTransfer();
+    dropped.items.add(new File([bytes], name, { type: kind }));
+    const how = { bubbles: true, cancelable: true };
+    document.querySelector('#drop').dispatchEvent(new DragEvent('drop', { dataTransfer: dropped, ...how }));
+}"""
+PASTE = DROP.replace(
+    "DragEvent('drop', { dataTransfer:", "ClipboardEvent('paste', { clipboardData:"
+)
+
+
+class Served:
+    """A service in a thread of its own."""
+
+    def __init__(self, token: str | None = None) -> None:
+        self._loop = asyncio.new_event_loop()
+        self.engine = Engine()
+        self._runner = Service(ServiceSettings(max_megabytes=1), self.engine, token).runner()
+        self._thread = threading.Thread(target=self._loop.run_forever)
+        self._thread.start()
+        port = asyncio.run_coroutine_threadsafe(self._start(), self._loop).result(10)
+        self.address = f"http://127.0.0.1:{port}/"
+
+    async def _start(self) -> int:
+        await self._runner.setup()
+        site = web.TCPSite(self._runner, "127.0.0.1", 0)
+        await site.start()
+        return site.port
+
+    def stop(self) -> None:
+        asyncio.run_coroutine_threadsafe(self._runner.cleanup(), self._loop).result(10)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with sync_api.sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served]:
+    service = Served()
+    yield service
+    service.stop()
+
+
+@pytest.fixture
+def page(browser: Any, served: Served) -> Iterator[Any]:
+    """The page, and nothing said on its console, nothing asked of anyone else."""
+    opened = browser.new_page()
+    said: list[str] = []
+    asked: list[str] = []
+    opened.on("console", lambda message: said.append(message.text))
+    opened.on("pageerror", lambda error: said.append(str(error)))
+    opened.on("request", lambda request: asked.append(request.url))
+    opened.goto(served.address)
+    yield opened
+    opened.close()
+    assert said == []
+    assert all(url.startswith((served.address, f"blob:{served.address}")) for url in asked), asked
+
+
+def give(
+    page: Any, how: str, data: bytes, name: str = "photo.jpg", kind: str = "image/jpeg"
+) -> None:
+    page.evaluate(how, [name, kind, base64.b64encode(data).decode()])
+
+
+def test_a_photo_dropped_is_answered_with_position_uncertainty_confidence_candidates_and_a_map(
+    page: Any,
+) -> None:
+    give(page, DROP, photo())
+    page.wait_for_selector("#answer:not([hidden])")
+    assert page.inner_text("#position") == "47.000000, 8.000000"
+    assert page.inner_text("#radius") == "± 25 m"
+    assert page.inner_text("#confidence") == "80 %"
+    assert page.inner_text("#say").startswith("Found in")
+    rows = page.locator("#candidates tr")
+    assert rows.count() == 5
+    assert rows.nth(1).inner_text().split() == ["2", "0001", "gallery-1", "0.890", "111", "m"]
+    assert page.locator("#map circle.dot").count() == 5
+    assert page.locator("#map circle.dot.best").count() == 1
+    assert page.evaluate("document.querySelector('#preview').naturalWidth") == 40
+    assert "3 images in the gallery" in page.inner_text("#index")
+
+
+def test_the_map_is_to_scale(page: Any) -> None:
+    """Candidates stand 0.001 degrees of latitude apart, 111.2 m; the rule says how long 100 m or so
+    are.
+    """
+    give(page, DROP, photo())
+    page.wait_for_selector("#answer:not([hidden])")
+    y = sorted(float(dot.get_attribute("cy")) for dot in page.locator("#map circle.dot").all())
+    apart = [below - above for above, below in pairwise(y)]
+    x = [float(page.locator("#map .rule").get_attribute(end)) for end in ("x1", "x2")]
+    rule = float(page.locator("#map text:not(.rank)").first.text_content().split()[0])
+    assert apart == pytest.approx([111.195 * (x[1] - x[0]) / rule] * 4, rel=1e-3)
+
+
+def test_what_is_no_photo_is_told_in_a_sentence_and_the_next_one_is_answered(
+    browser: Any, served: Served
+) -> None:
+    page = browser.new_page()  # Chromium notes each refused request on the console
+    page.goto(served.address)
+    for data, kind, word in (
+        (b"<svg/>", "image/svg+xml", "expected a JPEG"),
+        (bytes(2_000_000), "image/jpeg", "larger than 1 MB"),
+    ):
+        give(page, DROP, data, kind=kind)
+        page.wait_for_function(
+            "word => document.querySelector('#say').textContent.includes(word)", arg=word
+        )
+        assert "error" in page.locator("#say").get_attribute("class")
+        assert not page.is_visible("#answer")
+    give(page, PASTE, photo("PNG"), "photo.png", "image/png")
+    page.wait_for_selector("#answer:not([hidden])")
+    page.close()
+
+
+def test_a_rough_position_and_a_number_of_candidates_go_along_by_keyboard_alone(
+    page: Any, served: Served
+) -> None:
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.id") == "photo"
+    page.set_input_files("#photo", {"name": "a.jpg", "mimeType": "image/jpeg", "buffer": photo()})
+    page.wait_for_selector("#answer:not([hidden])")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    for text in ("47,5", "8.5", "2000", "3"):
+        page.keyboard.press("Tab")
+        page.keyboard.type(text)
+    page.keyboard.press("Enter")
+    page.wait_for_function("() => document.querySelectorAll('#candidates tr').length === 3")
+    question = served.engine.asked[-1][0]
+    assert question.near is not None
+    assert (question.near.lat, question.near.lon, question.near.radius_m, question.top) == (
+        47.5,
+        8.5,
+        2000,
+        3,
+    )
+    assert page.locator("#map circle.near").count() == 1
+
+
+@pytest.mark.parametrize(
+    ("width", "scheme"), [(360, "light"), (768, "dark"), (1280, "light"), (1280, "dark")]
+)
+def test_both_pages_fit_and_can_be_read(
+    browser: Any, served: Served, width: int, scheme: str
+) -> None:
+    page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
+    page.goto(served.address)
+    give(page, DROP, photo(size=(900, 700)), "a-name-that-does-not-end-" * 9 + ".jpg")
+    page.wait_for_selector("#answer:not([hidden])")
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    dark = page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(20, 23, 26)"
+    assert dark == (scheme == "dark")
+    page.goto(f"{served.address}api")
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert page.locator("section.call").count() == 8
+    page.close()
+
+
+def test_where_a_token_is_asked_for_the_page_asks_for_it(browser: Any) -> None:
+    service = Served(TOKEN)
+    page = browser.new_page()
+    page.goto(service.address)
+    give(page, DROP, photo())
+    page.wait_for_selector("#token-field:not([hidden])")
+    assert page.evaluate("document.activeElement.id") == "token"
+    page.keyboard.type(TOKEN)
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#answer:not([hidden])")
+    page.close()
+    service.stop()

@@ -1,0 +1,267 @@
+"""An index that is replaced while it answers: taken over when whole, refused when broken, never
+half of each.
+"""
+
+import asyncio
+import json
+import shutil
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from aiohttp.test_utils import TestClient, TestServer
+
+from pipeline.core import json_files
+from pipeline.core.errors import InputError
+from pipeline.core.records import Rejection
+from pipeline.features.table import Floats, PartFooter, PartRows, write_part
+from pipeline.index.build import IndexSettings, build_index
+from pipeline.locate.locate import Answer
+from pipeline.service import live_index
+from pipeline.service.answerer import Answerer, Outcome, Status
+from pipeline.service.app import Service
+from pipeline.service.live_index import LiveIndex
+from pipeline.service.question import Question
+from pipeline.service.settings import ServiceSettings
+from tests.service.test_question import photo
+
+DIMENSION = 8
+
+
+def make_index(path: Path, rows: int, fingerprint: str = "f" * 64) -> Path:
+    """An index of `rows` places 1,000 m apart; place n is seen in direction n of the vectors'
+    space.
+    """
+    table = path.with_name(f"{path.name}-table")
+    embeddings_BD = np.eye(rows, DIMENSION, dtype=np.float32)
+    part = PartRows(
+        keys=[f"gallery-{n}" for n in range(rows)],
+        locations=[f"place{n}" for n in range(rows)],
+        views=["satellite"] * rows,
+        splits=["gallery"] * rows,
+        lats=[47 + 0.009 * n for n in range(rows)],
+        lons=[8.0] * rows,
+        embeddings_BD=embeddings_BD,
+    )
+    write_part(
+        str(table / "a.parquet"),
+        part,
+        PartFooter(fingerprint=fingerprint, shard_sha256="s", rows=rows),
+    )
+    build_index(IndexSettings(table=str(table), out=str(path)))
+    return path
+
+
+def replace(path: Path, new: Path) -> None:
+    """As a careful operator does it: the parts first, each by renaming, index.json last."""
+    for name in sorted(
+        (entry.name for entry in new.iterdir()), key=lambda name: name == "index.json"
+    ):
+        (new / name).replace(path / name)
+
+
+class WidthEncoder:
+    """Sees place n in a photo that is 16 + n pixels wide; one of 15 cannot be decoded."""
+
+    def __init__(self, facts: dict[str, Any]) -> None:
+        self.batches: list[int] = []
+
+    def encode(self, photos: Sequence[bytes]) -> tuple[Floats, list[Rejection | None]]:
+        self.batches.append(len(photos))
+        places = [self.width(data) - 16 for data in photos]
+        whole = [place for place in places if place >= 0]
+        refused = [
+            None if place >= 0 else Rejection(path="p", reason="damaged image", found="f")
+            for place in places
+        ]
+        return np.eye(DIMENSION, dtype=np.float32)[whole].reshape(-1, DIMENSION), refused
+
+    @staticmethod
+    def width(data: bytes) -> int:
+        from pipeline.images.inspect import inspect
+
+        return inspect(data)[0]
+
+
+def ask(place: int, **where: Any) -> Question:
+    return Question(photo=photo(size=(16 + place, 16)), **where)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return make_index(tmp_path / "index", 3)
+
+
+def test_a_new_index_is_taken_over_and_a_search_under_way_keeps_the_old_one(
+    path: Path, tmp_path: Path
+) -> None:
+    live = LiveIndex(str(path))
+    held = live.current
+    live.look()
+    assert live.current is held
+    replace(path, make_index(tmp_path / "new", 5))
+    live.look()
+    assert (len(live.current.index), live.refused) == (5, None)
+    assert held.index.search(np.eye(1, DIMENSION, 2, dtype=np.float32), 1)[0][0].key == "gallery-2"
+
+
+def broken_files(path: Path) -> None:
+    (path / "index.faiss").write_bytes(b"no index")
+    (path / "index.json").write_text(
+        json.dumps(json_files.read_checksummed(str(path / "index.json")) | {"build_seconds": 9})
+    )
+
+
+BROKEN = {
+    "no index.json": lambda path: (path / "index.json").unlink(),
+    "half of index.json": lambda path: (path / "index.json").write_text('{"rows": 5, '),
+    "an index.json of something else": lambda path: (path / "index.json").write_text("[]"),
+    "files that are no index": broken_files,
+    "a calibration that is none": lambda path: (path / "calibration.json").write_text("{}"),
+}
+
+
+@pytest.mark.parametrize("harm", BROKEN.values(), ids=BROKEN)
+def test_a_broken_index_is_refused_with_a_reason_and_the_old_one_goes_on(
+    path: Path, harm: Any
+) -> None:
+    whole = path.with_name("whole")
+    shutil.copytree(path, whole)
+    live = LiveIndex(str(path))
+    held = live.current
+    harm(path)
+    live.look()
+    assert live.current is held
+    assert live.refused is not None
+    assert "\n" not in live.refused
+    shutil.rmtree(path)
+    shutil.copytree(whole, path)
+    live.look()
+    assert live.refused is None
+
+
+def test_another_networks_index_is_refused(path: Path, tmp_path: Path) -> None:
+    live = LiveIndex(str(path))
+    replace(path, make_index(tmp_path / "new", 5, fingerprint="e" * 64))
+    live.look()
+    assert len(live.current.index) == 3
+    assert "made by network eeeeeeeeeeee" in str(live.refused)
+
+
+def test_a_refused_index_is_not_opened_at_each_look_but_again_after_a_while(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A copy whose index.json came first: it is whole later, without index.json having changed
+    again.
+    """
+    live = LiveIndex(str(path))
+    new = make_index(tmp_path / "new", 5)
+    hidden = (path / "index.faiss").rename(tmp_path / "hidden")
+    (new / "index.json").replace(path / "index.json")
+    live.look()
+    assert live.refused
+    hidden.rename(path / "index.faiss")
+    replace(path, new)
+    live.look()
+    assert len(live.current.index) == 3
+    monkeypatch.setattr(live_index, "RETRY_S", 0.0)
+    live.look()
+    assert len(live.current.index) == 5
+    assert not live.refused
+
+
+def test_an_index_written_once_more_while_it_is_opened_is_left_for_the_next_look(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live = LiveIndex(str(path))
+    replace(path, make_index(tmp_path / "new", 4))
+    newer = make_index(tmp_path / "newer", 5)
+    opened = live_index.open_whole
+
+    def slow(at: str) -> live_index.Opened:
+        found = opened(at)
+        if newer.joinpath("index.json").exists():
+            replace(path, newer)
+        return found
+
+    monkeypatch.setattr(live_index, "open_whole", slow)
+    live.look()
+    assert len(live.current.index) == 3
+    live.look()
+    assert len(live.current.index) == 5
+
+
+def test_without_an_index_nothing_starts(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no index at"):
+        LiveIndex(str(tmp_path / "none"))
+
+
+def test_one_pass_of_the_network_answers_a_batch_in_order_whatever_each_asks(path: Path) -> None:
+    answerer = Answerer(str(path), WidthEncoder)
+    questions = [ask(2), Question(photo=photo(size=(15, 15))), ask(0, top=1), ask(1), ask(2, top=1)]
+    found = answerer.answer(questions)
+    assert isinstance(found[1], Rejection)
+    answers = [one for one in found if isinstance(one, Answer)]
+    assert [one.location for one in answers] == ["place2", "place0", "place1", "place2"]
+    assert [len(one.candidates) for one in answers] == [3, 1, 3, 1]
+    assert answerer._encoder.batches == [5]  # type: ignore[attr-defined]
+
+
+def test_requests_go_on_being_answered_while_the_index_is_replaced_again_and_again(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two galleries by turns under a stream of requests; none fails, and the last one asked is the
+    last one built.
+    """
+    answerer = Answerer(str(path), WidthEncoder)
+
+    class InThisProcess:
+        async def answer(self, questions: Sequence[Question]) -> list[Outcome]:
+            return await asyncio.to_thread(answerer.answer, questions)
+
+        async def status(self) -> Status:
+            return answerer.status()
+
+    monkeypatch.setattr(live_index, "LOOK_EVERY_S", 0.02)
+    stop = threading.Event()
+
+    async def main() -> list[int]:
+        statuses = []
+        service = Service(ServiceSettings(), InThisProcess())
+        async with TestClient(TestServer(service.app)) as client:
+            changing = asyncio.create_task(asyncio.to_thread(change))
+            while not changing.done():
+                kind = {"Content-Type": "image/jpeg"}
+                posts = [
+                    client.post("/locate", data=photo(size=(18, 16)), headers=kind)
+                    for _ in range(4)
+                ]
+                for response in await asyncio.gather(*posts):
+                    statuses.append(response.status)
+                    assert (await response.json())["location"] == "place2"
+            await changing
+            health = await (await client.get("/health")).json()
+            assert (health["rows"], health["refused"]) == (6, None)
+        return statuses
+
+    def change() -> None:
+        for rows in (5, 4, 6):
+            replace(path, make_index(tmp_path / f"new{rows}", rows))
+            deadline = time.monotonic() + 5
+            while answerer.status().rows != rows:
+                assert time.monotonic() < deadline
+                time.sleep(0.01)
+
+    follower = threading.Thread(target=answerer.live.follow, args=(stop,))
+    follower.start()
+    try:
+        statuses = asyncio.run(asyncio.wait_for(main(), 30))
+    finally:
+        stop.set()
+        follower.join()
+    assert len(statuses) > 10
+    assert set(statuses) == {200}

@@ -1,0 +1,122 @@
+"""What a request may ask: rough positions, numbers of candidates, and photos judged without
+decoding them.
+"""
+
+import io
+import struct
+import zlib
+
+import pytest
+from PIL import Image
+
+from pipeline.core.geo import Near
+from pipeline.service.question import MOST_SCANS, Refusal, question_of
+
+MEGAPIXELS = 1_000_000
+
+
+def photo(form: str = "JPEG", mode: str = "RGB", size: tuple[int, int] = (40, 30)) -> bytes:
+    stream = io.BytesIO()
+    Image.new(mode, size).save(stream, form)
+    return stream.getvalue()
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def bomb(side: int) -> bytes:
+    """A PNG of `side` x `side` black pixels, deflated to a thousandth."""
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0))
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + header
+        + chunk(b"IDAT", zlib.compress(bytes(side * (3 * side + 1))))
+        + chunk(b"IEND", b"")
+    )
+
+
+def refused(photo: bytes, **fields: str) -> Refusal:
+    with pytest.raises(Refusal) as caught:
+        question_of(photo, fields, MEGAPIXELS)
+    return caught.value
+
+
+@pytest.mark.parametrize("form", ["JPEG", "PNG", "WEBP"])
+def test_a_photo_alone_is_a_question(form: str) -> None:
+    asked = question_of(photo(form), {}, MEGAPIXELS)
+    assert (asked.near, asked.top) == (None, 5)
+
+
+def test_a_rough_position_is_a_circle() -> None:
+    asked = question_of(
+        photo(), {"lat": "47.5", "lon": "-8", "radius_m": "2e3", "top": "3"}, MEGAPIXELS
+    )
+    assert asked.near == Near(lat=47.5, lon=-8.0, radius_m=2000.0)
+    assert asked.top == 3
+
+
+@pytest.mark.parametrize(
+    "lat", ["NaN", "inf", "-Infinity", "1e999", "north", "47,5", "91", "1" * 400]
+)
+def test_a_latitude_that_is_none_is_refused_in_a_sentence(lat: str) -> None:
+    refusal = refused(photo(), lat=lat, lon="8", radius_m="100")
+    assert refusal.status == 400
+    assert "expected" in refusal.sentence
+    assert len(refusal.sentence) < 300
+
+
+@pytest.mark.parametrize(("lon", "radius"), [("181", "5"), ("8", "0"), ("8", "-1"), ("8", "nan")])
+def test_a_circle_that_is_none_is_refused(lon: str, radius: str) -> None:
+    assert refused(photo(), lat="1", lon=lon, radius_m=radius).status == 400
+
+
+def test_half_a_rough_position_is_refused() -> None:
+    assert "found only lat and lon" in refused(photo(), lat="1", lon="2").sentence
+
+
+@pytest.mark.parametrize("top", ["0", "51", "-1", "2.5", "all", "9" * 50, "٣"])
+def test_a_number_of_candidates_that_is_none_is_refused(top: str) -> None:
+    assert refused(photo(), top=top).status == 400
+
+
+@pytest.mark.parametrize(
+    ("data", "status", "word"),
+    [
+        (b"", 400, "empty"),
+        (b"<svg xmlns='http://www.w3.org/2000/svg'/>", 415, "expected a JPEG"),
+        (b"GIF89a" + bytes(60), 415, "expected a JPEG"),
+        (b"%!PS-Adobe-3.0 EPSF-3.0", 415, "expected a JPEG"),
+        (b"RIFF\x00\x00\x00\x00WAVE", 415, "expected a JPEG"),
+        (photo()[:-2], 422, "truncated"),
+        (photo()[:20], 422, "truncated"),
+        (photo("PNG")[:60], 422, "truncated"),
+        (photo(size=(900, 4)), 422, "absurd dimensions"),
+        (photo(size=(1001, 1000)), 413, "1001 x 1000"),
+        (photo("WEBP", size=(1001, 1000)), 413, "1001 x 1000"),
+        (bomb(1100), 413, "1100 x 1100"),
+    ],
+)  # fmt: skip
+def test_what_is_no_usable_photo_is_refused_in_a_sentence(
+    data: bytes, status: int, word: str
+) -> None:
+    refusal = refused(data)
+    assert refusal.status == status
+    assert word in refusal.sentence
+
+
+def test_a_cmyk_photo_of_too_many_pixels_is_refused_before_it_is_decoded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def no_decoding(data: bytes) -> None:
+        raise AssertionError("decoded")
+
+    monkeypatch.setattr("pipeline.images.inspect.decode", no_decoding)
+    assert refused(photo(mode="CMYK", size=(1001, 1000))).status == 413
+
+
+def test_a_jpeg_of_a_hundred_scans_too_many_is_refused() -> None:
+    data = photo()
+    scan = b"\xff\xda\x00\x0c"
+    assert question_of(data[:-2] + scan * (MOST_SCANS - 1) + data[-2:], {}, MEGAPIXELS)
+    assert "scans" in refused(data[:-2] + scan * MOST_SCANS + data[-2:]).sentence

@@ -1,0 +1,206 @@
+"""jobs/serve.py as a stranger calls it: a network and an index behind Ray Serve, asked over HTTP,
+killed, told to stop.
+"""
+
+import asyncio
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from jobs.encoding.photo_encoder import PhotoEncoder
+from jobs.serve import Settings, load, main
+from model.checkpoint import Checkpoint, dumps
+from model.pvda import FeatureEncoder, PVDAConfig
+from pipeline.core import json_files
+from pipeline.core.errors import InputError
+from pipeline.features.table import PartFooter, PartRows, write_part
+from pipeline.index.build import IndexSettings, build_index
+from pipeline.service import replicas
+from pipeline.service.engine import NotReady
+from pipeline.service.replicas import Replica
+from tests.jobs.test_photo_encoder import facts, photo
+from tests.processes import below, named
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def road(tmp_path: Path, lively_encoder: FeatureEncoder) -> tuple[Path, Path]:
+    """A checkpoint, and an index of three photos that it embedded."""
+    state = {"modules": {"encoder": lively_encoder.state_dict()}}
+    config = PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=16)
+    data = dumps(
+        Checkpoint(network=config, recipe={}, locations=[], epoch=0, history=[], state=state)
+    )
+    (tmp_path / "last.pt").write_bytes(data)
+    made_by = facts(data)
+    embeddings_BD, _ = PhotoEncoder(data, "last.pt", made_by).encode(
+        [photo(seed) for seed in range(3)]
+    )
+    part = PartRows(
+        keys=[f"gallery-{n}" for n in range(3)],
+        locations=[f"place{n}" for n in range(3)],
+        views=["satellite"] * 3,
+        splits=["gallery"] * 3,
+        lats=[47.0, 47.01, 47.02],
+        lons=[8.0] * 3,
+        embeddings_BD=embeddings_BD,
+    )
+    footer = PartFooter(fingerprint=made_by["fingerprint"], shard_sha256="s", rows=3)
+    write_part(str(tmp_path / "table" / "a.parquet"), part, footer)
+    build_index(IndexSettings(table=str(tmp_path / "table"), out=str(tmp_path / "index")))
+    return tmp_path / "last.pt", tmp_path / "index"
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, str(ROOT / "jobs" / "serve.py"), *map(str, arguments)]
+
+
+@contextmanager
+def started(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The job in a process of its own, and its address as soon as it listens."""
+    with subprocess.Popen(
+        command(*arguments), stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        try:
+            assert process.stderr is not None
+            heard = process.stderr.readline()
+            address = re.match(r"(http://\S+) listens", heard)
+            assert address, heard + process.stderr.read()
+            yield process, address[1]
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+
+
+def get(url: str, data: bytes | None = None) -> tuple[int, Any]:
+    """Status and JSON body."""
+    request = urllib.request.Request(
+        url, data, {"Content-Type": "image/jpeg"} if data is not None else {}
+    )
+    try:
+        with urllib.request.urlopen(request, timeout=40) as response:
+            return response.status, json.load(response)
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, json.load(error)
+
+
+def wait_ready(address: str) -> dict[str, Any]:
+    for _ in range(300):
+        status, health = get(f"{address}/health")
+        if status == 200:
+            return dict(health)
+        assert status == 503
+        assert health["why"]
+        time.sleep(0.2)
+    raise AssertionError("not ready after a minute")
+
+
+def replica_of(process: subprocess.Popen[str]) -> int:
+    """The process number of the service's replica, by the name that Ray gives it."""
+    name = f"ray::ServeReplica:pvda-{process.pid}:Replica"
+    return next(one for one in below(os.getpid()) if named(one).startswith(name))
+
+
+def serve_actors() -> list[str]:
+    """What of Ray Serve lives on the session's cluster."""
+    import ray
+
+    named = [str(actor["name"]) for actor in ray.util.list_named_actors(all_namespaces=True)]
+    return [name for name in named if name.startswith("SERVE")]
+
+
+def test_a_photo_is_answered_a_killed_replica_replaced_and_the_end_is_clean(
+    road: tuple[Path, Path], ray_address: str
+) -> None:
+    checkpoint, index = road
+    with started("--checkpoint", checkpoint, "--index", index, "--port", 0, "--threads", 1) as (
+        process,
+        address,
+    ):
+        health = wait_ready(address)
+        assert (health["rows"], health["refused"]) == (3, None)
+        for seed in range(3):
+            status, answer = get(f"{address}/locate", photo(seed))
+            assert (status, answer["location"]) == (200, f"place{seed}")
+            assert answer["candidates"][0]["score"] == pytest.approx(1, abs=1e-4)
+        assert get(f"{address}/locate", photo(1)[:-40])[0] == 422
+        os.kill(replica_of(process), signal.SIGKILL)
+        status, answer = get(f"{address}/locate", photo(2))
+        assert (status, answer["location"]) == (200, "place2")
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=20) == 0
+    assert not serve_actors()
+
+
+def test_a_network_that_did_not_make_the_index_ends_it_with_a_sentence(
+    road: tuple[Path, Path], ray_cluster: None
+) -> None:
+    checkpoint, index = road
+    said = json_files.read_checksummed(str(index / "index.json"))
+    (index / "index.json").write_text(json.dumps(said | {"fingerprint": "e" * 64}))
+    with pytest.raises(InputError, match="did not make this index"):
+        main(Settings(checkpoint=str(checkpoint), index=str(index), port=0, threads=1))
+    assert not serve_actors()
+
+
+def test_what_is_not_there_is_told_before_anything_starts(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no checkpoint at"):
+        main(Settings(checkpoint=str(tmp_path / "none.pt"), index=str(tmp_path)))
+    with pytest.raises(InputError, match="no index at"):
+        main(Settings(checkpoint=__file__, index=str(tmp_path)))
+    with pytest.raises(InputError, match="--replicas is 0"):
+        Settings(checkpoint="last.pt", index="index", replicas=0)
+
+
+def test_a_port_that_is_taken_is_told_before_anything_is_loaded(
+    road: tuple[Path, Path], ray_cluster: None
+) -> None:
+    checkpoint, index = road
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=f"cannot listen on 127.0.0.1 port {port}"):
+            main(Settings(checkpoint=str(checkpoint), index=str(index), port=port))
+
+
+def test_a_replica_that_cannot_load_says_why_and_loads_once_it_can(
+    road: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint, index = road
+    monkeypatch.setattr(replicas, "RETRY_S", 0.02)
+    hidden = index.rename(index.with_name("hidden"))
+    replica = Replica(partial(load, str(checkpoint), str(index), None, 1))
+    with pytest.raises(NotReady, match="no index at"):
+        asyncio.run(replica.status())
+    replica.check_health()  # another process would not find an index either
+    hidden.rename(index)
+    deadline = time.monotonic() + 10
+    while replica._answerer is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert asyncio.run(replica.status()).rows == 3
+
+
+def test_a_replica_whose_batch_does_not_end_is_ill(
+    road: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replica = Replica(partial(load, str(road[0]), str(road[1]), None, 1))
+    replica._began = time.monotonic() - replicas.STUCK_S - 1
+    with pytest.raises(TimeoutError, match="120 s"):
+        replica.check_health()

@@ -1,0 +1,271 @@
+"""Damaged shards: found before they are embedded, trained on or extended, and made anew by the
+command that packed them.
+"""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jobs.train import Settings, train
+from jobs.training.recipes import smoke
+from pipeline.batches.training import Reading, TrainingStream
+from pipeline.core.errors import InputError
+from pipeline.core.records import Split, View
+from pipeline.features.embed import EmbeddingSettings, Encoder, missing_shards
+from pipeline.features.embed_worker import Network
+from pipeline.features.part import PartFooter, PartRows, write_part
+from pipeline.shards.manifest import NOTE, Shard, read_manifest
+from pipeline.shards.pack import PackingSettings, pack
+from pipeline.shards.samples import read_shard
+from pipeline.shards.verify import check_shard, verify
+from pipeline.sources.university1652 import University1652
+from tests.damaging import MENDS, damages, found_or_equal, look_or_say_gone, sentence_of
+
+SOURCE = University1652()
+
+
+def imagery(root: Path, places: range) -> Path:
+    """Of each place a satellite image and four of the UAV."""
+    for place in places:
+        for number, name in enumerate(["satellite", "drone", "drone", "drone", "drone"]):
+            path = root / f"train/{name}/{place:04d}/image-{number:02d}.jpg"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            pixels = np.random.default_rng([place, number]).integers(
+                0, 255, (16, 16, 3), dtype=np.uint8
+            )
+            Image.fromarray(pixels).save(path, "JPEG")
+    return root
+
+
+def said(root: Path, out: Path, **changes: Any) -> PackingSettings:
+    given: dict[str, Any] = {
+        "root": str(root),
+        "out": str(out),
+        "samples_per_shard": 5,
+        "workers": 0,
+    }
+    return PackingSettings(**(given | changes))
+
+
+def content(out: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(out)): path.read_bytes()
+        for path in sorted(out.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    root, out = imagery(tmp_path_factory.mktemp("root"), range(4)), tmp_path_factory.mktemp("out")
+    pack(SOURCE, said(root, out))
+    return root, out
+
+
+@pytest.fixture
+def out(packed: tuple[Path, Path], tmp_path: Path) -> Path:
+    """A set of shards to be spoilt."""
+    return Path(shutil.copytree(packed[1], tmp_path / "shards"))
+
+
+def a_shard(out: Path) -> tuple[Shard, Path]:
+    shard = read_manifest(str(out)).of(Split.TRAIN, View.DRONE)[0]
+    return shard, out / f"{shard.name}.tar"
+
+
+def test_verification_and_embedding_find_each_damage_of_a_tar(out: Path) -> None:
+    shard, tar = a_shard(out)
+    look = look_or_say_gone(
+        tar, lambda: list(read_shard(str(out), shard.name, shard.split, shard.view, shard.sha256))
+    )
+    assert found_or_equal(tar, look, 200) == 201
+    for data in damages(tar.read_bytes(), 60, seed=1):
+        tar.write_bytes(data or b"")
+        assert any(str(tar) in sentence for sentence in check_shard(str(out), shard))
+
+
+def test_training_refuses_a_damaged_tar_or_leaves_the_damaged_image_out(out: Path) -> None:
+    """By default it looks at sizes before it starts, at each image's hash and name as it reads it."""
+    _, tar = a_shard(out)
+    good, refused, left_out = tar.read_bytes(), 0, 0
+    reading = Reading(batch_size=2, image_size=16, seed=1, threads=1, shuffle_buffer=4)
+
+    def batches() -> list[Any]:
+        return list(TrainingStream(str(out), reading).epoch(0))
+
+    expected = batches()
+    for data in damages(good, 100):
+        if data is None or len(data) != len(good):
+            continue
+        tar.write_bytes(data)
+        found: list[Any] = []
+        told = sentence_of(lambda found=found: found.extend(batches()))  # type: ignore[misc]
+        refused += told is not None
+        assert told is None or ("shards" in told and MENDS.search(told)), told
+        for now, then in zip(
+            (b for pair in found for b in pair),
+            (b for pair in expected for b in pair),
+            strict=False,
+        ):
+            whole = [key not in now.damaged for key in then.keys]
+            assert np.array_equal(now.images_B3HW[whole], then.images_B3HW[whole])
+            assert np.array_equal(now.location_B[whole], then.location_B[whole])
+            left_out += len(now.damaged)
+    assert refused > 5
+    assert left_out > 5
+
+
+def test_training_looks_at_sizes_first_and_at_every_byte_when_asked(
+    out: Path, tmp_path: Path
+) -> None:
+    recipe = smoke(1)
+    settings = Settings(
+        recipe=replace(recipe, batch_size=2), shards=str(out), out=str(tmp_path / "run"), workers=0
+    )
+    _, tar = a_shard(out)
+    good = tar.read_bytes()
+    for data in (None, good[:-512]):
+        tar.unlink(missing_ok=True)
+        if data is not None:
+            tar.write_bytes(data)
+        with pytest.raises(
+            InputError,
+            match=rf"1 shards cannot be used: {tar} (is missing|has).*make_shards.py --verify",
+        ):
+            train(settings)
+    tar.write_bytes(good[:2000] + bytes([good[2000] ^ 1]) + good[2001:])
+    with pytest.raises(
+        InputError,
+        match=rf"is damaged in \d places: {tar}.* has not the hash .*jobs/make_shards.py",
+    ):
+        train(replace(settings, verify=True))
+
+
+def spoil(what: str, out: Path, shard: Shard) -> None:
+    tar, part = out / f"{shard.name}.tar", out / f"records/{shard.name}.parquet"
+    for path, word in ((tar, "tar"), (part, "part")):
+        if f"{word} flipped" in what:
+            data = bytearray(path.read_bytes())
+            data[len(data) // 3] ^= 8
+            path.write_bytes(data)
+        if f"{word} gone" in what:
+            path.unlink()
+
+
+SPOILT = [
+    "tar flipped",
+    "tar gone",
+    "part flipped",
+    "part gone",
+    "tar gone, part gone",
+    "tar flipped, part flipped",
+]
+
+
+@pytest.mark.parametrize("what", SPOILT)
+def test_the_command_that_packed_makes_the_damaged_shard_anew(
+    what: str, packed: tuple[Path, Path], out: Path
+) -> None:
+    (root, whole), (shard, _) = packed, a_shard(out)
+    spoil(what, out, shard)
+    _, wrong = verify(str(out), workers=0)
+    assert wrong
+    assert all(shard.name in sentence for sentence in wrong)
+    others = {
+        name: (out / name).stat().st_mtime_ns for name in content(out) if "000001.tar" in name
+    }
+    pack(SOURCE, said(root, out))
+    now = {name: (out / name).stat().st_mtime_ns for name in others}
+    assert (now, verify(str(out), workers=0)[1]) == (others, [])
+    assert {name: data for name, data in content(out).items() if name.endswith(".tar")} == {
+        name: data for name, data in content(whole).items() if name.endswith(".tar")
+    }
+    assert not (out / NOTE).exists()
+
+
+@pytest.mark.parametrize("what", SPOILT)
+def test_an_extended_set_is_mended_by_the_commands_that_packed_it(
+    what: str, tmp_path: Path
+) -> None:
+    first, second, out = (
+        imagery(tmp_path / "a", range(3)),
+        imagery(tmp_path / "b", range(3, 6)),
+        tmp_path / "out",
+    )
+    pack(SOURCE, said(first, out))
+    manifest = pack(SOURCE, said(second, out, extend=True))
+    before = content(out)
+    spoilt = manifest.of(Split.TRAIN, View.DRONE)[1], manifest.shards[-1]
+    for shard in spoilt:
+        spoil(what, out, shard)
+    assert verify(str(out), workers=0)[1]
+    with pytest.raises(
+        InputError,
+        match=rf"1 shards of \S+ are damaged, .*--root {first}, then .*--root {second} --extend",
+    ):
+        pack(SOURCE, said(first, out))
+    assert pack(SOURCE, said(second, out, extend=True)) == manifest
+    assert verify(str(out), workers=0)[1] == []
+    same = (".tar", ".json") if "part" in what else (".tar", ".json", ".parquet")
+    after = content(out)
+    assert after.keys() == before.keys()
+    assert all(after[name] == data for name, data in before.items() if name.endswith(same))
+
+
+def test_imagery_that_has_changed_mends_nothing_and_spoils_nothing(tmp_path: Path) -> None:
+    first, second, out = (
+        imagery(tmp_path / "a", range(3)),
+        imagery(tmp_path / "b", range(3, 6)),
+        tmp_path / "out",
+    )
+    pack(SOURCE, said(first, out))
+    manifest = pack(SOURCE, said(second, out, extend=True))
+    shard = manifest.shards[0]
+    spoil("tar flipped", out, shard)
+    verify(str(out), workers=0)
+    before = content(out)
+    for path in (tmp_path / "a").rglob("*.jpg"):
+        path.write_bytes(path.read_bytes()[:-2] + b"\0\xff\xd9")
+    with pytest.raises(InputError, match="this imagery does not hold what they were packed from"):
+        pack(SOURCE, said(first, out))
+    assert content(out) == before
+
+
+def test_a_part_of_a_table_with_damaged_pages_is_embedded_again_when_every_byte_is_asked_for(
+    out: Path, tmp_path: Path
+) -> None:
+    manifest, table = read_manifest(str(out)), tmp_path / "table"
+    for shard in manifest.shards:
+        count = shard.samples
+        rows = PartRows(
+            keys=[f"{shard.name}-{number}" for number in range(count)],
+            locations=["a"] * count,
+            views=[shard.view] * count,
+            splits=[shard.split] * count,
+            lats=[None] * count,
+            lons=[None] * count,
+            embeddings_BD=np.eye(count, 8, dtype=np.float32),
+        )
+        footer = PartFooter(fingerprint="f" * 64, shard_sha256=shard.sha256, rows=count)
+        write_part(str(table / f"{shard.name}.parquet"), rows, footer)
+
+    def never(threads: int) -> Encoder:
+        raise AssertionError
+
+    def missing(settings: EmbeddingSettings) -> list[Shard]:
+        network = Network(fingerprint="f" * 64, image_size=16, factory=never)
+        return missing_shards(settings, network, manifest.shards)
+
+    asked = EmbeddingSettings(shards=str(out), out=str(table))
+    assert missing(replace(asked, verify=True)) == []
+    path = table / f"{manifest.shards[1].name}.parquet"
+    data = bytearray(path.read_bytes())
+    data[60] ^= 1  # within the first page
+    path.write_bytes(data)
+    assert missing(asked) == []
+    assert missing(replace(asked, verify=True)) == [manifest.shards[1]]

@@ -1,0 +1,179 @@
+"""University-1652's geotags: from its authors' KML files and from the simulator's tables, and what
+damage costs.
+"""
+
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from pipeline.core.errors import InputError
+from pipeline.core.records import GeoTag, ImageRecord, Rejection, View
+from pipeline.sources.kml import LARGEST, place_of_kml
+from pipeline.sources.text_tables import Unreadable
+from pipeline.sources.university1652 import University1652
+
+KML = """<?xml version="1.0" encoding="UTF-8"?>
+<kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2"><Document><Placemark>
+<name>0839</name>
+<LookAt><longitude>-1.5</longitude><latitude>53.5</latitude><altitude>0</altitude><range>500</range></LookAt>
+<Point><coordinates>
+  -1.25,53.75,0 </coordinates></Point></Placemark></Document></kml>"""
+
+
+def touch(path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"never opened")
+
+
+def miniature(root: Path) -> Path:
+    for place in ("0839", "0840"):
+        touch(root / "train/satellite" / place / f"{place}.jpg")
+        touch(root / "train/drone" / place / "image-01.jpeg")
+    touch(root / "train/street/0839/1.jpg")
+    touch(root / "test/query_drone/0001/image-01.JPEG")
+    return root
+
+
+def scanned(
+    root: Path, source: University1652 | None = None
+) -> tuple[dict[str, ImageRecord], list[Rejection]]:
+    found = list((source or University1652()).scan(str(root)))
+    records = {record.key: record for record in found if isinstance(record, ImageRecord)}
+    return records, [f for f in found if isinstance(f, Rejection)]
+
+
+def with_kml(
+    tmp_path: Path, files: dict[str, str]
+) -> tuple[dict[str, ImageRecord], list[Rejection]]:
+    for name, text in files.items():
+        path = tmp_path / "kml" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return scanned(miniature(tmp_path / "root"), University1652(kml=str(tmp_path / "kml")))
+
+
+def test_a_building_and_all_its_images_lie_where_its_kml_says(tmp_path: Path) -> None:
+    records, refused = with_kml(tmp_path, {"first-key/0839.kml": KML})
+    assert not refused
+    for key in ("train-satellite-0839-0839", "train-drone-0839-image-01"):
+        assert records[key].geotag == GeoTag(lat=53.75, lon=-1.25)
+    assert records["train-drone-0840-image-01"].geotag is None
+
+
+def test_without_a_point_the_look_counts_and_without_that_the_first_coordinate() -> None:
+    look = KML[: KML.index("<Point>")] + "</Placemark></Document></kml>"
+    assert place_of_kml(look.encode()) == (53.5, -1.5)
+    line = "<kml><LineString><coordinates>2.5,48.5,10 3,49,10</coordinates></LineString></kml>"
+    assert place_of_kml(line.encode()) == (48.5, 2.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "not XML"),
+        ("hello", "not XML"),
+        (KML[:200], "not XML"),
+        ("<kml/>", "no Point, LookAt or coordinates"),
+        (KML.replace("-1.25,53.75,0", "-1.25"), "expected longitude,latitude"),
+        (KML.replace("53.75", "95"), "latitude 95 is not between"),
+        (KML.replace("53.75", "nan"), "'nan' is not a finite number"),
+        (KML.replace("UTF-8", "no-such-code"), "not XML"),
+        (
+            '<!DOCTYPE kml [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]><kml>&b;</kml>',
+            "declares a document type",
+        ),
+        ('<!DOCTYPE kml SYSTEM "file:///etc/passwd"><kml/>', "declares a document type"),
+        (f"<kml>{' ' * LARGEST}</kml>", "expected at most 1048576"),
+    ],
+)
+def test_a_kml_that_tells_no_place_is_told_and_its_images_come_without_a_tag(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    records, refused = with_kml(tmp_path, {"0839.kml": text, "0840.KML": KML})
+    assert [(Path(r.path).name, r.reason) for r in refused] == [("0839.kml", "unreadable tag")]
+    assert said in refused[0].found
+    assert records["train-drone-0839-image-01"].geotag is None
+    assert records["train-drone-0840-image-01"].geotag == GeoTag(lat=53.75, lon=-1.25)
+
+
+def test_a_document_type_is_refused_in_other_encodings_too() -> None:
+    with pytest.raises(Unreadable, match="declares a document type"):
+        place_of_kml('<?xml version="1.0" encoding="UTF-16"?><!DOCTYPE kml><kml/>'.encode("utf-16"))
+
+
+def test_a_folder_without_kml_is_a_wrong_setting(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no KML files below .*check --kml"):
+        scanned(miniature(tmp_path), University1652(kml=str(tmp_path / "nowhere")))
+
+
+def test_the_simulators_tables_give_places_and_poses(tmp_path: Path) -> None:
+    root = miniature(tmp_path)
+    (root / "locations.csv").write_text("location,lat,lon\n0839,53.75,-1.25\n0840,1,2\n")
+    (root / "poses.csv").write_text(
+        "path,location,altitude_m,heading_deg,pitch_deg\ntrain/drone/0839/image-01.jpeg,0839,120.5,90,-45\n"
+    )
+    records, refused = scanned(root)
+    assert not refused
+    tag = GeoTag(lat=53.75, lon=-1.25, altitude_m=120.5, heading_deg=90, pitch_deg=-45)
+    assert records["train-drone-0839-image-01"].geotag == tag
+    assert records["train-satellite-0839-0839"].geotag == GeoTag(lat=53.75, lon=-1.25)
+
+
+def test_a_damaged_line_costs_its_own_images_tag_and_no_more(tmp_path: Path) -> None:
+    root = miniature(tmp_path)
+    (root / "locations.csv").write_text("location,lat,lon\n0839,north,-1.25\n0840,1,2\n0841\n")
+    (root / "poses.csv").write_text(
+        "path,location,altitude_m,heading_deg,pitch_deg\n"
+        "train/drone/0839/image-01.jpeg,0839,1,2,3\ntrain/drone/0840/image-01.jpeg,0840,inf,2,3\n"
+    )
+    records, refused = scanned(root)
+    assert [(Path(r.path).name, r.reason, r.found.split(":")[0]) for r in refused] == [
+        ("locations.csv", "unreadable tag", "line 2"),
+        ("locations.csv", "unreadable tag", "line 4"),
+        ("poses.csv", "unreadable tag", "line 2"),
+        ("poses.csv", "unreadable tag", "line 3"),
+    ]
+    assert records["train-drone-0839-image-01"].geotag is None
+    assert records["train-drone-0840-image-01"].geotag == GeoTag(lat=1, lon=2)
+
+
+def test_a_table_of_something_else_is_refused_whole(tmp_path: Path) -> None:
+    (miniature(tmp_path) / "locations.csv").write_text("id,x,y\n")
+    with pytest.raises(
+        InputError, match="has no column location, lat, lon, its first line holds id, x, y; mend it"
+    ):
+        scanned(tmp_path)
+
+
+def test_odd_folders_and_names_are_told_or_taken(tmp_path: Path) -> None:
+    root = miniature(tmp_path)
+    touch(root / "train/drone/0839/too deep/image-02.jpeg")
+    touch(root / "train/drone/0839/Thumbs.db")
+    touch(root / "train/drone/0839/.DS_Store")
+    touch(root / "train/drone/école 9/写真 1.JPG")
+    (root / "train/drone/0777").mkdir()
+    (root / "train/drone/gone").symlink_to(root / "nowhere")
+    (root / "train/drone/linked").symlink_to(root / "train/drone/0839/too deep")
+    records, refused = scanned(root, University1652(views=tuple(View)))
+    assert {record.location for record in records.values()} == {
+        "0839",
+        "0840",
+        "0001",
+        "école 9",
+        "linked",
+    }
+    assert "train-street-0839-1" in records
+    assert sorted((Path(r.path).name, r.reason) for r in refused) == [
+        ("Thumbs.db", "not an image's name"),
+        ("gone", "wrong folder"),
+        ("image-02.jpeg", "wrong folder"),
+    ]
+
+
+def test_images_and_kml_may_lie_on_other_storage() -> None:
+    memory = fsspec.filesystem("memory")
+    memory.pipe("/u1652/root/train/drone/0839/image-01.jpeg", b"x")
+    memory.pipe("/u1652/kml/0839.kml", KML.encode())
+    found = list(University1652(kml="memory://u1652/kml").scan("memory://u1652/root"))
+    assert [f.geotag for f in found if isinstance(f, ImageRecord)] == [GeoTag(lat=53.75, lon=-1.25)]
