@@ -288,7 +288,7 @@ def test_threads_that_resize_start_no_threads_of_their_own() -> None:
     script = (
         "import os, numpy, torch\n"
         "from concurrent.futures import ThreadPoolExecutor\n"
-        "from pipeline.images.decode import resize\n"
+        "from pipeline.images.transforms import resize\n"
         "torch.set_num_threads(8)\n"
         "image = numpy.zeros((2000, 2000, 3), numpy.uint8)\n"
         "before = len(os.listdir('/proc/self/task'))\n"

@@ -102,7 +102,7 @@ def test_an_index_in_parts_answers_as_one(table: str, tmp_path: Path, factory: s
 
 KILLED = """
     import os, signal, sys
-    from pipeline import index_plan, index_work
+    from pipeline.index import plan as index_plan, workspace as index_work
     from pipeline.index.build import IndexSettings, build_index
     from pipeline.core.records import Split, View
     index_plan.LEAST_UNIT_ROWS, index_plan.UNIT_SHARE = 250, 0
