@@ -85,7 +85,7 @@ def table(folder: Path, count: int) -> None:
                 pass
 
     def read_sealed() -> None:
-        with parquet_files.opened(path) as parquet:
+        with parquet_files.open_parquet(path) as parquet:
             for _ in parquet.iter_batches(columns=["embedding"]):
                 pass
 

@@ -23,13 +23,18 @@ import numpy as np
 import ray
 from PIL import Image
 
-from jobs.encoding.encoder import CALIBRATING, PROBES, EncoderSettings, network_of
+from jobs.encoding.encoder import (
+    CALIBRATION_IMAGES,
+    PROBE_IMAGES,
+    EncoderSettings,
+    make_encoder_spec,
+)
 from model.checkpoint import Checkpoint, dumps
 from model.pvda import FeatureEncoder, PVDAConfig
 from pipeline.core import cluster
 from pipeline.core.records import Split, View
 from pipeline.features.embed import EmbeddingSettings
-from pipeline.features.embed_worker import IN_FLIGHT, Assignment, Network, ShardEmbedder
+from pipeline.features.embed_worker import IN_FLIGHT, EmbedJob, EncoderSpec, ShardEmbedder
 from pipeline.shards.manifest import Shard
 
 SOURCE_SIDE = 512
@@ -116,19 +121,19 @@ def network(
     folder: str,
     images: list[bytes],
     settings: EncoderSettings | None = None,
-) -> Network:
+) -> EncoderSpec:
     """The network as a worker builds it, checked by images of a shard of its own."""
     apart = Path(folder) / "probe"
     apart.mkdir(exist_ok=True)
-    write_shard(str(apart), 0, images, PROBES + CALIBRATING)
+    write_shard(str(apart), 0, images, PROBE_IMAGES + CALIBRATION_IMAGES)
     embedding = EmbeddingSettings(
         shards=str(apart), out="none", split=Split.GALLERY, view=View.DRONE, batch_size=batch
     )
-    return network_of(made, "the benchmark's", embedding, settings)
+    return make_encoder_spec(made, "the benchmark's", embedding, settings)
 
 
-def worker(folder: str, made: Network, batch: int, threads: int, decoders: int) -> Any:
-    given = Assignment(
+def worker(folder: str, made: EncoderSpec, batch: int, threads: int, decoders: int) -> Any:
+    given = EmbedJob(
         shards=folder,
         out=f"{folder}/table",
         batch_size=batch,
@@ -148,7 +153,7 @@ def worker(folder: str, made: Network, batch: int, threads: int, decoders: int) 
 def end_to_end(actor: Any, shards: list[Shard]) -> tuple[float, Counter[str]]:
     """Images per second from tar to part, and where the threads' seconds went."""
     began, spent = time.perf_counter(), Counter[str]()
-    for _, done in cluster.bounded(actor.work.remote, shards, IN_FLIGHT):
+    for _, done in cluster.bounded_map(actor.work.remote, shards, IN_FLIGHT):
         spent.update(done.seconds)
     seconds = time.perf_counter() - began
     spent["idle"] = seconds - spent["infer"]  # type: ignore[assignment]

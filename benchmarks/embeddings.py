@@ -20,7 +20,7 @@ from model.checkpoint import build_encoder, loads
 from model.inference.embed import embed
 from pipeline.features.table import Floats, PartFooter, PartRows, write_part
 from pipeline.images.decode import decode
-from pipeline.index.recall import HELD_QUERIES
+from pipeline.index.recall import RECALL_QUERIES
 
 BATCH = 512
 SMALLEST = 0.35  # side of a crop as a share of the image's
@@ -107,7 +107,7 @@ def main() -> None:
     paths = sorted(Path(arguments.imagery).glob("*.jpg"))
     images_N = [torch.from_numpy(decode(path.read_bytes())).permute(2, 0, 1) for path in paths]
     names = [path.stem for path in paths]
-    write_split(arguments, images_N, names, "query", "drone", HELD_QUERIES, seed=1)
+    write_split(arguments, images_N, names, "query", "drone", RECALL_QUERIES, seed=1)
     write_split(arguments, images_N, names, "gallery", "satellite", arguments.rows, seed=0)
 
 

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.core.arrays import Whole
+from pipeline.core.arrays import Ints
 from pipeline.features.table import Floats, PartFooter, PartRows, open_table, write_part
 from pipeline.retrieval.ranking import Blocks, Side, rank, side_of_array
 from pipeline.retrieval.tasks import side_of
@@ -30,7 +30,7 @@ PART_ROWS = 8_192
 ROUNDS = 3  # the best of so many, in turn: other work on the machine slows some of them
 
 
-def made_vectors(label_Q: Whole, centres_LD: Floats, seed: int, noise: float = 3) -> Floats:
+def made_vectors(label_Q: Ints, centres_LD: Floats, seed: int, noise: float = 3) -> Floats:
     """Unit vectors round the centre of each label; cosines of true matches are near 0.1, of others
     near 0.
     """
@@ -45,7 +45,7 @@ def made_vectors(label_Q: Whole, centres_LD: Floats, seed: int, noise: float = 3
 
 def made_side(locations: int, each: int, centres_LD: Floats, seed: int) -> Side:
     """`each` vectors of each of the first `locations` locations."""
-    label_Q: Whole = np.repeat(np.arange(locations), each)
+    label_Q: Ints = np.repeat(np.arange(locations), each)
     keys, names = np.arange(len(label_Q)).astype(np.str_), label_Q.astype(np.str_)
     return side_of_array(keys, names, made_vectors(label_Q, centres_LD, seed))
 

@@ -23,7 +23,7 @@ import numpy as np
 from pipeline.core.records import Split
 from pipeline.features.table import Floats, PartFooter, PartRows, open_table, write_part
 from pipeline.index.build import IndexSettings, build_index
-from pipeline.index.recall import HELD_QUERIES, exact_search
+from pipeline.index.recall import RECALL_QUERIES, exact_search
 from pipeline.index.searcher import Index
 
 PART_ROWS = 16_384
@@ -94,7 +94,7 @@ def make_table(folder: Path, rows: int, dimension: int) -> None:
         write_rows(
             folder, "gallery", "satellite", number, made_vectors(first, count, dimension, 0), first
         )
-    spread = np.linspace(0, rows - 1, HELD_QUERIES).astype(int)
+    spread = np.linspace(0, rows - 1, RECALL_QUERIES).astype(int)
     queries = np.concatenate([made_vectors(int(first), 1, dimension, 1) for first in spread])
     write_rows(folder, "query", "drone", 0, queries, 0)
 

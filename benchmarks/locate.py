@@ -23,7 +23,7 @@ import numpy as np
 
 from jobs.calibrate import Settings as CalibrationSettings
 from jobs.calibrate import calibrate_index
-from jobs.encoding.encoder import network_of
+from jobs.encoding.encoder import make_encoder_spec
 from jobs.train import Settings as TrainSettings
 from jobs.train import train
 from jobs.training.recipes import smoke
@@ -35,14 +35,19 @@ from pipeline.features.embed import EmbeddingSettings, embed_gallery
 from pipeline.features.table import open_table
 from pipeline.index.build import IndexSettings, build_index
 from pipeline.index.searcher import Index
-from pipeline.locate.calibration import Example
-from pipeline.locate.calibration_data import Labelled, examples
-from pipeline.locate.confidence import Confidence
-from pipeline.locate.flight import motion_over, settle
-from pipeline.locate.gallery_map import GalleryMap, gallery_map
-from pipeline.locate.locate import Answer, answers
-from pipeline.locate.reliability import Bin, calibration_error, diagram, reliability
-from pipeline.locate.track import TRACKED, Start
+from pipeline.locate.calibration import CalibrationExample
+from pipeline.locate.calibration_data import LabelledImages, make_examples
+from pipeline.locate.confidence import Calibration
+from pipeline.locate.flight import apply_track, motion_for_gallery
+from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
+from pipeline.locate.locate import Answer, answers_from_hits
+from pipeline.locate.reliability import (
+    ReliabilityBin,
+    expected_calibration_error,
+    reliability_bins,
+    reliability_diagram,
+)
+from pipeline.locate.track import TRACK_CANDIDATES, TrackStart
 from pipeline.shards.pack import PackingSettings, pack
 from pipeline.simulation.simulate import SimulationSettings, simulate
 from pipeline.sources.university1652 import University1652
@@ -78,12 +83,14 @@ def prepare(textures: str, out: Path, epochs: int) -> None:
     )
     for split, view in ((Split.QUERY, View.DRONE), (Split.GALLERY, View.SATELLITE)):
         embedding = EmbeddingSettings(shards=shards, out=table, split=split, view=view)
-        embed_gallery(embedding, network_of(storage.read_bytes(checkpoint), checkpoint, embedding))
+        embed_gallery(
+            embedding, make_encoder_spec(storage.read_bytes(checkpoint), checkpoint, embedding)
+        )
     build_index(IndexSettings(table=table, out=index, split=Split.GALLERY, view=View.SATELLITE))
     calibrate_index(CalibrationSettings(checkpoint=checkpoint, shards=shards, index=index))
 
 
-def photos_of(table: str) -> Labelled:
+def photos_of(table: str) -> LabelledImages:
     """The test's UAV photos with what is known of them."""
     rows = open_table(table).select(Split.QUERY, View.DRONE)
     labels = rows.labels()
@@ -97,19 +104,19 @@ def photos_of(table: str) -> Labelled:
             strict=True,
         )
     ]
-    return Labelled(facts=facts, embeddings_QD=rows.embeddings())
+    return LabelledImages(facts=facts, embeddings_QD=rows.embeddings())
 
 
-def grouped(photos: Labelled, views: int) -> Labelled:
+def grouped(photos: LabelledImages, views: int) -> LabelledImages:
     """Means of `views` photos of a place, in the order of their keys."""
     order = sorted(range(len(photos.facts)), key=lambda number: photos.facts[number]["key"])
     groups = [order[begin : begin + views] for begin in range(0, len(order), views)]
     total_GD = np.array([photos.embeddings_QD[group].sum(axis=0) for group in groups])
     unit_GD = (total_GD / np.linalg.norm(total_GD, axis=1, keepdims=True)).astype(np.float32)
-    return Labelled(facts=[photos.facts[group[0]] for group in groups], embeddings_QD=unit_GD)
+    return LabelledImages(facts=[photos.facts[group[0]] for group in groups], embeddings_QD=unit_GD)
 
 
-def within(found: list[Answer], asked: list[Example]) -> Doubles:
+def within(found: list[Answer], asked: list[CalibrationExample]) -> Doubles:
     """Which answers, known or not, lie within the tolerance: 1 or 0."""
     at_Q2 = np.array(
         [
@@ -122,22 +129,24 @@ def within(found: list[Answer], asked: list[Example]) -> Doubles:
     )
 
 
-def confidence_lines(name: str, asked: list[Example], confidence: Confidence) -> list[Bin]:
+def confidence_lines(
+    name: str, asked: list[CalibrationExample], confidence: Calibration
+) -> list[ReliabilityBin]:
     """How true the probabilities are, and what the threshold does, photos from inside and outside
     the gallery alike.
 
     Returns the bins of the reliability diagram.
     """
     inside, outside = (
-        answers([getattr(one, side) for one in asked], 5, confidence)
+        answers_from_hits([getattr(one, side) for one in asked], 5, confidence)
         for side in ("inside", "outside")
     )
     right_Q = within(inside, asked)
     said_N = np.array([one.probability for one in [*inside, *outside]], np.float64)
-    bins = reliability(said_N, np.concatenate([right_Q, 0 * right_Q]), np.ones(len(said_N)))
+    bins = reliability_bins(said_N, np.concatenate([right_Q, 0 * right_Q]), np.ones(len(said_N)))
     known_Q = np.array([one.known for one in inside])
     print(f"{name}: within {WITHIN_M:.0f} m {right_Q.mean():.1%} of {len(asked)}")
-    print(f"{name}: expected calibration error {calibration_error(bins):.3f}")
+    print(f"{name}: expected calibration error {expected_calibration_error(bins):.3f}")
     print(
         f"{name}: from outside the gallery, answered unknown {np.mean([not one.known for one in outside]):.1%}"
     )
@@ -148,7 +157,7 @@ def confidence_lines(name: str, asked: list[Example], confidence: Confidence) ->
     return bins
 
 
-def flights_of(asked: list[Example], rng: np.random.Generator) -> list[list[int]]:
+def flights_of(asked: list[CalibrationExample], rng: np.random.Generator) -> list[list[int]]:
     """Numbers of the photos of each flight: always to the nearest place not seen yet, a photo of
     each.
     """
@@ -176,13 +185,13 @@ def flights_of(asked: list[Example], rng: np.random.Generator) -> list[list[int]
 
 
 def track_lines(
-    asked: list[Example], confidence: Confidence, gallery: GalleryMap, strangers: float
+    asked: list[CalibrationExample], confidence: Calibration, gallery: GalleryMap, strangers: float
 ) -> None:
     """Photos of flights, a share of them from outside the gallery: each by itself, as tracks, and
     with a rough start.
     """
     rng = np.random.default_rng(0)
-    motion = motion_over(gallery, 25.0)
+    motion = motion_for_gallery(gallery, 25.0)
     rows: dict[str, list[tuple[bool, bool, bool]]] = {
         name: [] for name in ("single", "track", "track with start")
     }
@@ -198,13 +207,15 @@ def track_lines(
             hits = [
                 one.outside if odd else one.inside for one, odd in zip(stops, strange, strict=True)
             ]
-            single = answers(hits, TRACKED, confidence)
+            single = answers_from_hits(hits, TRACK_CANDIDATES, confidence)
             off = float(rng.uniform(-0.5, 0.5)) * START_M / 111_195
-            start = Start(lat=float(at_T2[0, 0]) + off, lon=float(at_T2[0, 1]), radius_m=START_M)
+            start = TrackStart(
+                lat=float(at_T2[0, 0]) + off, lon=float(at_T2[0, 1]), radius_m=START_M
+            )
             begin = time.perf_counter()
             found = {
-                "single": single, "track": settle(single, times, confidence, motion),
-                "track with start": settle(single, times, confidence, motion, start),
+                "single": single, "track": apply_track(single, times, confidence, motion),
+                "track with start": apply_track(single, times, confidence, motion, start),
             }  # fmt: skip
             spent += time.perf_counter() - begin
             for name, said in found.items():
@@ -242,20 +253,20 @@ def main() -> None:
         )
     )
     photos = photos_of(str(given.out / "table"))
-    nobody = Labelled(facts=[], embeddings_QD=photos.embeddings_QD[:0])
+    nobody = LabelledImages(facts=[], embeddings_QD=photos.embeddings_QD[:0])
     for views in (1, 3, 12):
-        asked = examples(grouped(photos, views), nobody, index, confidence.spacing_m, WITHIN_M)
+        asked = make_examples(grouped(photos, views), nobody, index, confidence.spacing_m, WITHIN_M)
         bins = confidence_lines(
             f"{views} photo{'s together' if views > 1 else ''}", asked, confidence
         )
         if views == 1:
-            picture = diagram(
+            picture = reliability_diagram(
                 bins,
                 "Probability said and share that was right, test photos inside and outside the gallery",
             )
             storage.write_bytes(str(given.out / "reliability.svg"), picture.encode())
             for strangers in (0.0, 0.2):
-                track_lines(asked, confidence, gallery_map(index), strangers)
+                track_lines(asked, confidence, read_gallery_map(index), strangers)
 
 
 if __name__ == "__main__":

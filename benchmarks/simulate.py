@@ -18,17 +18,17 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from PIL import Image
 
-from pipeline.simulation.location import Order, photograph
+from pipeline.simulation.location import LocationSpec, render_location
 
 VIEWS = 54
 
 
 def measure(size: int, locations: int) -> float:
     """Pictures per second of CPU time, whole locations."""
-    photograph(Order(seed=1, location=1, views=1, size=size))
+    render_location(LocationSpec(seed=1, location=1, views=1, size=size))
     begin = time.process_time()
     for location in range(locations):
-        photograph(Order(seed=1, location=2 + location, views=VIEWS, size=size))
+        render_location(LocationSpec(seed=1, location=2 + location, views=VIEWS, size=size))
     return locations * (VIEWS + 1) / (time.process_time() - begin)
 
 
@@ -38,7 +38,7 @@ def contact_sheet(
     """Write a JPEG with a row per location."""
     rows = []
     for location in locations:
-        taken = photograph(Order(seed=seed, location=location, views=views, size=size))
+        taken = render_location(LocationSpec(seed=seed, location=location, views=views, size=size))
         rows.append(
             np.hstack(
                 [

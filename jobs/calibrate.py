@@ -11,7 +11,7 @@ from itertools import islice
 import numpy as np
 
 from jobs.command_line.cli import run
-from jobs.encoding.encoder import read_checkpoint
+from jobs.encoding.encoder import read_checkpoint_bytes
 from jobs.encoding.photo_encoder import PhotoEncoder
 from model.checkpoint import loads
 from pipeline.core import storage
@@ -19,21 +19,26 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import console, progress, results
 from pipeline.core.records import Split, View
 from pipeline.index.searcher import Index
-from pipeline.locate.calibration import Gallery, Judging, calibrate
-from pipeline.locate.calibration_data import Labelled, examples
-from pipeline.locate.confidence import FILE, Confidence, read_confidence, write_confidence
-from pipeline.locate.gallery_map import gallery_map
-from pipeline.locate.reliability import diagram
+from pipeline.locate.calibration import CalibrationContext, CalibrationCriteria, fit_calibration
+from pipeline.locate.calibration_data import LabelledImages, make_examples
+from pipeline.locate.confidence import (
+    CALIBRATION_FILE,
+    Calibration,
+    read_calibration,
+    write_calibration,
+)
+from pipeline.locate.gallery_map import read_gallery_map
+from pipeline.locate.reliability import reliability_diagram
 from pipeline.shards.external import open_manifest
 from pipeline.shards.manifest import refuse_missing
 from pipeline.shards.samples import read_shard
 
-BATCH = 256
+ENCODE_BATCH = 256
 "Photos that are encoded and asked at a time."
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings(Judging):
+class Settings(CalibrationCriteria):
     """What is calibrated, on which photos."""
 
     checkpoint: str
@@ -61,58 +66,61 @@ class Settings(Judging):
             raise InputError(f"--photos is {self.photos}, expected at least 1")
 
 
-def calibrate_index(settings: Settings) -> Confidence:
+def calibrate_index(settings: Settings) -> Calibration:
     """Calibrate an index, unless its calibration is there; one of another gallery or settings is
     replaced. Returns it.
 
     Raises InputError and CheckpointError on unusable input.
     """
-    out = settings.out or storage.join(settings.index, FILE)
+    out = settings.out or storage.join(settings.index, CALIBRATION_FILE)
     index = Index(settings.index)
     asked = f"{settings.split} {settings.view} -> {settings.gallery_view}, at most {settings.photos} photos"
     wanted = (asked, len(index), settings.tolerance, settings.outside)
-    there = finished(out, index)
+    there = load_if_done(out, index)
     if there and (there.asked, there.gallery, there.tolerance_m, there.outside) == wanted:
         console.print(f"{out} is complete; nothing to do")
         return there
-    data = read_checkpoint(settings.checkpoint)
+    data = read_checkpoint_bytes(settings.checkpoint)
     encoder = PhotoEncoder(data, settings.checkpoint, index.facts, settings.shards)
     trained_on = frozenset(loads(data, settings.checkpoint).locations)
-    photos = embedded(settings, encoder, settings.view, trained_on, settings.photos)
-    overhead = embedded(settings, encoder, settings.gallery_view, trained_on, None)
-    spacing_m = gallery_map(index).spacing_m
-    found = examples(photos, overhead, index, spacing_m, settings.tolerance)
-    gallery = Gallery(
+    photos = embed_view(settings, encoder, settings.view, trained_on, settings.photos)
+    overhead = embed_view(settings, encoder, settings.gallery_view, trained_on, None)
+    spacing_m = read_gallery_map(index).spacing_m
+    found = make_examples(photos, overhead, index, spacing_m, settings.tolerance)
+    gallery = CalibrationContext(
         fingerprint=encoder.fingerprint, rows=len(index), spacing_m=spacing_m, asked=asked
     )
-    confidence = calibrate(found, settings, gallery)
-    write_confidence(out, confidence)
+    confidence = fit_calibration(found, settings, gallery)
+    write_calibration(out, confidence)
     picture = f"{out.removesuffix('.json')}.svg"
     storage.write_bytes(
-        picture, diagram(confidence.bins, f"Reliability over {confidence.photos} photos").encode()
+        picture,
+        reliability_diagram(
+            confidence.bins, f"Reliability over {confidence.photos} photos"
+        ).encode(),
     )
-    console.print(told(confidence))
+    console.print(summary(confidence))
     results.print(f"calibration: {out}, diagram: {picture}", soft_wrap=True)
     return confidence
 
 
-def finished(out: str, index: Index) -> Confidence | None:
+def load_if_done(out: str, index: Index) -> Calibration | None:
     """The calibration that is there; none where it is another network's or damaged, as it is to be
     replaced.
     """
     try:
-        return read_confidence(out, index.facts) if storage.exists(out) else None
+        return read_calibration(out, index.facts) if storage.exists(out) else None
     except InputError:
         return None
 
 
-def embedded(
+def embed_view(
     settings: Settings,
     encoder: PhotoEncoder,
     view: View,
     trained_on: frozenset[str],
     most: int | None,
-) -> Labelled:
+) -> LabelledImages:
     """The first images of a view that show places which were not trained on, with their embeddings;
     damaged ones left out.
 
@@ -129,7 +137,7 @@ def embedded(
     facts, blocks = [], [np.empty((0, encoder.dimension), np.float32)]
     with progress(None, f"{view} images", "images") as meter:
         wanted = islice(samples, most)
-        while batch := list(islice(wanted, BATCH)):
+        while batch := list(islice(wanted, ENCODE_BATCH)):
             block_BD, rejected = encoder.encode([sample.data for sample in batch])
             facts += [
                 sample.facts
@@ -138,10 +146,10 @@ def embedded(
             ]
             blocks.append(block_BD)
             meter.advance(len(batch))
-    return Labelled(facts=facts, embeddings_QD=np.concatenate(blocks))
+    return LabelledImages(facts=facts, embeddings_QD=np.concatenate(blocks))
 
 
-def told(confidence: Confidence) -> str:
+def summary(confidence: Calibration) -> str:
     """What the calibration found, in words."""
     return (
         f"{confidence.photos} photos of {confidence.locations} places not trained on: {confidence.right:.1%} answered rightly; "

@@ -20,7 +20,7 @@ from rich.text import Text
 from jobs.calibrate import Settings as CalibrationSettings
 from jobs.calibrate import calibrate_index
 from jobs.command_line.cli import run
-from jobs.encoding.encoder import network_of
+from jobs.encoding.encoder import make_encoder_spec
 from jobs.evaluate import print_table
 from jobs.locate import Settings as LocateSettings
 from jobs.locate import locate_photos
@@ -38,8 +38,8 @@ from pipeline.features.embed import EmbeddingSettings, embed_gallery
 from pipeline.features.table import open_table
 from pipeline.index.build import IndexSettings, build_index
 from pipeline.index.searcher import Index
-from pipeline.locate.geojson import Located
-from pipeline.locate.page import Place, away_m, told_m
+from pipeline.locate.geojson import LocatedPhoto
+from pipeline.locate.page import LatLon, distance_to_m, format_distance
 from pipeline.shards.pack import PackingSettings, pack
 from pipeline.simulation.simulate import SimulationSettings, simulate
 from pipeline.sources.university1652 import University1652
@@ -109,7 +109,9 @@ def demo(settings: Settings) -> list[dict[str, Any]]:
         ):
             for split in (Split.QUERY, Split.GALLERY):
                 embedding = EmbeddingSettings(shards=shards, out=table, split=split)
-                embed_gallery(embedding, network_of(storage.read_bytes(file), file, embedding))
+                embed_gallery(
+                    embedding, make_encoder_spec(storage.read_bytes(file), file, embedding)
+                )
         with step(
             seconds,
             f"{5 + 2 * number} evaluate",
@@ -213,7 +215,8 @@ def locate_some(demo: Demo) -> str:
     names = sorted(name for name in places if storage.is_folder(storage.join(root, name)))[:PHOTOS]
     folders = {storage.join(root, name): places[name] for name in names}
     firsts = {
-        storage.join(folder, storage.names(folder)[0]): place for folder, place in folders.items()
+        storage.join(folder, storage.list_names(folder)[0]): place
+        for folder, place in folders.items()
     }
     page = storage.join(demo.out, "photos.html")
     asked = LocateSettings(
@@ -238,17 +241,17 @@ def locate_some(demo: Demo) -> str:
     return page
 
 
-def positions(path: str) -> dict[str, Place]:
+def positions(path: str) -> dict[str, LatLon]:
     """Latitude and longitude by location, as the simulator wrote them."""
     rows = csv.DictReader(io.StringIO(storage.read_bytes(path).decode()))
     return {row["location"]: (float(row["lat"]), float(row["lon"])) for row in rows}
 
 
-def _cells(one: Located, place: Place) -> tuple[str, str]:
+def _cells(one: LocatedPhoto, place: LatLon) -> tuple[str, str]:
     """How far off an answer is, and how sure it was."""
     answer = one.answer
     if answer is None:
         return "not decoded", ""
-    off = told_m(away_m(answer, place))
+    off = format_distance(distance_to_m(answer, place))
     sure = "" if answer.probability is None else f"{answer.probability:.0%}"
     return off if answer.known else f"unknown ({off})", sure

@@ -5,7 +5,7 @@ TABLE`.
 from dataclasses import dataclass, fields
 
 from jobs.command_line.cli import run
-from jobs.encoding.encoder import EncoderSettings, network_of, read_checkpoint
+from jobs.encoding.encoder import EncoderSettings, make_encoder_spec, read_checkpoint_bytes
 from pipeline.core import storage
 from pipeline.features.embed import EmbeddingSettings, embed_gallery
 
@@ -20,14 +20,14 @@ class Settings(EmbeddingSettings, EncoderSettings):
 
 def main(settings: Settings) -> None:
     """Embed shards into a feature table, one part per shard; finished parts are skipped."""
-    checkpoint = read_checkpoint(settings.checkpoint)
+    checkpoint = read_checkpoint_bytes(settings.checkpoint)
     given = {field.name: getattr(settings, field.name) for field in fields(EmbeddingSettings)}
     given |= {"shards": storage.absolute(settings.shards), "out": storage.absolute(settings.out)}
     embedding = EmbeddingSettings(**given)
     encoder = EncoderSettings(
         **{field.name: getattr(settings, field.name) for field in fields(EncoderSettings)}
     )
-    network = network_of(checkpoint, settings.checkpoint, embedding, encoder)
+    network = make_encoder_spec(checkpoint, settings.checkpoint, embedding, encoder)
     embed_gallery(embedding, network)
 
 

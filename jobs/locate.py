@@ -17,37 +17,37 @@ from rich import box
 from rich.table import Table
 
 from jobs.command_line.cli import run
-from jobs.encoding.encoder import read_checkpoint
+from jobs.encoding.encoder import read_checkpoint_bytes
 from jobs.encoding.photo_encoder import PhotoEncoder
-from jobs.encoding.queries import Query, read_photos, together
+from jobs.encoding.queries import Query, encode_photos, merge_by_folder
 from pipeline.core import rejections, storage
-from pipeline.core.errors import InputError, Unfinished
-from pipeline.core.geo import Near
+from pipeline.core.errors import Incomplete, InputError
+from pipeline.core.geo import Circle
 from pipeline.core.progress import console, results
 from pipeline.features.part import verify_part
-from pipeline.images.thumbnails import no_pictures
-from pipeline.index.filters import Where
+from pipeline.images.thumbnails import no_images
+from pipeline.index.filters import Filter
 from pipeline.index.searcher import Index
 from pipeline.locate import geojson
-from pipeline.locate.confidence import Confidence, find_confidence, read_confidence
-from pipeline.locate.flight import LIKELIER, motion_over, settle
-from pipeline.locate.gallery_map import GalleryMap, gallery_map
-from pipeline.locate.geojson import Located
-from pipeline.locate.locate import Answer, locate
-from pipeline.locate.page import Place, Surroundings, render
-from pipeline.locate.photo_files import find_photos, read_times, seconds
-from pipeline.locate.track import TRACKED, Motion, Start
+from pipeline.locate.confidence import Calibration, find_calibration, read_calibration
+from pipeline.locate.flight import TRACK_THRESHOLD, apply_track, motion_for_gallery
+from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
+from pipeline.locate.geojson import LocatedPhoto
+from pipeline.locate.locate import Answer, locate_embeddings
+from pipeline.locate.page import LatLon, PageContext, render_page
+from pipeline.locate.photo_files import find_photos, parse_time, read_times
+from pipeline.locate.track import TRACK_CANDIDATES, Motion, TrackStart
 from pipeline.shards.manifest import read_manifest
 from pipeline.shards.record_table import footprints
 from pipeline.shards.samples import fetch
 
-THREE_NUMBERS: Any = tyro.constructors.PrimitiveConstructorSpec(
+CIRCLE_FLAG: Any = tyro.constructors.PrimitiveConstructorSpec(
     nargs=3,  # tyro's own reading of an optional tuple takes the photos behind it as well
     metavar="LAT LON METRES",
-    instance_from_str=lambda said: Near(
+    instance_from_str=lambda said: Circle(
         lat=float(said[0]), lon=float(said[1]), radius_m=float(said[2])
     ),
-    is_instance=lambda value: value is None or isinstance(value, Near),
+    is_instance=lambda value: value is None or isinstance(value, Circle),
     str_from_instance=lambda value: (
         [str(value)] if value is None else [str(value.lat), str(value.lon), str(value.radius_m)]
     ),
@@ -71,7 +71,7 @@ class Settings:
     "Candidates that are listed of each photo."
     together: bool = False
     "All photos of a folder show one place: they are asked as one, by the mean of their embeddings."
-    near: Annotated[Near | None, THREE_NUMBERS] = None
+    near: Annotated[Circle | None, CIRCLE_FLAG] = None
     """Only gallery images in this circle may answer. With --track it is where the flight began,
     when its first photo was taken."""
     track: bool = False
@@ -111,28 +111,30 @@ class Settings:
         Motion(max_speed=self.max_speed, elsewhere=self.elsewhere)  # which checks them
 
 
-def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None) -> list[Located]:
+def locate_photos(
+    settings: Settings, true_positions: Mapping[str, LatLon] | None = None
+) -> list[LocatedPhoto]:
     """Answer, write what was asked for, and return the answers in the order of the photos (of their
     folders, together).
 
-    `truths`: where photos were really taken, by name, for the page. Raises InputError and CheckpointError on unusable input.
+    `true_positions`: where photos were really taken, by name, for the page. Raises InputError and CheckpointError on unusable input.
     """
     photos = find_photos(settings.photos)
-    checkpoint = read_checkpoint(settings.checkpoint)
+    checkpoint = read_checkpoint_bytes(settings.checkpoint)
     index = Index(settings.index, whole=settings.verify or None)
     if settings.verify and index.told.refine == "table":
         for name in index.told.table_parts:
             verify_part(storage.join(index.told.table, name))
-    confidence = confidence_of(settings, index)
+    confidence = load_calibration(settings, index)
     encoder = PhotoEncoder(checkpoint, settings.checkpoint, index.facts, settings.shards)
-    gallery = gallery_map(index)
-    queries = read_photos(photos, encoder)
+    gallery = read_gallery_map(index)
+    queries = encode_photos(photos, encoder)
     if settings.together:
-        queries = together(queries)
+        queries = merge_by_folder(queries)
     asked = [query for query in queries if query.embedding_D is not None]
     if settings.track:
-        asked = timed(asked, settings)
-    answers = ask(asked, index, gallery, confidence, settings)
+        asked = with_times(asked, settings)
+    answers = answer_queries(asked, index, gallery, confidence, settings)
     answered = dict(
         zip((query.name for query in asked), zip(asked, answers, strict=True), strict=True)
     )
@@ -143,31 +145,31 @@ def locate_photos(settings: Settings, truths: Mapping[str, Place] | None = None)
         for query in queries
     ]
     if settings.track:
-        located.sort(key=lambda one: (one.taken_at is None, seconds(one.taken_at or "0")))
+        located.sort(key=lambda one: (one.taken_at is None, parse_time(one.taken_at or "0")))
     about = {
         "index": settings.index, "fingerprint": encoder.fingerprint, "together": settings.together,
-        "threshold": LIKELIER if settings.track else confidence.threshold if confidence else None,
+        "threshold": TRACK_THRESHOLD if settings.track else confidence.threshold if confidence else None,
     }  # fmt: skip
-    storage.write_bytes(settings.out, geojson.geojson(located, about, settings.track))
+    storage.write_bytes(settings.out, geojson.to_geojson(located, about, settings.track))
     if settings.csv:
-        storage.write_bytes(settings.csv, geojson.table(located))
+        storage.write_bytes(settings.csv, geojson.to_csv(located))
     if settings.page:
-        around = Surroundings(
+        around = PageContext(
             title="Where these photos were taken",
             gallery=gallery,
             confidence=confidence,
             fingerprint=encoder.fingerprint,
             track=settings.track,
-            truths=truths or {},
+            true_positions=true_positions or {},
         )
         storage.write_bytes(
-            settings.page, page(located, around, settings.shards).encode("utf-8", "replace")
+            settings.page, make_page(located, around, settings.shards).encode("utf-8", "replace")
         )
     return located
 
 
-def ask(
-    queries: Sequence[Query], index: Index, gallery: GalleryMap, confidence: Confidence | None, settings: Settings
+def answer_queries(
+    queries: Sequence[Query], index: Index, gallery: GalleryMap, confidence: Calibration | None, settings: Settings
 ) -> list[Answer]:  # fmt: skip
     """An answer per query, in the light of the whole flight with --track."""
     embeddings_QD = np.array([query.embedding_D for query in queries], np.float32).reshape(
@@ -175,24 +177,28 @@ def ask(
     )
     near = settings.near
     if not settings.track or confidence is None:
-        where = Where(near=near) if near else None
-        return locate(index, embeddings_QD, settings.top, where, confidence, gallery.spacing_m)
-    single = locate(index, embeddings_QD, max(settings.top, TRACKED), None, confidence)
-    start = Start(lat=near.lat, lon=near.lon, radius_m=near.radius_m) if near else None
-    motion = motion_over(gallery, settings.max_speed, settings.elsewhere)
-    return settle(
-        single, [seconds(query.taken_at or "0") for query in queries], confidence, motion, start
+        where = Filter(near=near) if near else None
+        return locate_embeddings(
+            index, embeddings_QD, settings.top, where, confidence, gallery.spacing_m
+        )
+    single = locate_embeddings(
+        index, embeddings_QD, max(settings.top, TRACK_CANDIDATES), None, confidence
+    )
+    start = TrackStart(lat=near.lat, lon=near.lon, radius_m=near.radius_m) if near else None
+    motion = motion_for_gallery(gallery, settings.max_speed, settings.elsewhere)
+    return apply_track(
+        single, [parse_time(query.taken_at or "0") for query in queries], confidence, motion, start
     )
 
 
-def confidence_of(settings: Settings, index: Index) -> Confidence | None:
+def load_calibration(settings: Settings, index: Index) -> Calibration | None:
     """The calibration that was named, or the one beside the index, or none, which is said.
 
     Raises InputError where it is another network's, or where there is none and a track needs one.
     """
     if settings.calibration:
-        return read_confidence(settings.calibration, index.facts)
-    confidence = find_confidence(settings.index, index.facts)
+        return read_calibration(settings.calibration, index.facts)
+    confidence = find_calibration(settings.index, index.facts)
     if confidence is None and settings.track:
         raise InputError(
             f"no calibration beside {settings.index}, and --track weighs candidates by one; expected calibration.json; make it "
@@ -211,7 +217,7 @@ def confidence_of(settings: Settings, index: Index) -> Confidence | None:
     return confidence
 
 
-def timed(queries: Sequence[Query], settings: Settings) -> list[Query]:
+def with_times(queries: Sequence[Query], settings: Settings) -> list[Query]:
     """The photos with when each was taken: by the table, else by the interval, else as the cameras
     say.
 
@@ -233,9 +239,9 @@ def timed(queries: Sequence[Query], settings: Settings) -> list[Query]:
     return [replace(query, taken_at=said[query.name]) for query in queries]
 
 
-def _located(query: Query, answer: Answer | None, top: int) -> Located:
+def _located(query: Query, answer: Answer | None, top: int) -> LocatedPhoto:
     shown = replace(answer, candidates=answer.candidates[:top]) if answer else None
-    return Located(
+    return LocatedPhoto(
         name=query.name,
         photos=query.photos,
         answer=shown,
@@ -244,19 +250,19 @@ def _located(query: Query, answer: Answer | None, top: int) -> Located:
     )
 
 
-def page(located: Sequence[Located], around: Surroundings, shards: str | None) -> str:
+def make_page(located: Sequence[LocatedPhoto], around: PageContext, shards: str | None) -> str:
     """The HTML page; with pictures and corners of the gallery's images where shards are at hand."""
 
     def photos(names: Iterable[str]) -> dict[str, bytes]:
         return {name: storage.read_bytes(name) for name in names}
 
     if shards is None:
-        return render(located, around, photos, no_pictures)
+        return render_page(located, around, photos, no_images)
     around = replace(around, footprints=partial(footprints, shards, read_manifest(shards)))
-    return render(located, around, photos, partial(fetch, shards))
+    return render_page(located, around, photos, partial(fetch, shards))
 
 
-def print_answers(located: Sequence[Located]) -> None:
+def print_answers(located: Sequence[LocatedPhoto]) -> None:
     """The answers on standard output, a line each."""
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for heading in ("photo", "position", "within", "sure", "location", "score"):
@@ -270,7 +276,7 @@ def print_answers(located: Sequence[Located]) -> None:
     results.print(table)
 
 
-def _cells(one: Located) -> list[str]:
+def _cells(one: LocatedPhoto) -> list[str]:
     answer = one.answer
     if answer is None:
         return [one.rejected[0].reason, "", "", "", ""]
@@ -298,9 +304,9 @@ def main(settings: Settings) -> None:
     )
     damaged = [refused for one in located for refused in one.rejected]
     if damaged:
-        raise Unfinished(
+        raise Incomplete(
             f"{len(damaged)} of {sum(len(one.photos) for one in located)} photos could not be decoded: "
-            f"{rejections.commonest(damaged)}; they are listed in {settings.out}"
+            f"{rejections.most_common_reasons(damaged)}; they are listed in {settings.out}"
         )
 
 

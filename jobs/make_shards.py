@@ -11,7 +11,7 @@ import tyro
 
 from jobs.command_line.cli import run
 from pipeline.core import storage
-from pipeline.core.errors import InputError, Unfinished
+from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.progress import console
 from pipeline.shards import record_table
 from pipeline.shards.manifest import read_manifest
@@ -70,7 +70,7 @@ def check(out: str, verify: bool = False) -> None:
     for sentence in wrong:
         console.print(sentence)
     if wrong:
-        raise Unfinished(
+        raise Incomplete(
             f"{out} is damaged in {len(wrong)} places; run the command that packed it again: it makes anew the shards that are "
             "named, and no others"
         )

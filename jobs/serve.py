@@ -15,15 +15,15 @@ from jobs.command_line.cli import run
 from jobs.encoding.photo_encoder import PhotoEncoder
 from model.checkpoint import CheckpointError
 from pipeline.core import cluster, storage
-from pipeline.core.cluster import place
+from pipeline.core.cluster import plan_placement
 from pipeline.core.errors import InputError
 from pipeline.core.progress import console
-from pipeline.index.metadata import FACTS
-from pipeline.service.answerer import Answerer
+from pipeline.index.metadata import METADATA_FILE
+from pipeline.service.answerer import Predictor
 from pipeline.service.app import Service
-from pipeline.service.batcher import Gone
+from pipeline.service.batcher import ReplicaLost
 from pipeline.service.engine import NotReady
-from pipeline.service.live_index import LOOK_EVERY_S
+from pipeline.service.live_index import POLL_INTERVAL_S
 from pipeline.service.replicas import Replicas
 from pipeline.service.settings import ServiceSettings
 
@@ -50,7 +50,7 @@ class Settings(ServiceSettings):
                 raise InputError(f"--{name} is {value}, expected at least 1")
 
 
-def load(checkpoint: str, index: str, shards: str | None, threads: int) -> Answerer:
+def load_predictor(checkpoint: str, index: str, shards: str | None, threads: int) -> Predictor:
     """What each replica calls. Raises InputError."""
     import torch
 
@@ -64,14 +64,14 @@ def load(checkpoint: str, index: str, shards: str | None, threads: int) -> Answe
         except CheckpointError as error:
             raise InputError(str(error)) from None
 
-    return Answerer(index, encoder_for)
+    return Predictor(index, encoder_for)
 
 
 def main(settings: Settings) -> None:
     """Answer over HTTP where photos were taken, until Ctrl-C or SIGTERM."""
     for name, path, hint in (
         ("checkpoint", settings.checkpoint, "a last.pt of jobs/train.py"),
-        ("index", storage.join(settings.index, FACTS), "an index of jobs/build_index.py"),
+        ("index", storage.join(settings.index, METADATA_FILE), "an index of jobs/build_index.py"),
     ):
         if not storage.is_file(path):
             raise InputError(f"no {name} at {path}; expected {hint}; check --{name}")
@@ -84,12 +84,14 @@ async def serve(settings: Settings, token: str | None) -> None:
     """Listen at once, so that whoever asks for its health hears that it is loading; answer once it
     has loaded.
     """
-    placement = place(cluster.nodes(), settings.replicas, settings.replicas, settings.threads)
+    placement = plan_placement(
+        cluster.nodes(), settings.replicas, settings.replicas, settings.threads
+    )
     shards = None if settings.shards is None else storage.absolute(settings.shards)
     checkpoint, index = storage.absolute(settings.checkpoint), storage.absolute(settings.index)
-    make = partial(load, checkpoint, index, shards, placement.cpus)
+    make = partial(load_predictor, checkpoint, index, shards, placement.cpus)
     replicas = Replicas(f"pvda-{os.getpid()}", placement, make)
-    runner = Service(settings, replicas, token, abreast=placement.workers).runner()
+    runner = Service(settings, replicas, token, concurrency=placement.workers).runner()
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
@@ -103,7 +105,7 @@ async def serve(settings: Settings, token: str | None) -> None:
                 f"cannot listen on {settings.host} port {settings.port}: {error.strerror}; choose another --port"
             ) from None
         console.print(f"http://{settings.host}:{site.port} listens; loading")
-        working = asyncio.create_task(work(replicas))
+        working = asyncio.create_task(watch_replicas(replicas))
         stopping = asyncio.create_task(stop.wait())
         await asyncio.wait([working, stopping], return_when=asyncio.FIRST_COMPLETED)
         if working.done():
@@ -115,7 +117,7 @@ async def serve(settings: Settings, token: str | None) -> None:
         await asyncio.to_thread(replicas.stop)
 
 
-async def work(replicas: Replicas) -> None:
+async def watch_replicas(replicas: Replicas) -> None:
     """Load, then tell whenever another index answers or one was refused; replicas themselves are
     silent.
     """
@@ -124,10 +126,10 @@ async def work(replicas: Replicas) -> None:
         f"ready: {known.rows} rows, {known.factory}, network {known.fingerprint[:12]}; Ctrl-C ends it"
     )
     while True:
-        await asyncio.sleep(LOOK_EVERY_S)
+        await asyncio.sleep(POLL_INTERVAL_S)
         try:
             status = await replicas.status()
-        except (NotReady, Gone):  # another replica is on its way
+        except (NotReady, ReplicaLost):  # another replica is on its way
             continue
         if status != known:
             said = f"another index answers: {status.rows} rows, {status.factory}"

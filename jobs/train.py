@@ -31,9 +31,9 @@ from model.checkpoint import CheckpointError
 from model.pvda import FeatureEncoder
 from model.weights.load import load_backbone, read_state_dict
 from pipeline.core import cluster, storage
-from pipeline.core.lock import one_at_a_time
+from pipeline.core.lock import locks_output
 from pipeline.core.progress import Meter, console, progress
-from pipeline.core.errors import InputError, Unfinished
+from pipeline.core.errors import InputError, Incomplete
 from pipeline.core.records import Split
 from pipeline.shards.manifest import read_manifest, refuse_missing
 from pipeline.shards.verify import refuse_damaged
@@ -90,7 +90,7 @@ class Settings(Conduct):
         )
 
 
-@one_at_a_time(lambda settings: settings.out)
+@locks_output(lambda settings: settings.out)
 def train(settings: Settings) -> str:
     """Train a recipe to its end and return the checkpoint's path; a finished run is left as it is.
 
@@ -241,7 +241,7 @@ def ray_worker(config: dict[str, Any]) -> None:
         place = replace(place, distribute=distribute, share=share, gather=gather)
     try:
         train_worker(config["run"], place, told.put if rank == 0 else lambda facts: None)
-    except (Unfinished, InputError, CheckpointError) as error:
+    except (Incomplete, InputError, CheckpointError) as error:
         told.put({"refused": error})
         raise
 

@@ -15,7 +15,7 @@ import tyro
 from jobs import STOPPED
 from jobs.command_line.signals import interruptible
 from model.checkpoint import CheckpointError
-from pipeline.core.errors import InputError, Unfinished
+from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.progress import console
 
 SECONDS_TO_END = 15.0
@@ -46,7 +46,7 @@ def run(
             asked = "check the path, its rights and the room on its disk, and run the same command again to go on"
             _say(f"{where}{error.strerror or error}; {asked}")
             sys.exit(1)
-        except Unfinished as error:
+        except Incomplete as error:
             _say(str(error))
             sys.exit(1)
         except (Exception, KeyboardInterrupt) as error:

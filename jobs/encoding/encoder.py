@@ -22,15 +22,15 @@ from model.inference.optimise import make_fast
 from pipeline.batches.ordered import CHANGED, decoded, stack
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.features.embed import EmbeddingSettings, Network
+from pipeline.features.embed import EmbeddingSettings, EncoderSpec
 from pipeline.features.table import Floats
 from pipeline.images.decode import DecodeError, Pixels
-from pipeline.images.transforms import Resizer, preprocessing
+from pipeline.images.transforms import Resizer, preprocessing_name
 from pipeline.shards.external import open_manifest
 from pipeline.shards.manifest import Manifest, mending, refuse_missing
 from pipeline.shards.samples import Sample, read_shard
 
-PROBES, CALIBRATING = 16, 128
+PROBE_IMAGES, CALIBRATION_IMAGES = 16, 128
 "Images by which the fast encoder is checked, and by which int8 is calibrated."
 Compiling = Literal["auto", "always", "never"]
 Bytes = npt.NDArray[np.uint8]
@@ -53,7 +53,7 @@ class EncoderSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Blueprint:
+class EncoderRecipe:
     """What a worker makes an encoder of."""
 
     checkpoint: bytes
@@ -66,7 +66,7 @@ class Blueprint:
     calibration_B3HW: Bytes | None
 
 
-def read_checkpoint(path: str) -> bytes:
+def read_checkpoint_bytes(path: str) -> bytes:
     """The bytes of a checkpoint.
 
     Raises InputError when there is none.
@@ -78,10 +78,10 @@ def read_checkpoint(path: str) -> bytes:
     return storage.read_bytes(path)
 
 
-class Embedder:
+class WorkerEncoder:
     """An encoder, made and called on a worker. `remarks` are told on the terminal."""
 
-    def __init__(self, blueprint: Blueprint, threads: int) -> None:
+    def __init__(self, blueprint: EncoderRecipe, threads: int) -> None:
         # Ray sets OMP_NUM_THREADS to the actor's cores before torch is imported; said again for
         # callers without Ray.
         torch.set_num_threads(threads)
@@ -108,9 +108,9 @@ class Embedder:
         return result
 
 
-def network_of(
+def make_encoder_spec(
     data: bytes, name: str, embedding: EmbeddingSettings, settings: EncoderSettings | None = None
-) -> Network:
+) -> EncoderSpec:
     """What the embedder needs to know of a checkpoint whose bytes came from `name`.
 
     Raises CheckpointError when the bytes are none, InputError where the precision cannot be had or
@@ -128,34 +128,34 @@ def network_of(
             raise InputError(str(error)) from None
     # Once: of shards that others made it is a pass over all tars.
     manifest = open_manifest(embedding.shards, embedding.split, embedding.view)
-    count = PROBES + (CALIBRATING if precision == "int8" else 0)
-    some_B3HW = some_images(embedding.shards, manifest, size, settings.resizer, count)
-    calibration_B3HW = some_B3HW[PROBES:] if precision == "int8" else None
+    count = PROBE_IMAGES + (CALIBRATION_IMAGES if precision == "int8" else 0)
+    some_B3HW = first_images(embedding.shards, manifest, size, settings.resizer, count)
+    calibration_B3HW = some_B3HW[PROBE_IMAGES:] if precision == "int8" else None
     digest = (
         None if calibration_B3HW is None else calibration_digest(torch.from_numpy(calibration_B3HW))
     )
     said = with_precision(
-        f"{preprocessing(settings.resizer)}, mirror {settings.mirror}", precision, digest
+        f"{preprocessing_name(settings.resizer)}, mirror {settings.mirror}", precision, digest
     )
-    blueprint = Blueprint(
+    blueprint = EncoderRecipe(
         checkpoint=data,
         settings=settings,
         precision=precision,
         batch_size=embedding.batch_size,
         images=sum(shard.samples for shard in manifest.of(embedding.split, embedding.view))
         // (embedding.workers or 1),
-        probe_B3HW=some_B3HW[:PROBES],
+        probe_B3HW=some_B3HW[:PROBE_IMAGES],
         calibration_B3HW=calibration_B3HW,
     )
-    return Network(
+    return EncoderSpec(
         fingerprint=fingerprint(checkpoint, said),
         image_size=size,
         resizer=settings.resizer,
-        factory=partial(Embedder, blueprint),
+        factory=partial(WorkerEncoder, blueprint),
     )
 
 
-def some_images(shards: str, manifest: Manifest, size: int, resizer: Resizer, count: int) -> Bytes:
+def first_images(shards: str, manifest: Manifest, size: int, resizer: Resizer, count: int) -> Bytes:
     """The first images of a set, from each split and view alike, as bytes (at most `count`, 3,
     size, size).
 
@@ -171,7 +171,9 @@ def some_images(shards: str, manifest: Manifest, size: int, resizer: Resizer, co
     refuse_missing(shards, first.values())
     for shard in first.values():
         samples = read_shard(shards, shard.name, shard.split, shard.view)
-        images = (usable(shards, *opened) for opened in decoded(samples, size, 1, 4, resizer))
+        images = (
+            usable_pixels(shards, *opened) for opened in decoded(samples, size, 1, 4, resizer)
+        )
         found.append(
             list(islice((image for image in images if image is not None), -(-count // len(first))))
         )
@@ -186,7 +188,7 @@ def some_images(shards: str, manifest: Manifest, size: int, resizer: Resizer, co
     return stack(mixed)
 
 
-def usable(shards: str, sample: Sample, image: Pixels | DecodeError) -> Pixels | None:
+def usable_pixels(shards: str, sample: Sample, image: Pixels | DecodeError) -> Pixels | None:
     """An image's pixels, None where it has none. Raises InputError where it is not the one that was
     packed.
     """

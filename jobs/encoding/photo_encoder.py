@@ -14,29 +14,29 @@ from typing import Any
 import numpy as np
 import torch
 
-from jobs.encoding.encoder import CALIBRATING, PROBES, Bytes, some_images
+from jobs.encoding.encoder import CALIBRATION_IMAGES, PROBE_IMAGES, Bytes, first_images
 from model.checkpoint import Checkpoint, build_encoder, fingerprint, loads
 from model.inference.embed import InEffect, with_precision
 from model.inference.int8 import calibration_digest, require_int8
 from model.inference.optimise import make_fast
 from pipeline.batches.ordered import stack
 from pipeline.core.errors import InputError
-from pipeline.core.prefetch import ahead
+from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import Rejection
 from pipeline.features.table import Floats
 from pipeline.images.decode import DecodeError, Pixels, decode
 from pipeline.images.inspect import inspect
-from pipeline.images.transforms import Resizer, preprocessing, resize
+from pipeline.images.transforms import Resizer, preprocessing_name, resize
 from pipeline.shards.external import open_manifest
 
-BATCH = 32
+FORWARD_BATCH = 32
 "Photos of a forward pass."
-THREADS = 2
+DECODE_THREADS = 2
 "That decode; the network computes on all cores."
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Way:
+class EncodingConfig:
     """One way to embed with a network."""
 
     mirror: bool
@@ -49,7 +49,7 @@ class _Way:
     def fingerprint(self, checkpoint: Checkpoint) -> str:
         calibration = self.calibration_B3HW
         digest = None if calibration is None else calibration_digest(torch.from_numpy(calibration))
-        said = f"{preprocessing(self.resizer)}, mirror {self.mirror}"
+        said = f"{preprocessing_name(self.resizer)}, mirror {self.mirror}"
         return fingerprint(checkpoint, with_precision(said, self.precision, digest))
 
 
@@ -71,7 +71,7 @@ class PhotoEncoder:
         opened = loads(checkpoint, name)
         self.image_size = opened.network.image_size
         self.fingerprint: str = index_facts["fingerprint"]
-        ways = _ways(shards, self.image_size)
+        ways = candidate_configs(shards, self.image_size)
         way = next((way for way in ways if way.fingerprint(opened) == self.fingerprint), None)
         if way is None:
             int8 = (
@@ -95,7 +95,7 @@ class PhotoEncoder:
         self._encode = make_fast(
             encoder,
             probe_B3HW=torch.from_numpy(way.probe_B3HW),
-            batch_size=BATCH,
+            batch_size=FORWARD_BATCH,
             precision=way.precision,
             mirror=way.mirror,
             compiled=False,  # compiling takes longer than some hundred photos
@@ -110,11 +110,11 @@ class PhotoEncoder:
         """Unit embeddings (Q, D) of the photos that can be decoded, in order, and for each photo
         None or why it has no row.
 
-        `names` are what a rejection's path says; by default the photos' numbers, from 1.
+        `list_names` are what a rejection's path says; by default the photos' numbers, from 1.
         """
         named = names or [f"photo {number}" for number in range(1, len(photos) + 1)]
         opened = (
-            list(ahead(self._open, photos, THREADS, 4 * THREADS))
+            list(prefetch_map(self._open, photos, DECODE_THREADS, 4 * DECODE_THREADS))
             if len(photos) > 1
             else [*map(self._open, photos)]
         )
@@ -138,33 +138,35 @@ class PhotoEncoder:
             return error
 
 
-def _ways(shards: str | None, size: int) -> Iterator[_Way]:
+def candidate_configs(shards: str | None, size: int) -> Iterator[EncodingConfig]:
     """All ways to embed, the likely ones first."""
     precisions: tuple[InEffect, ...] = ("float32", "bfloat16")
     resizers: tuple[Resizer, ...] = ("torch", "pillow")
-    made_B3HW = made_probes(size)
+    made_B3HW = synthetic_images(size)
     for precision, mirror, resizer in product(precisions, (True, False), resizers):
-        yield _Way(mirror=mirror, resizer=resizer, precision=precision, probe_B3HW=made_B3HW)
+        yield EncodingConfig(
+            mirror=mirror, resizer=resizer, precision=precision, probe_B3HW=made_B3HW
+        )
     if shards is None:
         return
     manifest = open_manifest(shards)
     for resizer, mirror in product(resizers, (True, False)):
-        some_B3HW = some_images(shards, manifest, size, resizer, PROBES + CALIBRATING)
-        yield _Way(
+        some_B3HW = first_images(shards, manifest, size, resizer, PROBE_IMAGES + CALIBRATION_IMAGES)
+        yield EncodingConfig(
             mirror=mirror,
             resizer=resizer,
             precision="int8",
-            probe_B3HW=some_B3HW[:PROBES],
-            calibration_B3HW=some_B3HW[PROBES:],
+            probe_B3HW=some_B3HW[:PROBE_IMAGES],
+            calibration_B3HW=some_B3HW[PROBE_IMAGES:],
         )
 
 
-def made_probes(size: int) -> Bytes:
+def synthetic_images(size: int) -> Bytes:
     """Images (PROBES, 3, size, size) to check the encoder by before any photo is there: clouds of
     colour, always the same.
     """
     rng = np.random.default_rng(0)
-    sides = [4 << number % 4 for number in range(PROBES)]
+    sides = [4 << number % 4 for number in range(PROBE_IMAGES)]
     return stack(
         [resize(rng.integers(0, 256, size=(side, side, 3), dtype=np.uint8), size) for side in sides]
     )

@@ -8,15 +8,15 @@ import numpy as np
 
 from jobs.encoding.photo_encoder import PhotoEncoder
 from pipeline.core import storage
-from pipeline.core.prefetch import ahead
+from pipeline.core.prefetch import prefetch_map
 from pipeline.core.progress import progress
 from pipeline.core.records import Rejection
 from pipeline.features.table import Floats
-from pipeline.locate.photo_files import folder_of, taken_at
+from pipeline.locate.photo_files import parent_folder, read_taken_at
 
-BATCH = 128
+READ_BATCH = 128
 "Photos that are held and encoded at a time."
-READERS = 4
+READ_THREADS = 4
 "Files that are read at once: enough for a network's waiting."
 
 
@@ -33,13 +33,13 @@ class Query:
     taken_at: str | None
 
 
-def read_photos(photos: Sequence[str], encoder: PhotoEncoder) -> list[Query]:
+def encode_photos(photos: Sequence[str], encoder: PhotoEncoder) -> list[Query]:
     """One query per photo, in order."""
     queries: list[Query] = []
     with progress(len(photos), "photos", "photos") as meter:
-        for begin in range(0, len(photos), BATCH):
-            names = photos[begin : begin + BATCH]
-            read = list(ahead(_read, names, READERS, 2 * READERS))
+        for begin in range(0, len(photos), READ_BATCH):
+            names = photos[begin : begin + READ_BATCH]
+            read = list(prefetch_map(_read, names, READ_THREADS, 2 * READ_THREADS))
             held = [b"" if isinstance(data, Rejection) else data for data in read]
             embeddings_QD, refusals = encoder.encode(held, names)
             rejected = [
@@ -53,7 +53,7 @@ def read_photos(photos: Sequence[str], encoder: PhotoEncoder) -> list[Query]:
                     photos=(name,),
                     embedding_D=None if refused else next(rows),
                     rejected=(refused,) if refused else (),
-                    taken_at=None if refused else taken_at(data),
+                    taken_at=None if refused else read_taken_at(data),
                 )
                 for name, data, refused in zip(names, held, rejected, strict=True)
             ]
@@ -68,14 +68,14 @@ def _read(photo: str) -> bytes | Rejection:
         return Rejection(path=photo, reason="unreadable file", found=str(error))
 
 
-def together(queries: Sequence[Query]) -> list[Query]:
+def merge_by_folder(queries: Sequence[Query]) -> list[Query]:
     """One query per folder: the mean of its photos' embeddings at unit length, as the paper's
     multi-query.
     """
-    ordered = sorted(queries, key=lambda query: folder_of(query.name))
+    ordered = sorted(queries, key=lambda query: parent_folder(query.name))
     return [
         _merged(folder, list(group))
-        for folder, group in groupby(ordered, key=lambda query: folder_of(query.name))
+        for folder, group in groupby(ordered, key=lambda query: parent_folder(query.name))
     ]
 
 

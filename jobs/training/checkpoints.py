@@ -72,7 +72,7 @@ def older_name(checkpoint: Checkpoint) -> str:
 
 def older_names(out: str) -> list[str]:
     """The checkpoints before the last one, newest first."""
-    found = [match for name in storage.names(out) if (match := OLDER.fullmatch(name))]
+    found = [match for name in storage.list_names(out) if (match := OLDER.fullmatch(name))]
     return [
         match[0]
         for match in sorted(found, key=lambda match: (int(match[1]), int(match[2])), reverse=True)
@@ -142,7 +142,7 @@ class Checkpoints:
     def write(self, checkpoint: Checkpoint) -> None:
         last = storage.join(self._run.out, CHECKPOINT)
         if self._latest is not None and self._run.keep > 1:
-            storage.copy(last, storage.join(self._run.out, self._latest))
+            storage.link_or_copy(last, storage.join(self._run.out, self._latest))
         storage.write_bytes(last, dumps(checkpoint))
         self._latest = older_name(checkpoint)
         for name in older_names(self._run.out)[self._run.keep - 1 :]:
@@ -195,7 +195,7 @@ class Curves:
         if storage.exists(self._path):
             self._write(history)
         if storage.is_local(out):
-            folder = storage.locate(storage.join(out, "tensorboard"))[1]
+            folder = storage.resolve(storage.join(out, "tensorboard"))[1]
             self._board = SummaryWriter(folder, purge_step=len(history) + 1)
 
     def write(self, history: list[dict[str, Any]]) -> None:

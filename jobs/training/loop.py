@@ -23,8 +23,8 @@ from model.training import Training
 from model.weights.load import load_backbone, read_state_dict
 from pipeline.batches.training import Batch, Reading, TrainingStream
 from pipeline.core import storage
-from pipeline.core.errors import Unfinished
-from pipeline.core.prefetch import ready
+from pipeline.core.errors import Incomplete
+from pipeline.core.prefetch import prefetch
 
 SECONDS_BETWEEN_REPORTS = 1.0
 BATCHES_READY = 2
@@ -173,7 +173,7 @@ class Worker:
             return self.tally.means()
         except NotFinite as error:
             last = storage.join(self.run.out, CHECKPOINT)
-            raise Unfinished(
+            raise Incomplete(
                 f"training diverged in epoch {len(self.history) + 1}, by step {self.tally.steps} of {self.stream.steps}: "
                 f"{error}, expected a finite number; {last}, where there is one, is from before; train anew into another --out "
                 "with lower learning rates or --precision float32"
@@ -209,7 +209,7 @@ class Worker:
                 labels = [tensor.pin_memory() for tensor in labels]
             return images, labels, pair[0].damaged + pair[1].damaged
 
-        for images, labels, damaged in ready(
+        for images, labels, damaged in prefetch(
             map(tensors, self.stream.epoch(epoch, self.tally.steps)), BATCHES_READY
         ):
             images, labels = (

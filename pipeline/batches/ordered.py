@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.core.prefetch import ahead
+from pipeline.core.prefetch import prefetch_map
 from pipeline.images.decode import DecodeError, Pixels, decode
 from pipeline.images.transforms import Resizer, resize
 from pipeline.shards.samples import Sample
@@ -38,7 +38,7 @@ def decoded(
     """The samples' images in order, decoded and resized by threads; what cannot be decoded comes as
     its error.
     """
-    return ahead(lambda sample: opened(sample, image_size, resizer), samples, threads, depth)
+    return prefetch_map(lambda sample: opened(sample, image_size, resizer), samples, threads, depth)
 
 
 def opened(sample: Sample, image_size: int, resizer: Resizer = "torch") -> Opened:

@@ -17,8 +17,8 @@ from pipeline.batches.holdout import held_out, without
 from pipeline.batches.ordered import Opened, refuse_changed, sound, stack
 from pipeline.batches.sampler import plan_pass, read_spans, shuffled
 from pipeline.core.errors import InputError
-from pipeline.core.prefetch import ahead
-from pipeline.core.records import Split, View, key_names
+from pipeline.core.prefetch import prefetch_map
+from pipeline.core.records import Split, View, key_matches
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.transforms import Augmentation, Resizer, augment
 from pipeline.shards.manifest import Manifest, mending, read_manifest
@@ -128,7 +128,7 @@ class TrainingStream:
             )
 
         numbered = islice(enumerate(samples), skip * reading.batch_size, None)
-        prepared = ahead(prepare, numbered, reading.threads, 4 * reading.batch_size)
+        prepared = prefetch_map(prepare, numbered, reading.threads, 4 * reading.batch_size)
         while group := list(islice(prepared, reading.batch_size)):
             whole, damaged = sound(group)
             if not whole:
@@ -154,7 +154,7 @@ class TrainingStream:
     def _class(self, sample: Sample, view: View) -> int:
         """An image's label. The key says it too, and the tar's headers have checksums."""
         location = sample.facts["location"]
-        if location not in self.classes or not key_names(sample.key, Split.TRAIN, view, location):
+        if location not in self.classes or not key_matches(sample.key, Split.TRAIN, view, location):
             raise InputError(
                 f"image {sample.key} of {self.shards} is of location {location!r}, expected the one of its key and of "
                 f"the manifest's {len(self.classes)}; {mending(self.shards)}"

@@ -17,30 +17,30 @@ from ray.exceptions import RayError, RayTaskError
 
 from pipeline.core import cluster
 
-STRIKES = 3
+MAX_ATTEMPTS = 3
 "Deaths over one item after which it is not tried again."
-FIRST_LOST = 5
+MAX_SKIPPED_BEFORE_SUCCESS = 5
 "Items that may be set aside before any was done; then the fault is not theirs."
-SECONDS_UNTIL_TOLD = 15.0
+SECONDS_UNTIL_NOTICE = 15.0
 "Without a worker, until it is said that they are waited for."
 
 
 @dataclass(frozen=True, kw_only=True)
-class Terms:
+class PoolConfig:
     """How a crew works."""
 
-    hire: Callable[[], Any]
+    create_actor: Callable[[], Any]
     "Asks Ray for a new actor."
     size: int
     "Actors that are asked for."
-    asks_for: str
+    resources: str
     "What an actor asks of the cluster, for messages."
     in_flight: int = 2
     "Items that an actor has at once; its `max_concurrency`."
     refusals: tuple[type[Exception], ...] = ()
-    "What `work` raises of an item that is no use trying again: it is set aside at once."
+    "What `watch_replicas` raises of an item that is no use trying again: it is set aside at once."
     fatal: tuple[type[Exception], ...] = ()
-    "What `work` raises when all items would fail alike: it is raised by the crew."
+    "What `watch_replicas` raises when all items would fail alike: it is raised by the crew."
     patience: float = 600.0
     "Seconds without any worker until NobodyCame."
     say: Callable[[str], None] = lambda text: None
@@ -48,7 +48,7 @@ class Terms:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SetAside:
+class Skipped:
     """Why an item was not done."""
 
     reason: str
@@ -57,11 +57,11 @@ class SetAside:
     "What was seen last."
 
 
-class NobodyCame(RuntimeError):
+class NoWorkerStarted(RuntimeError):
     """No actor started in time."""
 
 
-class CannotWork(RuntimeError):
+class PoolFailed(RuntimeError):
     """Actors start and fail, whatever the item."""
 
 
@@ -80,10 +80,10 @@ class _Worker:
     "Whether the item it has must be the only one."
 
 
-class Crew:
+class ActorPool:
     """So many actors, replaced as they die."""
 
-    def __init__(self, terms: Terms) -> None:
+    def __init__(self, terms: PoolConfig) -> None:
         self.terms = terms
         self.seconds = 0.0
         "That actors stood ready or worked, all together; known when the work is done."
@@ -118,16 +118,16 @@ class Crew:
                 self._dismiss(worker)
 
     def _hire(self) -> None:
-        actor = self.terms.hire()
+        actor = self.terms.create_actor()
         self._workers.append(_Worker(actor, actor.__ray_ready__.remote(), actor.start.remote()))
 
     def _dismiss(self, worker: _Worker) -> None:
         self._workers.remove(worker)
         if worker.starting is None:
             self.seconds += time.monotonic() - worker.since
-            cluster.end_actor(worker.actor, worker.created)
+            cluster.stop_actor(worker.actor, worker.created)
         else:
-            cluster.end_actor(worker.actor, worker.created, worker.starting)
+            cluster.stop_actor(worker.actor, worker.created, worker.starting)
 
     def _hand_out(self) -> None:
         while self._fresh or self._suspects:
@@ -158,11 +158,13 @@ class Crew:
             if ended:
                 return owner[ended[0]], ended[0]
             waited = time.monotonic() - began
-            if self.working or waited < min(SECONDS_UNTIL_TOLD, self.terms.patience):
+            if self.working or waited < min(SECONDS_UNTIL_NOTICE, self.terms.patience):
                 continue
-            words = f"no worker has started for {waited:.0f} s; each asks for {self.terms.asks_for}"
+            words = (
+                f"no worker has started for {waited:.0f} s; each asks for {self.terms.resources}"
+            )
             if waited > self.terms.patience:
-                raise NobodyCame(words)
+                raise NoWorkerStarted(words)
             if not told:
                 self.terms.say(f"{words}; waiting for up to {self.terms.patience:.0f} s")
                 told = True
@@ -180,7 +182,7 @@ class Crew:
         elif isinstance(error, self.terms.fatal):
             raise error
         elif isinstance(error, self.terms.refusals):
-            yield item, SetAside(reason="unusable", found=str(error))
+            yield item, Skipped(reason="unusable", found=str(error))
         else:
             # Of an actor that died nobody knows over which item; of one that raised it is known,
             # and what else it had is begun again elsewhere, because an error nobody foresaw may
@@ -206,21 +208,21 @@ class Crew:
         self._failed_starts += 1
         self._dismiss(worker)
         hopeless = not isinstance(error, RayError) or getattr(error, "actor_init_failed", False)
-        if hopeless or self._failed_starts == STRIKES:
-            raise CannotWork(f"a worker cannot start: {_told(error)}") from error
+        if hopeless or self._failed_starts == MAX_ATTEMPTS:
+            raise PoolFailed(f"a worker cannot start: {_error_line(error)}") from error
         self._hire()
 
-    def _blame(self, items: list[Any], error: BaseException) -> Iterator[tuple[Any, SetAside]]:
+    def _blame(self, items: list[Any], error: BaseException) -> Iterator[tuple[Any, Skipped]]:
         for item in items:
             self._strikes[item] += 1
-            if self._strikes[item] < STRIKES:
+            if self._strikes[item] < MAX_ATTEMPTS:
                 self._suspects.append(item)
                 continue
             self._lost += 1
-            yield item, SetAside(reason=f"lost {STRIKES} workers", found=_told(error))
-        if self._lost >= FIRST_LOST and not self._done:
-            raise CannotWork(
-                f"{self._lost} items lost {STRIKES} workers each and none was done: {_told(error)}"
+            yield item, Skipped(reason=f"lost {MAX_ATTEMPTS} workers", found=_error_line(error))
+        if self._lost >= MAX_SKIPPED_BEFORE_SUCCESS and not self._done:
+            raise PoolFailed(
+                f"{self._lost} items lost {MAX_ATTEMPTS} workers each and none was done: {_error_line(error)}"
             ) from error
 
 
@@ -234,7 +236,7 @@ def _outcome(ref: Any) -> tuple[Any, BaseException | None]:
         return None, error
 
 
-def _told(error: BaseException) -> str:
+def _error_line(error: BaseException) -> str:
     """An error in one line: its first, or the last of the traceback that Ray writes where an actor
     cannot be made.
     """

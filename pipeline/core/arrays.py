@@ -5,9 +5,9 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float32]
 Halves = npt.NDArray[np.float16]
-Words = npt.NDArray[np.str_]
+Strings = npt.NDArray[np.str_]
 
-Whole = npt.NDArray[np.int64]
+Ints = npt.NDArray[np.int64]
 Doubles = npt.NDArray[np.float64]
 
 Mask = npt.NDArray[np.bool_]

@@ -18,13 +18,13 @@ import ray
 from ray._private.utils import read_ray_address
 from ray.exceptions import RayTaskError
 
-from pipeline.core.errors import Unfinished
+from pipeline.core.errors import Incomplete
 from pipeline.core.progress import console
 
 Item = TypeVar("Item")
 
 
-CORES = 8
+CORES_PER_WORKER = 8
 "Of a worker without a GPU, where nothing was said: a network's threads gain little beyond."
 
 
@@ -68,14 +68,14 @@ def connect() -> None:
         logging.ERROR
     )
     try:
-        with _undisturbed():
+        with _keep_signal_handlers():
             ray.init(_address(), log_to_driver=False, logging_level=logging.WARNING)
     except (
         Exception
     ) as error:  # Ray raises ConnectionError, RuntimeError, ValueError and plain Exception here
         asked = f"at {address}" if (address := os.environ.get("RAY_ADDRESS")) else "on this machine"
         why = str(error).strip().partition("\n")[0] or type(error).__name__
-        raise Unfinished(
+        raise Incomplete(
             f"found no Ray cluster {asked}, and none could be started ({why}); expected one "
             "that answers; see to it, or unset RAY_ADDRESS so that one is started here, and run the same command again"
         ) from error
@@ -102,7 +102,7 @@ def _address() -> str | None:
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
+def _keep_signal_handlers() -> Iterator[None]:
     """Keep Ctrl-C until Ray has started, as half of it cannot be stopped: it crashes. Said twice it
     is heeded at once.
 
@@ -156,7 +156,7 @@ def _resources() -> dict[str, float]:
     return found
 
 
-def end_actor(actor: Any, first: "ray.ObjectRef[Any]", *queued: "ray.ObjectRef[Any]") -> None:
+def stop_actor(actor: Any, first: "ray.ObjectRef[Any]", *queued: "ray.ObjectRef[Any]") -> None:
     """End an actor. `first`: its first call, which shows whether it was created; `queued`: calls
     behind that, given up.
 
@@ -174,7 +174,7 @@ def end_actor(actor: Any, first: "ray.ObjectRef[Any]", *queued: "ray.ObjectRef[A
     actor.__ray_terminate__.remote()
 
 
-def bounded(
+def bounded_map(
     submit: Callable[[Item], "ray.ObjectRef[Any]"], items: Iterable[Item], window: int
 ) -> Iterator[tuple[Item, Any]]:
     """Call `submit` on every item with at most `window` calls in flight; yield (item, result) as
@@ -196,7 +196,7 @@ def bounded(
         yield item, result
 
 
-def place(
+def plan_placement(
     nodes: Sequence[Node],
     items: int,
     workers: int | None = None,
@@ -210,20 +210,24 @@ def place(
         gpus = 1.0 if any(node.gpus >= 1 for node in nodes) else 0.0
     if workers is None:
         workers = sum(
-            _room(node, cpus or (1 if gpus else min(CORES, max(1, int(node.cpus)))), gpus)
+            _workers_that_fit(
+                node, cpus or (1 if gpus else min(CORES_PER_WORKER, max(1, int(node.cpus)))), gpus
+            )
             for node in nodes
         )
     workers = max(1, min(workers, items))
     if cpus is None:
         most = int(max((node.cpus for node in nodes), default=1))
         fitting = (
-            c for c in range(most, 1, -1) if sum(_room(node, c, gpus) for node in nodes) >= workers
+            c
+            for c in range(most, 1, -1)
+            if sum(_workers_that_fit(node, c, gpus) for node in nodes) >= workers
         )
         cpus = next(fitting, 1)
     return Placement(workers=workers, cpus=cpus, gpus=gpus)
 
 
-def _room(node: Node, cpus: int, gpus: float) -> int:
+def _workers_that_fit(node: Node, cpus: int, gpus: float) -> int:
     """How many such workers a node holds."""
     by_cpus = int(node.cpus // cpus)
     return min(by_cpus, int(node.gpus // gpus)) if gpus else by_cpus

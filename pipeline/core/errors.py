@@ -6,6 +6,6 @@ class InputError(Exception):
     expected, what to do. Jobs print it alone and exit with 2."""
 
 
-class Unfinished(Exception):
+class Incomplete(Exception):
     """Work that could not be done whole; what is done stays. The message is one sentence for a
     person. Jobs print it alone and exit with 1."""

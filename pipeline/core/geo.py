@@ -13,7 +13,7 @@ def on_sphere(places_N2: Doubles) -> Doubles:
     special there.
     """
     lat_N, lon_N = np.radians(places_N2[:, 0]), np.radians(places_N2[:, 1])
-    return EARTH_M * np.stack(
+    return EARTH_RADIUS_M * np.stack(
         [np.cos(lat_N) * np.cos(lon_N), np.cos(lat_N) * np.sin(lon_N), np.sin(lat_N)], axis=1
     )
 
@@ -52,7 +52,9 @@ class Box:
         return spans + [(-edge, -edge) for edge in (180.0, -180.0) if edge in (west, east)]
 
 
-EARTH_M = 6_371_008.8  # mean radius [IUGG]; against the ellipsoid distances err by up to 0.5 %
+EARTH_RADIUS_M = (
+    6_371_008.8  # mean radius [IUGG]; against the ellipsoid distances err by up to 0.5 %
+)
 
 
 def haversine_m(one_x2: Doubles, other_x2: Doubles) -> Doubles:
@@ -65,11 +67,11 @@ def haversine_m(one_x2: Doubles, other_x2: Doubles) -> Doubles:
         np.sin(half[..., 0]) ** 2
         + np.cos(one[..., 0]) * np.cos(other[..., 0]) * np.sin(half[..., 1]) ** 2
     )
-    return np.asarray(2 * EARTH_M * np.arcsin(np.sqrt(np.clip(chord, 0, 1))))
+    return np.asarray(2 * EARTH_RADIUS_M * np.arcsin(np.sqrt(np.clip(chord, 0, 1))))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Near:
+class Circle:
     """A circle on the ground round a rough position: what a UAV that has just lost its GPS still
     knows.
 

@@ -14,12 +14,12 @@ from enum import StrEnum
 from typing import Any, TypeVar, cast, get_args, get_origin
 
 from pipeline.core import storage
-from pipeline.core.records import excerpt, is_text
+from pipeline.core.records import excerpt, is_utf8
 
 Told = TypeVar("Told")
 
 
-def as_told(kind: type[Told], said: object) -> Told:
+def from_json(kind: type[Told], said: object) -> Told:
     """The dataclass `kind` from a JSON object with its fields by name. Raises ValueError."""
     return cast(Told, _value(kind, said, kind.__name__))
 
@@ -27,7 +27,7 @@ def as_told(kind: type[Told], said: object) -> Told:
 def is_file_name(name: str) -> bool:
     """Whether a name is one file's in a folder: it leads nowhere else, whatever joins it to a path."""
     return (
-        bool(name) and not name.startswith(".") and not set(name) & set("/\\\0") and is_text(name)
+        bool(name) and not name.startswith(".") and not set(name) & set("/\\\0") and is_utf8(name)
     )
 
 
@@ -64,7 +64,7 @@ def _value(kind: Any, said: object, name: str) -> object:
     if (
         kind in (int, bool, str)
         and type(said) is kind
-        and (kind is not str or is_text(cast(str, said)))
+        and (kind is not str or is_utf8(cast(str, said)))
     ):
         return said
     raise ValueError(f"{name[:100]} is {excerpt(said)}, expected {getattr(kind, '__name__', kind)}")
@@ -94,13 +94,13 @@ def _dataclass(kind: Any, said: object, name: str) -> object:
     )
 
 
-SEAL, KIND = "seal", "sha256:"
+CHECKSUM_KEY, CHECKSUM_PREFIX = "seal", "sha256:"
 "Name and beginning of the last entry."
 
 
 def write_checksummed(path: str, said: dict[str, Any]) -> None:
     """Write an object as a JSON file with its seal, whole or not at all."""
-    storage.write_json(path, said | {SEAL: checksum_of(said)})
+    storage.write_json(path, said | {CHECKSUM_KEY: checksum_of(said)})
 
 
 def read_checksummed(path: str) -> dict[str, Any]:
@@ -111,14 +111,14 @@ def read_checksummed(path: str) -> dict[str, Any]:
     said = storage.read_json(path)
     if not isinstance(said, dict):
         raise ValueError(f"{type(said).__name__} in place of an object")
-    seal = said.pop(SEAL, None)
+    seal = said.pop(CHECKSUM_KEY, None)
     # A seal under another name is one whose name was damaged.
     sealed = seal is not None or any(
-        isinstance(value, str) and value.startswith(KIND) for value in said.values()
+        isinstance(value, str) and value.startswith(CHECKSUM_PREFIX) for value in said.values()
     )
     if sealed and seal != checksum_of(said):
         raise ValueError(
-            f"its {SEAL!r} is not of what it says; whoever changed it on purpose takes that entry out"
+            f"its {CHECKSUM_KEY!r} is not of what it says; whoever changed it on purpose takes that entry out"
         )
     return said
 
@@ -127,4 +127,4 @@ def checksum_of(said: dict[str, Any]) -> str:
     """The hash of what reading the object back would give, whatever the order of its entries."""
     read_back = json.loads(json.dumps(said))
     plain = json.dumps(read_back, sort_keys=True, separators=(",", ":"))
-    return KIND + hashlib.sha256(plain.encode()).hexdigest()
+    return CHECKSUM_PREFIX + hashlib.sha256(plain.encode()).hexdigest()

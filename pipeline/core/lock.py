@@ -26,7 +26,7 @@ Made = TypeVar("Made")
 
 
 @contextmanager
-def only_one(out: str) -> Iterator[None]:
+def output_lock(out: str) -> Iterator[None]:
     """Hold the folder `out` as the one run that writes it.
 
     Raises InputError, which says who, where another run holds it.
@@ -35,7 +35,7 @@ def only_one(out: str) -> Iterator[None]:
         yield
         return
     name = hashlib.sha256(
-        os.path.realpath(storage.locate(out)[1]).encode("utf-8", "surrogateescape")
+        os.path.realpath(storage.resolve(out)[1]).encode("utf-8", "surrogateescape")
     ).hexdigest()
     folder = os.path.join(tempfile.gettempdir(), f"pvda-locks-{os.getuid()}")
     os.makedirs(folder, mode=0o700, exist_ok=True)
@@ -56,7 +56,7 @@ def only_one(out: str) -> Iterator[None]:
         os.close(file)
 
 
-def one_at_a_time(
+def locks_output(
     out: Callable[Given, str],
 ) -> Callable[[Callable[Given, Made]], Callable[Given, Made]]:
     """Make a stage the only run that writes its output; `out` says which, of the stage's arguments."""
@@ -64,7 +64,7 @@ def one_at_a_time(
     def of(stage: Callable[Given, Made]) -> Callable[Given, Made]:
         @wraps(stage)
         def alone(*args: Given.args, **kwargs: Given.kwargs) -> Made:
-            with only_one(out(*args, **kwargs)):
+            with output_lock(out(*args, **kwargs)):
                 return stage(*args, **kwargs)
 
         return alone

@@ -20,20 +20,20 @@ import pyarrow.parquet as pq
 
 from pipeline.core import storage
 
-DAMAGE = (pa.ArrowException, OSError, ValueError)
+DAMAGE_ERRORS = (pa.ArrowException, OSError, ValueError)
 """What reading a damaged file raises: of ours ArrowInvalid; of pyarrow's also errors of texts that
 are no UTF-8."""
-MARK = b"pvda.seal"
-SEAL = re.compile(rb"pvda\.seal:([0-9a-f]{64}):([0-9a-f]{64}):pvda\.seal")
+CHECKSUM_MARK = b"pvda.seal"
+CHECKSUM_BLOCK = re.compile(rb"pvda\.seal:([0-9a-f]{64}):([0-9a-f]{64}):pvda\.seal")
 """Hash of all bytes before it, and of that hash with all bytes behind it. The mark is there twice,
 so that no flipped bit makes a sealed file look like one from before."""
-SEAL_BYTES = 2 * (len(MARK) + 1) + 2 * 64 + 1
+CHECKSUM_BLOCK_BYTES = 2 * (len(CHECKSUM_MARK) + 1) + 2 * 64 + 1
 MAGIC = b"PAR1"
-TAIL = 8
+TRAILER_BYTES = 8
 "Bytes behind the footer: its length and the magic."
-AT_ONCE = 1 << 16
+END_READ_BYTES = 1 << 16
 "Bytes from the end that are read first: most footers whole, as pyarrow does it."
-PIECE = 1 << 22
+HASH_BLOCK_BYTES = 1 << 22
 
 
 class CheckedFile(pq.ParquetFile):  # type: ignore[misc]  # pyarrow has no types
@@ -43,7 +43,7 @@ class CheckedFile(pq.ParquetFile):  # type: ignore[misc]  # pyarrow has no types
 
     def read(self, *arguments: Any, **settings: Any) -> pa.Table:
         table = super().read(*arguments, **settings)
-        _refuse_count(len(table), self.metadata.num_rows)
+        _check_row_count(len(table), self.metadata.num_rows)
         return table
 
     def iter_batches(
@@ -53,7 +53,7 @@ class CheckedFile(pq.ParquetFile):  # type: ignore[misc]  # pyarrow has no types
         for batch in super().iter_batches(batch_size, groups, **settings):
             seen += len(batch)
             yield batch
-        _refuse_count(seen, sum(self.metadata.row_group(group).num_rows for group in groups))
+        _check_row_count(seen, sum(self.metadata.row_group(group).num_rows for group in groups))
 
 
 def write_table(
@@ -80,32 +80,32 @@ def writer(path: str, schema: pa.Schema, **options: Any) -> Iterator[pq.ParquetW
         ):
             yield columns
         with open(local, "r+b") as written:
-            _seal(written)
+            _append_checksum(written)
 
 
 @contextmanager
-def opened(path: str) -> Iterator[CheckedFile]:
+def open_parquet(path: str) -> Iterator[CheckedFile]:
     """A file to read from, a piece at a time. Raises one of DAMAGE, here or while it is read, where
     it is no whole file.
     """
     with storage.open_read(path) as stream:
-        _refuse_footer(stream)
+        _check_footer(stream)
         # With a buffer, a row group is read as it is decoded and not fetched whole before.
         yield CheckedFile(stream, buffer_size=1 << 20, page_checksum_verification=True)
 
 
 def read_table(path: str, columns: list[str] | None = None) -> pa.Table:
     """All rows of a file. Raises one of DAMAGE where it is no whole file."""
-    with opened(path) as parquet:
+    with open_parquet(path) as parquet:
         return parquet.read(columns=columns)
 
 
-def refuse_damaged(path: str) -> bool:
+def verify_parquet(path: str) -> bool:
     """Raise one of DAMAGE where any byte of a file is not what was written; false where it has no
     seal that would say.
     """
     with storage.open_read(path) as stream:
-        said = _refuse_footer(stream)
+        said = _check_footer(stream)
         if said is None:
             return False
         begin, body = said
@@ -114,34 +114,34 @@ def refuse_damaged(path: str) -> bool:
     return True
 
 
-def is_whole(path: str) -> bool:
-    """Whether `refuse_damaged` has nothing against a file."""
+def parquet_intact(path: str) -> bool:
+    """Whether `verify_parquet` has nothing against a file."""
     try:
-        refuse_damaged(path)
-    except DAMAGE:
+        verify_parquet(path)
+    except DAMAGE_ERRORS:
         return False
     return True
 
 
-def _seal(stream: IO[bytes]) -> None:
+def _append_checksum(stream: IO[bytes]) -> None:
     begin, footer = _footer(stream)
     body = _hash(stream, begin)
     stream.seek(begin)
-    stream.write(b":".join([MARK, body, _digest(body + footer), MARK]) + footer)
+    stream.write(b":".join([CHECKSUM_MARK, body, _digest(body + footer), CHECKSUM_MARK]) + footer)
 
 
-def _refuse_footer(stream: IO[bytes]) -> tuple[int, bytes] | None:
+def _check_footer(stream: IO[bytes]) -> tuple[int, bytes] | None:
     """Where the pages end and the hash of them all; None where the file has no seal.
 
     Raises ArrowInvalid where the footer is not what was written.
     """
     begin, footer = _footer(stream)
-    end = max(0, begin - SEAL_BYTES)
+    end = max(0, begin - CHECKSUM_BLOCK_BYTES)
     stream.seek(end)
-    found = SEAL.fullmatch(stream.read(begin - end))
+    found = CHECKSUM_BLOCK.fullmatch(stream.read(begin - end))
     if found is None:
-        stream.seek(min(end, max(0, stream.seek(0, 2) - AT_ONCE)))
-        if MARK in stream.read():
+        stream.seek(min(end, max(0, stream.seek(0, 2) - END_READ_BYTES)))
+        if CHECKSUM_MARK in stream.read():
             raise pa.ArrowInvalid("its footer is not what was written")
     elif _digest(found[1] + footer) != found[2]:
         raise pa.ArrowInvalid("its footer is not what was written")
@@ -152,11 +152,11 @@ def _refuse_footer(stream: IO[bytes]) -> tuple[int, bytes] | None:
 def _footer(stream: IO[bytes]) -> tuple[int, bytes]:
     """Where the footer begins, and its bytes with those that say its length."""
     size = stream.seek(0, 2)
-    stream.seek(max(0, size - AT_ONCE))
+    stream.seek(max(0, size - END_READ_BYTES))
     end = stream.read()
-    if len(end) < TAIL or end[-4:] != MAGIC:
+    if len(end) < TRAILER_BYTES or end[-4:] != MAGIC:
         raise pa.ArrowInvalid("it does not end as a Parquet file ends")
-    length = struct.unpack("<I", end[-8:-4])[0] + TAIL
+    length = struct.unpack("<I", end[-8:-4])[0] + TRAILER_BYTES
     if length > size:
         raise pa.ArrowInvalid(f"it has {size} bytes and says that its footer has {length}")
     if length > len(end):
@@ -169,7 +169,7 @@ def _hash(stream: IO[bytes], end: int) -> bytes:
     """Hash of the first bytes of a file, in hexadecimal digits."""
     digest = hashlib.sha256()
     stream.seek(0)
-    while end and (piece := stream.read(min(PIECE, end))):
+    while end and (piece := stream.read(min(HASH_BLOCK_BYTES, end))):
         digest.update(piece)
         end -= len(piece)
     return digest.hexdigest().encode()
@@ -179,6 +179,6 @@ def _digest(data: bytes) -> bytes:
     return hashlib.sha256(data).hexdigest().encode()
 
 
-def _refuse_count(found: int, expected: int) -> None:
+def _check_row_count(found: int, expected: int) -> None:
     if found != expected:
         raise pa.ArrowInvalid(f"{found} rows come out of its pages and its footer says {expected}")

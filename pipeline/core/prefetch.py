@@ -16,13 +16,13 @@ Out = TypeVar("Out")
 Item = TypeVar("Item")
 
 
-def ahead(
+def prefetch_map(
     function: Callable[[In], Out], items: Iterable[In], threads: int | Executor, depth: int
 ) -> Iterator[Out]:
     """`map` by threads, in order, at most `depth` items ahead of the consumer. Decoding releases
     the GIL.
     """
-    with _lent(threads) as (pool, waiting):
+    with _executor(threads) as (pool, waiting):
         for item in items:
             waiting.append(pool.submit(function, item))
             if len(waiting) > depth:
@@ -31,7 +31,7 @@ def ahead(
             yield waiting.popleft().result()
 
 
-def ready(
+def prefetch(
     items: Iterable[Item], depth: int, thread: Executor | None = None
 ) -> Generator[Item, None, None]:
     """The items in order, made by a thread of their own, `depth` of them before they are asked for.
@@ -39,7 +39,7 @@ def ready(
     `thread` must be a single one, that nobody else uses meanwhile.
     """
     source, end = iter(items), object()
-    with _lent(thread or 1) as (pool, waiting):
+    with _executor(thread or 1) as (pool, waiting):
         waiting.extend(pool.submit(next, source, end) for _ in range(depth))
         while (item := waiting.popleft().result()) is not end:
             waiting.append(pool.submit(next, source, end))
@@ -47,7 +47,7 @@ def ready(
 
 
 @contextmanager
-def _lent(threads: int | Executor) -> Iterator[tuple[Executor, deque[Future[Any]]]]:
+def _executor(threads: int | Executor) -> Iterator[tuple[Executor, deque[Future[Any]]]]:
     """Threads, and a queue of what they were given: at the end what has not begun is dropped, what
     has is waited for.
     """

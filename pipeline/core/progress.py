@@ -24,29 +24,31 @@ from rich.text import Text
 
 SECONDS_BETWEEN_LINES = 5.0
 
-UNSEEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+CONTROL_CHARACTERS = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+)
 """What a terminal would obey and not show, line ends and tabs aside; what turns the direction of
 writing round; and halves of characters, which stand for the bytes of names that are no UTF-8."""
 
 
-def visible(text: str) -> str:
+def escape_controls(text: str) -> str:
     """Text as a terminal may be given it: files may be called anything, also what clears a screen."""
-    return UNSEEN.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+    return CONTROL_CHARACTERS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
-class _Plain(Console):
+class _PlainConsole(Console):
     """A console that shows text as it is: names are no markup and no emoji, and command nothing."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(highlight=False, markup=False, emoji=False, **kwargs)
 
     def render_str(self, text: str, **kwargs: Any) -> Text:
-        return super().render_str(visible(text), **kwargs)
+        return super().render_str(escape_controls(text), **kwargs)
 
 
-console = _Plain(stderr=True, soft_wrap=True)
+console = _PlainConsole(stderr=True, soft_wrap=True)
 "Where progress and remarks go. Paths stay whole for whoever copies them."
-results = _Plain()
+results = _PlainConsole()
 "Where results go: standard output."
 
 
@@ -64,35 +66,35 @@ class Meter(Protocol):
 def progress(total: float | None, label: str, unit: str = "images") -> Iterator[Meter]:
     """Show the progress of `total` units of work (None where unknown)."""
     if not console.is_terminal:
-        meter = _Lines(total, label, unit)
+        meter = _JsonLines(total, label, unit)
         yield meter
         meter.line(last=True)
         return
     columns = (
-        _Told("{task.description}"),
+        _PlainColumn("{task.description}"),
         BarColumn(bar_width=30),
         MofNCompleteColumn(),
-        _Told("{task.fields[rate]}"),
+        _PlainColumn("{task.fields[rate]}"),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        _Told("{task.fields[facts]}"),
+        _PlainColumn("{task.fields[facts]}"),
     )
     with Progress(*columns, console=console) as bar:
-        yield _Bar(bar, total, label, unit)
+        yield _TerminalBar(bar, total, label, unit)
 
 
-class _Told(TextColumn):
+class _PlainColumn(TextColumn):
     """A column of text that is no markup."""
 
     def __init__(self, form: str) -> None:
         super().__init__(form, markup=False)
 
     def render(self, task: Task) -> Text:
-        return Text(visible(super().render(task).plain), style="none")
+        return Text(escape_controls(super().render(task).plain), style="none")
 
 
-class _Bar:
+class _TerminalBar:
     def __init__(self, bar: Progress, total: float | None, label: str, unit: str) -> None:
         self._bar, self._unit, self._start, self._done = bar, unit, time.monotonic(), 0.0
         self._task = bar.add_task(label, total=total, rate="", facts="")
@@ -102,14 +104,14 @@ class _Bar:
         rate = f"{self._done / max(1e-9, time.monotonic() - self._start):.1f} {self._unit}/s"
         self._bar.update(self._task, advance=count, rate=rate)
         if facts:
-            shown = "  ".join(f"{name} {_short(value)}" for name, value in facts.items())
+            shown = "  ".join(f"{name} {_format_value(value)}" for name, value in facts.items())
             self._bar.update(self._task, facts=shown)
 
     def note(self, text: str) -> None:
         self._bar.console.print(text)
 
 
-class _Lines:
+class _JsonLines:
     def __init__(self, total: float | None, label: str, unit: str) -> None:
         self._total, self._label, self._unit = total, label, unit
         self._start = self._said = time.monotonic()
@@ -141,5 +143,5 @@ class _Lines:
         print(json.dumps({"step": self._label, "note": text}), file=sys.stderr, flush=True)
 
 
-def _short(value: float | str) -> str:
+def _format_value(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:.3g}"

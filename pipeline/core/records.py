@@ -84,17 +84,17 @@ class ImageRecord:
         return f"{self.path}#{self.part}" if self.part else self.path
 
 
-LONGEST_KEY = 90
+MAX_KEY_LENGTH = 90
 "A tar header of the oldest kind holds names of 100 characters, ending included."
-LONGEST_EXCERPT = 200
+MAX_EXCERPT_LENGTH = 200
 "Characters of a damaged value that are shown."
-LONGEST_FOUND = 600
+MAX_FOUND_LENGTH = 600
 "Characters of what was found that are written down."
-KEY = re.compile(rf"[a-z0-9_-]{{1,{LONGEST_KEY}}}")
+KEY_PATTERN = re.compile(rf"[a-z0-9_-]{{1,{MAX_KEY_LENGTH}}}")
 "What a key looks like."
 
 
-def is_text(name: str) -> bool:
+def is_utf8(name: str) -> bool:
     """Whether it can be written down as UTF-8: names of files in other encodings hold lone
     surrogates.
     """
@@ -105,12 +105,12 @@ def is_text(name: str) -> bool:
     return True
 
 
-def as_text(name: str) -> str:
+def escape_non_utf8(name: str) -> str:
     """The name with what cannot be written down spelled out."""
     return name.encode("utf-8", "backslashreplace").decode()
 
 
-def is_place(lat: object, lon: object) -> bool:
+def is_position(lat: object, lon: object) -> bool:
     """Whether these are degrees north and east of some place."""
     plain = all(
         isinstance(value, int | float) and not isinstance(value, bool) for value in (lat, lon)
@@ -121,7 +121,7 @@ def is_place(lat: object, lon: object) -> bool:
 def excerpt(value: object) -> str:
     """So much of what was found as a sentence can hold."""
     said = repr(value)
-    return said if len(said) <= LONGEST_EXCERPT else f"{said[:LONGEST_EXCERPT]}..."
+    return said if len(said) <= MAX_EXCERPT_LENGTH else f"{said[:MAX_EXCERPT_LENGTH]}..."
 
 
 def make_key(split: Split, view: View, location: str, stem: str) -> str:
@@ -133,15 +133,15 @@ def make_key(split: Split, view: View, location: str, stem: str) -> str:
     """
     named = f"{split}-{view}-{location}-{stem}"
     slug = re.sub(r"[^a-z0-9_-]", "_", named.lower())
-    if slug == named and len(slug) <= LONGEST_KEY:
+    if slug == named and len(slug) <= MAX_KEY_LENGTH:
         return slug
-    return f"{slug[: LONGEST_KEY - 9]}-{hashlib.sha256(named.encode('utf-8', 'surrogateescape')).hexdigest()[:8]}"
+    return f"{slug[: MAX_KEY_LENGTH - 9]}-{hashlib.sha256(named.encode('utf-8', 'surrogateescape')).hexdigest()[:8]}"
 
 
-def key_names(key: str, split: Split, view: View, location: str) -> bool:
+def key_matches(key: str, split: Split, view: View, location: str) -> bool:
     """Whether a key that `make_key` made is of this split, view and location."""
     begin = re.sub(r"[^a-z0-9_-]", "_", f"{split}-{view}-{location}-".lower())
-    return key.startswith(begin[: LONGEST_KEY - 9])
+    return key.startswith(begin[: MAX_KEY_LENGTH - 9])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,9 +155,9 @@ class Rejection:
     "What this file held, for the person who mends it; cut where it is longer than LONGEST_FOUND."
 
     def __post_init__(self) -> None:
-        found = as_text(self.found)
+        found = escape_non_utf8(self.found)
         if (
-            len(found) > LONGEST_FOUND
+            len(found) > MAX_FOUND_LENGTH
         ):  # a damaged file may hold a megabyte where a number was expected
-            found = f"{found[: LONGEST_FOUND - 3]}..."
+            found = f"{found[: MAX_FOUND_LENGTH - 3]}..."
         object.__setattr__(self, "found", found)

@@ -17,11 +17,11 @@ from fsspec.implementations.local import LocalFileSystem
 
 from pipeline.core.errors import InputError
 
-TEMPORARY = re.compile(r"\.(.+)\.[0-9a-f]{8}")
-"Names that `atomic` gives to files until they are whole."
+TEMPORARY_NAME = re.compile(r"\.(.+)\.[0-9a-f]{8}")
+"Names that `atomic_write` gives to files until they are whole."
 
 
-def locate(path: str) -> tuple[Any, str]:
+def resolve(path: str) -> tuple[Any, str]:
     """The fsspec file system of a path and the path on it.
 
     Raises InputError where no file system is known by a URI's scheme, or what it needs is not
@@ -40,7 +40,7 @@ def locate(path: str) -> tuple[Any, str]:
 
 
 def is_local(path: str) -> bool:
-    return isinstance(locate(path)[0], LocalFileSystem)
+    return isinstance(resolve(path)[0], LocalFileSystem)
 
 
 def absolute(path: str) -> str:
@@ -55,13 +55,13 @@ def join(folder: str, *names: str) -> str:
 
 
 def exists(path: str) -> bool:
-    filesystem, inner = locate(path)
+    filesystem, inner = resolve(path)
     return bool(filesystem.exists(inner))
 
 
-def names(folder: str) -> list[str]:
+def list_names(folder: str) -> list[str]:
     """File names in a folder, sorted, without temporary and hidden ones; an absent folder has none."""
-    filesystem, inner = locate(folder)
+    filesystem, inner = resolve(folder)
     if not filesystem.isdir(inner):
         return []
     found = (entry.rstrip("/").rsplit("/", 1)[-1] for entry in filesystem.ls(inner, detail=False))
@@ -74,7 +74,7 @@ def walk(folder: str) -> dict[str, int]:
 
     Links are followed, but not in circles.
     """
-    filesystem, inner = locate(folder)
+    filesystem, inner = resolve(folder)
     root = inner.rstrip("/") + "/"
     if isinstance(filesystem, LocalFileSystem):
         found = dict(_walk_disk(inner, frozenset()))
@@ -104,7 +104,7 @@ def _walk_disk(folder: str, above: frozenset[str]) -> Iterator[tuple[str, int]]:
 
 
 def is_folder(path: str) -> bool:
-    filesystem, inner = locate(path)
+    filesystem, inner = resolve(path)
     return bool(filesystem.isdir(inner))
 
 
@@ -114,12 +114,12 @@ def is_file(path: str) -> bool:
 
 def size(path: str) -> int:
     """Bytes of a file."""
-    filesystem, inner = locate(path)
+    filesystem, inner = resolve(path)
     return int(filesystem.size(inner))
 
 
 def read_bytes(path: str) -> bytes:
-    filesystem, inner = locate(path)
+    filesystem, inner = resolve(path)
     data: bytes = filesystem.cat_file(inner)
     return data
 
@@ -128,7 +128,7 @@ def read_head(path: str, size: int) -> bytes:
     """The first `size` bytes of a file, or all of it where it is shorter; of a remote file no more
     is fetched.
     """
-    filesystem, inner = locate(path)
+    filesystem, inner = resolve(path)
     data: bytes = filesystem.cat_file(inner, start=0, end=size)
     return data
 
@@ -142,13 +142,13 @@ def read_json(path: str) -> Any:
 
 
 def open_read(path: str) -> IO[bytes]:
-    filesystem, inner = locate(path)
+    filesystem, inner = resolve(path)
     stream: IO[bytes] = filesystem.open(inner, "rb")
     return stream
 
 
 @contextmanager
-def atomic(path: str) -> Iterator[IO[bytes]]:
+def atomic_write(path: str) -> Iterator[IO[bytes]]:
     """A stream to write a file through, which appears under its name when complete or not at all."""
     with atomic_file(path) as local, open(local, "wb") as stream:
         yield stream
@@ -162,7 +162,7 @@ def atomic_file(path: str) -> Iterator[str]:
     On a local disk: a hidden temporary neighbour, fsynced and renamed. Elsewhere: one upload at the
     end, which object stores make visible whole.
     """
-    filesystem, inner = locate(path)
+    filesystem, inner = resolve(path)
     if not isinstance(filesystem, LocalFileSystem):
         filesystem.makedirs(inner.rsplit("/", 1)[0], exist_ok=True)
         with tempfile.TemporaryDirectory() as scratch:
@@ -182,27 +182,27 @@ def atomic_file(path: str) -> Iterator[str]:
         temporary.unlink(missing_ok=True)
 
 
-def sweep(folder: str, names: Iterable[str]) -> None:
-    """Remove what `atomic` left of these files in a folder where its process was killed; nobody may
+def remove_temporaries(folder: str, names: Iterable[str]) -> None:
+    """Remove what `atomic_write` left of these files in a folder where its process was killed; nobody may
     be writing them.
     """
-    filesystem, inner = locate(folder)
+    filesystem, inner = resolve(folder)
     if isinstance(filesystem, LocalFileSystem) and os.path.isdir(inner):
         wanted = set(names)
         for entry in os.listdir(inner):
-            left = TEMPORARY.fullmatch(entry)
+            left = TEMPORARY_NAME.fullmatch(entry)
             if left and left[1] in wanted:
                 Path(inner, entry).unlink(missing_ok=True)
 
 
-def copy(source: str, target: str) -> None:
+def link_or_copy(source: str, target: str) -> None:
     """A second name for a file's content on the same storage, all or nothing; both must be written
     whole from then on.
 
     On a local disk a hard link, which costs nothing, where the disk has them.
     """
-    filesystem, inner = locate(source)
-    other = locate(target)[1]
+    filesystem, inner = resolve(source)
+    other = resolve(target)[1]
     if not isinstance(filesystem, LocalFileSystem):
         filesystem.copy(inner, other)
         return
@@ -218,26 +218,26 @@ def copy(source: str, target: str) -> None:
 
 
 def remove(path: str) -> None:
-    filesystem, inner = locate(path)
+    filesystem, inner = resolve(path)
     filesystem.rm_file(inner)
 
 
 def remove_folder(path: str) -> None:
     """A folder with all that is in it; one that is not there is no fault."""
-    filesystem, inner = locate(path)
+    filesystem, inner = resolve(path)
     if filesystem.exists(inner):
         filesystem.rm(inner, recursive=True)
 
 
 def write_bytes(path: str, data: bytes) -> None:
-    with atomic(path) as stream:
+    with atomic_write(path) as stream:
         stream.write(data)
 
 
-def as_json(value: Any) -> bytes:
+def encode_json(value: Any) -> bytes:
     """The file that `write_json` writes."""
     return (json.dumps(value, indent=2, ensure_ascii=False) + "\n").encode()
 
 
 def write_json(path: str, value: Any) -> None:
-    write_bytes(path, as_json(value))
+    write_bytes(path, encode_json(value))

@@ -15,12 +15,12 @@ import pyarrow as pa
 
 from pipeline.core import json_files, parquet, storage
 from pipeline.core.errors import InputError
-from pipeline.core.lock import one_at_a_time
+from pipeline.core.lock import locks_output
 from pipeline.core.progress import console, progress
 from pipeline.core.records import Split, View
 from pipeline.evaluation.extras import Besides, Export, write_besides
-from pipeline.features.table import FeatureTable, Floats, open_table, verify
-from pipeline.images.thumbnails import no_pictures
+from pipeline.features.table import FeatureTable, Floats, open_table, verify_table
+from pipeline.images.thumbnails import no_images
 from pipeline.report.inputs import (
     Extras,
     Findings,
@@ -147,7 +147,7 @@ class EvaluationSettings:
             )
 
 
-@one_at_a_time(lambda settings: settings.out)
+@locks_output(lambda settings: settings.out)
 def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
     """Evaluate into `settings.out` and return the metric rows. A finished evaluation of the same
     inputs is left as it is.
@@ -210,7 +210,7 @@ def plan(settings: EvaluationSettings) -> tuple[FeatureTable, FeatureTable, list
     Raises InputError when they come from different networks, allow no task, or more than the one
     that was asked for.
     """
-    opened = verify if settings.verify else open_table
+    opened = verify_table if settings.verify else open_table
     queries = opened(settings.table or settings.queries or "")
     gallery = queries if settings.table else opened(settings.gallery or "")
     if queries.fingerprint != gallery.fingerprint:
@@ -281,7 +281,7 @@ def _evaluate(
     )
     _write_report(settings, queries, gallery, findings, extras)
     spent["report"] = time.monotonic() - started
-    metrics = storage.as_json(rows)
+    metrics = storage.encode_json(rows)
     write_inputs(settings.out, inputs, metrics)
     storage.write_bytes(storage.join(settings.out, METRICS), metrics)
     parts = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.items())
@@ -334,7 +334,7 @@ def _write_report(
             for key, vector_D in vectors_by_key(side, wanted).items()
         }
 
-    pictures = (lambda keys: fetch(shards, keys)) if shards else no_pictures
+    pictures = (lambda keys: fetch(shards, keys)) if shards else no_images
     page = render(findings, extras, pictures, vectors, settings.panels)
     storage.write_bytes(storage.join(settings.out, "report.html"), page.encode())
     if settings.figures:

@@ -16,36 +16,36 @@ import ray
 
 from pipeline.core import cluster, storage
 from pipeline.core import rejections as rejects
-from pipeline.core.actor_pool import CannotWork, Crew, NobodyCame, SetAside, Terms
-from pipeline.core.cluster import Node, Placement, place
-from pipeline.core.errors import InputError, Unfinished
-from pipeline.core.lock import one_at_a_time
+from pipeline.core.actor_pool import ActorPool, NoWorkerStarted, PoolConfig, PoolFailed, Skipped
+from pipeline.core.cluster import Node, Placement, plan_placement
+from pipeline.core.errors import Incomplete, InputError
+from pipeline.core.lock import locks_output
 from pipeline.core.progress import console, progress
 from pipeline.core.records import Split, View
 from pipeline.features import expected_parts
 from pipeline.features.embed_worker import (
     IN_FLIGHT,
-    Assignment,
-    CannotWrite,
-    Embedded,
+    EmbedJob,
     Encoder,
-    Network,
+    EncoderSpec,
     ShardEmbedder,
+    ShardResult,
+    TableWriteFailed,
 )
 from pipeline.features.part import (
     REJECTED,
     PartHeader,
-    list_rejected,
     part_names,
     read_header,
     read_headers,
     verify_part,
+    write_rejected,
 )
 from pipeline.shards.external import open_manifest
 from pipeline.shards.manifest import MANIFEST, Manifest, Shard, mending, missing_tars
 from pipeline.shards.verify import refuse_damaged
 
-__all__ = ["EmbeddingSettings", "Encoder", "Incomplete", "Network", "embed_gallery"]
+__all__ = ["EmbeddingSettings", "Encoder", "EncoderSpec", "IncompleteEmbedding", "embed_gallery"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,14 +91,14 @@ class EmbeddingSettings:
             raise InputError(f"--gpus-per-worker is {self.gpus_per_worker}, expected 0 or more")
 
 
-class Incomplete(Unfinished):
+class IncompleteEmbedding(Incomplete):
     """Embedding has done what it could, and some shards could not be done. One sentence, with their
     names.
     """
 
 
-@one_at_a_time(lambda settings, network: settings.out)
-def embed_gallery(settings: EmbeddingSettings, network: Network) -> int:
+@locks_output(lambda settings, network: settings.out)
+def embed_gallery(settings: EmbeddingSettings, network: EncoderSpec) -> int:
     """Embed every shard that has no finished part yet; returns how many images were embedded.
 
     `settings` must name paths that a worker can open (absolute, or URIs). Raises InputError on unusable input, Incomplete
@@ -106,13 +106,13 @@ def embed_gallery(settings: EmbeddingSettings, network: Network) -> int:
     """
     if settings.verify and storage.exists(storage.join(settings.shards, MANIFEST)):
         refuse_damaged(settings.shards)
-    wanted = wanted_shards(settings)
-    missing = missing_shards(settings, network, wanted)
-    expected_parts.promise(settings.out, [f"{shard.name}.parquet" for shard in wanted])
+    wanted = requested_shards(settings)
+    missing = pending_shards(settings, network, wanted)
+    expected_parts.add_expected(settings.out, [f"{shard.name}.parquet" for shard in wanted])
     absent = missing_tars(settings.shards, missing)  # said now, and not when their turn comes
     asked = mending(settings.shards)
     lost = {
-        name: SetAside(reason="unusable", found=f"{said}; {asked}") for name, said in absent.items()
+        name: Skipped(reason="unusable", found=f"{said}; {asked}") for name, said in absent.items()
     }
     embedded = 0
     for name, aside in lost.items():
@@ -121,20 +121,21 @@ def embed_gallery(settings: EmbeddingSettings, network: Network) -> int:
         cluster.connect()
         nodes = cluster.nodes()
         given = (settings.workers, settings.cpus_per_worker, settings.gpus_per_worker)
-        placement = place(nodes, len(todo), *given)
-        crew = Crew(terms_of(settings, network, placement, nodes))
-        embedded, given_up = run(settings, crew, todo, placement)
+        placement = plan_placement(nodes, len(todo), *given)
+        crew = ActorPool(pool_config(settings, network, placement, nodes))
+        embedded, given_up = run_pool(settings, crew, todo, placement)
         lost |= given_up
-    expected_parts.give_up(settings.out, [f"{name}.parquet" for name in lost])
-    storage.sweep(
-        settings.out, [expected_parts.LIST, *(f"{shard.name}.parquet" for shard in wanted)]
+    expected_parts.remove_expected(settings.out, [f"{name}.parquet" for name in lost])
+    storage.remove_temporaries(
+        settings.out,
+        [expected_parts.EXPECTED_PARTS, *(f"{shard.name}.parquet" for shard in wanted)],
     )
     rejections = [
         (header.name.removesuffix(".parquet"), one)
         for header in read_headers(settings.out)
         for one in header.footer.rejected
     ]
-    listed = list_rejected(
+    listed = write_rejected(
         settings.out,
         [
             *((name, one.path, one.reason, one.found) for name, one in rejections),
@@ -142,14 +143,14 @@ def embed_gallery(settings: EmbeddingSettings, network: Network) -> int:
         ],
     )
     if listed and rejections:
-        reasons = rejects.commonest(one for _, one in rejections)
+        reasons = rejects.most_common_reasons(one for _, one in rejections)
         told = f"{len(rejections)} images could not be decoded: {reasons}; see {storage.join(settings.out, REJECTED)}"
         console.print(told, style="yellow")
     if lost:
         reasons = "; ".join(
             f"{name} ({aside.reason}: {aside.found})" for name, aside in sorted(lost.items())
         )
-        raise Incomplete(
+        raise IncompleteEmbedding(
             f"{len(lost)} of {len(wanted)} shards could not be embedded, expected all; the others are done; mend these and run "
             f"the same command again: {reasons}"
         )
@@ -158,7 +159,7 @@ def embed_gallery(settings: EmbeddingSettings, network: Network) -> int:
     return embedded
 
 
-def wanted_shards(settings: EmbeddingSettings) -> list[Shard]:
+def requested_shards(settings: EmbeddingSettings) -> list[Shard]:
     """The shards that were asked for.
 
     Raises InputError when there are none.
@@ -176,8 +177,8 @@ def wanted_shards(settings: EmbeddingSettings) -> list[Shard]:
     return wanted
 
 
-def missing_shards(
-    settings: EmbeddingSettings, network: Network, wanted: Sequence[Shard]
+def pending_shards(
+    settings: EmbeddingSettings, network: EncoderSpec, wanted: Sequence[Shard]
 ) -> list[Shard]:
     """Those that have no finished part: one that is there, complete, and made of this very shard.
 
@@ -195,7 +196,7 @@ def missing_shards(
                 raise
             console.print(f"{error}; it is embedded again", style="yellow")
             continue
-        refuse_other(settings, network, header)
+        check_same_encoder(settings, network, header)
         footer, shard = header.footer, own.get(name)
         counted = footer.rows + len(footer.rejected)
         if shard and (footer.shard_sha256, counted) == (shard.sha256, shard.samples):
@@ -203,7 +204,9 @@ def missing_shards(
     return [shard for shard in wanted if shard.name not in done]
 
 
-def refuse_other(settings: EmbeddingSettings, network: Network, header: PartHeader) -> None:
+def check_same_encoder(
+    settings: EmbeddingSettings, network: EncoderSpec, header: PartHeader
+) -> None:
     """Raise InputError where a part of the table cannot stand beside those that would be made."""
     path, made_by = storage.join(settings.out, header.name), header.footer.fingerprint
     if made_by != network.fingerprint:
@@ -218,12 +221,12 @@ def refuse_other(settings: EmbeddingSettings, network: Network, header: PartHead
         )
 
 
-def terms_of(
-    settings: EmbeddingSettings, network: Network, placement: Placement, nodes: Sequence[Node]
-) -> Terms:
+def pool_config(
+    settings: EmbeddingSettings, network: EncoderSpec, placement: Placement, nodes: Sequence[Node]
+) -> PoolConfig:
     """How the crew works: what an actor is, and which failures are whose."""
     cpus, gpus = placement.cpus, placement.gpus
-    assignment = Assignment(
+    assignment = EmbedJob(
         shards=settings.shards,
         out=settings.out,
         batch_size=settings.batch_size,
@@ -235,42 +238,42 @@ def terms_of(
         max_concurrency=IN_FLIGHT
     )
     shared = ray.put(network)  # the weights travel to each node once
-    return Terms(
-        hire=lambda: actor.remote(assignment, shared),
+    return PoolConfig(
+        create_actor=lambda: actor.remote(assignment, shared),
         size=placement.workers,
-        asks_for=f"{placement}, and the largest of {len(nodes)} nodes has {max((n.cpus for n in nodes), default=0):g} CPUs",
+        resources=f"{placement}, and the largest of {len(nodes)} nodes has {max((n.cpus for n in nodes), default=0):g} CPUs",
         in_flight=IN_FLIGHT,
         refusals=(InputError,),
-        fatal=(CannotWrite,),
+        fatal=(TableWriteFailed,),
         patience=settings.patience,
         say=console.print,
     )
 
 
-def run(
-    settings: EmbeddingSettings, crew: Crew, missing: Sequence[Shard], placement: Placement
-) -> tuple[int, dict[str, SetAside]]:
+def run_pool(
+    settings: EmbeddingSettings, crew: ActorPool, missing: Sequence[Shard], placement: Placement
+) -> tuple[int, dict[str, Skipped]]:
     """Embed the missing shards; returns how many images that made, and which shards had to be set
     aside.
     """
-    spent, embedded, lost, start = Counter[str](), 0, dict[str, SetAside](), time.monotonic()
+    spent, embedded, lost, start = Counter[str](), 0, dict[str, Skipped](), time.monotonic()
     try:
         with progress(sum(shard.samples for shard in missing), "embedding") as meter:
             for shard, result in crew.work(missing):
-                if isinstance(result, SetAside):
+                if isinstance(result, Skipped):
                     lost[shard.name] = result
                     meter.note(f"{shard.name} is set aside ({result.reason}): {result.found}")
                     continue
-                assert isinstance(result, Embedded)
+                assert isinstance(result, ShardResult)
                 spent.update(result.seconds)
                 embedded += shard.samples
                 meter.advance(shard.samples, workers=crew.working)
-    except NobodyCame as error:
+    except NoWorkerStarted as error:
         raise InputError(
             f"{error}; start nodes that have them, or give --cpus-per-worker, --gpus-per-worker"
         ) from None
-    except (CannotWork, CannotWrite) as error:
-        raise Incomplete(str(error)) from error
+    except (PoolFailed, TableWriteFailed) as error:
+        raise IncompleteEmbedding(str(error)) from error
     elapsed = time.monotonic() - start
     idle = max(0.0, crew.seconds - spent["infer"])
     threads = ", ".join(f"{name} {spent[name]:.1f} s" for name in ("read", "decode", "write"))

@@ -24,7 +24,7 @@ from pipeline.batches.ordered import Opened, opened, stack
 from pipeline.core import storage
 from pipeline.core.arrays import Floats, Halves
 from pipeline.core.errors import InputError
-from pipeline.core.prefetch import ahead, ready
+from pipeline.core.prefetch import prefetch, prefetch_map
 from pipeline.core.records import Rejection
 from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.images.decode import DecodeError, Pixels
@@ -37,17 +37,17 @@ Encoder = Callable[[npt.NDArray[np.uint8]], Floats]
 it has to say of itself stands in its `remarks`, where it has any."""
 IN_FLIGHT = 2
 "Shards that a worker has at once: one is embedded while the other is read, or written."
-READY_BATCHES = 2
+PREFETCH_BATCHES = 2
 "Stacked and waiting for the encoder."
 TOLERANCE = 0.01
 "Of an embedding's length."
-NO_PLACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM})
+FATAL_WRITE_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM})
 "Errors of writing that the next shard would meet as well."
 Seconds = defaultdict[str, float]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Network:
+class EncoderSpec:
     """The encoder as the embedder needs to know it."""
 
     fingerprint: str
@@ -61,7 +61,7 @@ class Network:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Assignment:
+class EmbedJob:
     """What the work on every shard has in common."""
 
     shards: str
@@ -74,7 +74,7 @@ class Assignment:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Embedded:
+class ShardResult:
     """What became of a shard."""
 
     rows: int
@@ -83,14 +83,14 @@ class Embedded:
     "Of threads, by what they did: read, decode, infer, write."
 
 
-class CannotWrite(RuntimeError):
+class TableWriteFailed(RuntimeError):
     """The table's place takes no more. One sentence."""
 
 
 class ShardEmbedder:
-    """One worker. `work` may be called by two threads at once."""
+    """One worker. `watch_replicas` may be called by two threads at once."""
 
-    def __init__(self, given: Assignment, network: Network) -> None:
+    def __init__(self, given: EmbedJob, network: EncoderSpec) -> None:
         self._given, self._network = given, network
         # One thread for all that computes: shards queue here, and torch's settings of a thread hold
         # for every pass.
@@ -108,7 +108,7 @@ class ShardEmbedder:
         self._encoder = self._device.submit(self._network.factory, self._given.threads).result()
         return list(getattr(self._encoder, "remarks", ()))
 
-    def work(self, shard: Shard) -> Embedded:
+    def work(self, shard: Shard) -> ShardResult:
         """Embed one shard and write its part.
 
         Raises InputError where the tar is cut off or not what the manifest says, CannotWrite where
@@ -118,7 +118,7 @@ class ShardEmbedder:
         batches_made = self._batches(shard, samples, rejected, seconds)
         with (
             self._reader() as reader,
-            closing(ready(batches_made, READY_BATCHES, reader)) as batches,
+            closing(prefetch(batches_made, PREFETCH_BATCHES, reader)) as batches,
         ):
             first = next(
                 batches, None
@@ -135,7 +135,7 @@ class ShardEmbedder:
         start = time.perf_counter()
         self._write(shard, samples, embeddings_ND[: len(samples)], rejected)
         seconds["write"] += time.perf_counter() - start
-        return Embedded(rows=len(samples), rejected=tuple(rejected), seconds=dict(seconds))
+        return ShardResult(rows=len(samples), rejected=tuple(rejected), seconds=dict(seconds))
 
     @contextmanager
     def _reader(self) -> Iterator[ThreadPoolExecutor]:
@@ -159,7 +159,9 @@ class ShardEmbedder:
             read_shard(given.shards, shard.name, shard.split, shard.view, shard.sha256), seconds
         )
         images: list[Pixels] = []
-        for (sample, image), spent in ahead(self._open, samples, self._decoders, given.batch_size):
+        for (sample, image), spent in prefetch_map(
+            self._open, samples, self._decoders, given.batch_size
+        ):
             seconds["decode"] += spent
             if isinstance(image, DecodeError):
                 rejected.append(Rejection(path=sample.key, reason=image.reason, found=image.found))
@@ -243,9 +245,9 @@ class ShardEmbedder:
         try:
             write_part(path, rows, footer, self._given.dtype)
         except OSError as error:
-            if error.errno not in NO_PLACE:
+            if error.errno not in FATAL_WRITE_ERRORS:
                 raise
-            raise CannotWrite(
+            raise TableWriteFailed(
                 f"{path} cannot be written ({error.strerror}), expected {embeddings_BD.nbytes / 1e6:.1f} MB of room and the "
                 "right to write; make room or choose another --out, and run the same command again to go on"
             ) from None

@@ -11,35 +11,35 @@ from collections.abc import Iterable
 from pipeline.core import json_files, storage
 from pipeline.core.errors import InputError
 
-LIST = "_parts.json"
+EXPECTED_PARTS = "_parts.json"
 
 
-def promise(table: str, names: Iterable[str]) -> None:
+def add_expected(table: str, names: Iterable[str]) -> None:
     """These parts, besides those that were promised before, are the table's."""
     known = set(_read(table, mending=True))
     if not known.issuperset(promised := set(names)):
         _write(table, known | promised)
 
 
-def give_up(table: str, names: Iterable[str]) -> None:
+def remove_expected(table: str, names: Iterable[str]) -> None:
     """These parts are not to come: their shards could not be embedded, and that was said."""
     if lost := set(names):
         _write(table, set(_read(table)) - lost)
 
 
-def refuse_missing(table: str, there: Iterable[str]) -> None:
+def check_expected(table: str, there: Iterable[str]) -> None:
     """Raise InputError where a promised part is not there."""
     promised = set(_read(table))
     missing = sorted(promised.difference(there))
     if missing:
         raise InputError(
             f"{table} lacks {len(missing)} of the {len(promised)} parts that it is to have, {missing[0]} first; run the "
-            f"embed_gallery command that fills it again, or delete {storage.join(table, LIST)} where it is meant to do without"
+            f"embed_gallery command that fills it again, or delete {storage.join(table, EXPECTED_PARTS)} where it is meant to do without"
         )
 
 
 def _read(table: str, mending: bool = False) -> list[str]:
-    path = storage.join(table, LIST)
+    path = storage.join(table, EXPECTED_PARTS)
     if not storage.exists(path):
         return []
     try:
@@ -54,4 +54,4 @@ def _read(table: str, mending: bool = False) -> list[str]:
 
 
 def _write(table: str, names: set[str]) -> None:
-    json_files.write_checksummed(storage.join(table, LIST), {"parts": sorted(names)})
+    json_files.write_checksummed(storage.join(table, EXPECTED_PARTS), {"parts": sorted(names)})

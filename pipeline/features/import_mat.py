@@ -14,13 +14,13 @@ import numpy as np
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.core.lock import one_at_a_time
+from pipeline.core.lock import locks_output
 from pipeline.core.records import Split, View, make_key
 from pipeline.features.mat_file import NUMBERS, IsHdf5, Unreadable, read_mat
 from pipeline.features.table import Floats, PartFooter, PartRows, write_part
 
 PART_ROWS = 8_192
-JUNK = -1  # the official evaluation takes gallery rows of this label out of the ranking
+JUNK_LABEL = -1  # the official evaluation takes gallery rows of this label out of the ranking
 ViewName = Literal["drone", "satellite", "street", "google"]
 
 
@@ -39,14 +39,14 @@ class ImportSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Side:
+class _EmbeddingSet:
     features_ND: Floats
     labels: list[int]
     paths: list[str]
     "Empty where the file has none."
 
 
-@one_at_a_time(lambda settings: settings.out)
+@locks_output(lambda settings: settings.out)
 def import_features(settings: ImportSettings) -> dict[str, tuple[str, int]]:
     """Write OUT/queries and OUT/gallery; returns, for each, its path and rows. What is there
     already is left as it is.
@@ -104,7 +104,7 @@ def _load(path: str, data: bytes) -> dict[str, Any]:
     return said
 
 
-def _side(path: str, said: dict[str, Any], name: str) -> _Side:
+def _side(path: str, said: dict[str, Any], name: str) -> _EmbeddingSet:
     with np.errstate(over="ignore"):  # an infinite length is refused below
         features_ND = np.asarray(said[f"{name}_f"], np.float32)
     label_N = np.ravel(said[f"{name}_label"])
@@ -123,8 +123,8 @@ def _side(path: str, said: dict[str, Any], name: str) -> _Side:
             f"{path} has {name}_f of shape {features_ND.shape}, {len(labels)} labels and {len(paths)} paths; expected one row, "
             "one label and one path (or no paths at all) for each image; save them again"
         )
-    if name == "gallery" and JUNK in labels:
-        kept = [row for row, label in enumerate(labels) if label != JUNK]
+    if name == "gallery" and JUNK_LABEL in labels:
+        kept = [row for row, label in enumerate(labels) if label != JUNK_LABEL]
         features_ND, labels = features_ND[kept], [labels[row] for row in kept]
         paths = [paths[row] for row in kept] if paths else []
     length_N1 = np.linalg.norm(features_ND.astype(np.float64), axis=1, keepdims=True)
@@ -134,13 +134,13 @@ def _side(path: str, said: dict[str, Any], name: str) -> _Side:
             f"row {row} of {name}_f in {path} has length {length_N1[row, 0]:g}; expected vectors of finite length above 0; "
             "leave that image out"
         )
-    return _Side(
+    return _EmbeddingSet(
         features_ND=(features_ND / length_N1).astype(np.float32), labels=labels, paths=paths
     )
 
 
 def _write(
-    table: str, side: _Side, split: Split, view: View, fingerprint: str, by_path: bool
+    table: str, side: _EmbeddingSet, split: Split, view: View, fingerprint: str, by_path: bool
 ) -> int:
     folders = [path.replace("\\", "/").split("/") for path in side.paths]
     if by_path and folders and len(folders[0]) > 2:
@@ -169,7 +169,7 @@ def _write(
         f"{split}-{view}-{first // PART_ROWS:06d}.parquet"
         for first in range(0, len(keys), PART_ROWS)
     ]
-    strangers = sorted(set(storage.names(table)) - set(names))
+    strangers = sorted(set(storage.list_names(table)) - set(names))
     if strangers:
         raise InputError(
             f"{table} holds {strangers[0]}, which is not of these features; choose another --out"

@@ -17,7 +17,7 @@ NUMBERS = ("gallery_f", "gallery_label", "query_f", "query_label")
 PATHS = ("gallery_path", "query_path")
 NAMES = "names"
 "Under this name the reader lists all that the file holds."
-CANNOT, HDF5 = 3, 4
+EXIT_UNREADABLE, EXIT_HDF5 = 3, 4
 "Exit codes of the reader: it says why on its error stream; the file is a MATLAB 7.3 one."
 
 
@@ -35,12 +35,12 @@ def read_mat(data: bytes) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
     Raises Unreadable, IsHdf5.
     """
     done = subprocess.run([sys.executable, __file__], input=data, capture_output=True, check=False)
-    if done.returncode == HDF5:
+    if done.returncode == EXIT_HDF5:
         raise IsHdf5
     if done.returncode:
         said = (
             done.stderr.decode(errors="replace").strip().splitlines()
-            if done.returncode == CANNOT
+            if done.returncode == EXIT_UNREADABLE
             else []
         )
         raise Unreadable(said[-1][:300] if said else "the reader crashed over it")
@@ -60,10 +60,10 @@ def main() -> int:
         names = np.array([name for name in said if not name.startswith("__")], np.str_)
         np.savez(sys.stdout.buffer, **{NAMES: names}, **plain)  # type: ignore[arg-type]
     except NotImplementedError:  # scipy's word for MATLAB 7.3
-        return HDF5
+        return EXIT_HDF5
     except Exception as error:  # the reader raises whatever the damage leads it to
         print(" ".join(str(error).split()) or type(error).__name__, file=sys.stderr)
-        return CANNOT
+        return EXIT_UNREADABLE
     return 0
 
 

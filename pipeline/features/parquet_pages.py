@@ -29,7 +29,7 @@ Whole = npt.NDArray[np.int64]
 NO_CRC = -1
 
 
-class Damaged(Exception):
+class DamagedPage(Exception):
     """A page is not what was written."""
 
 
@@ -38,7 +38,7 @@ class NotPlain(Exception):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pages:
+class ColumnPages:
     """The data pages of a column, over all row groups of a file; P pages."""
 
     first_P: Whole
@@ -62,10 +62,10 @@ class Pages:
             crc != NO_CRC
             and zlib.crc32(data[int(self.page_P[page]) : int(self.end_P[page])]) != crc
         ):
-            raise Damaged(f"the checksum of the page at byte {self.page_P[page]} is another")
+            raise DamagedPage(f"the checksum of the page at byte {self.page_P[page]} is another")
 
 
-def find_pages(parquet: pq.ParquetFile, data: mmap.mmap, column: int, width: int) -> Pages:
+def find_pages(parquet: pq.ParquetFile, data: mmap.mmap, column: int, width: int) -> ColumnPages:
     """The pages of one column whose values take `width` bytes each.
 
     Raises NotPlain where it is compressed, encoded, or its pages do not add up.
@@ -98,7 +98,7 @@ def find_pages(parquet: pq.ParquetFile, data: mmap.mmap, column: int, width: int
         if values - before != chunk.num_values:
             raise NotPlain
     first_P, begin_P, page_P, end_P, crc_P = np.array(pages, np.int64).reshape(-1, 5).T
-    return Pages(
+    return ColumnPages(
         first_P=first_P, begin_P=begin_P, page_P=page_P, end_P=end_P, crc_P=crc_P, values=values
     )
 

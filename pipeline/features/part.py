@@ -18,11 +18,11 @@ from pipeline.core import parquet as parquet_files
 from pipeline.core import rejections, storage
 from pipeline.core.arrays import Floats, Halves
 from pipeline.core.errors import InputError
-from pipeline.core.prefetch import ahead
+from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import Rejection, Split, View, excerpt
 
 SCHEMA_VERSION = "1"
-REJECTED = f"_rejected/{rejections.FILE}"
+REJECTED = f"_rejected/{rejections.REJECTED_FILE}"
 """Within a table. In a folder of its own, so that `*.parquet` names parts only, and one whose
 underscore keeps it from readers that look into folders: pandas, pyarrow and Spark."""
 REJECTED_SCHEMA = pa.schema([(name, pa.string()) for name in ("shard", "key", "reason", "found")])
@@ -132,18 +132,18 @@ def open_part(path: str) -> Iterator[pq.ParquetFile]:
     Raises InputError, here or while it is read, when it is no whole Parquet file.
     """
     try:
-        with parquet_files.opened(path) as parquet:
+        with parquet_files.open_parquet(path) as parquet:
             yield parquet
-    except parquet_files.DAMAGE as error:
+    except parquet_files.DAMAGE_ERRORS as error:
         raise _unreadable(path, error) from None
 
 
 def verify_part(path: str) -> None:
     """Look at every byte of a part. Raises InputError where one is not what was written."""
     try:
-        if parquet_files.refuse_damaged(path):
+        if parquet_files.verify_parquet(path):
             return
-    except parquet_files.DAMAGE as error:
+    except parquet_files.DAMAGE_ERRORS as error:
         raise _unreadable(path, error) from None
     with open_part(path) as parquet:  # from before there were seals
         for _ in parquet.iter_batches():
@@ -156,7 +156,7 @@ def _unreadable(path: str, error: Exception) -> InputError:
     )
 
 
-def sound(found: pa.Table) -> pa.Table:
+def validate_rows(found: pa.Table) -> pa.Table:
     """The rows, every value looked at: text that is no UTF-8 would else come to light far from its
     part.
 
@@ -166,7 +166,7 @@ def sound(found: pa.Table) -> pa.Table:
     return found
 
 
-def kind_of(path: str, split: str | None, view: str | None) -> tuple[Split, View]:
+def parse_split_and_view(path: str, split: str | None, view: str | None) -> tuple[Split, View]:
     """Split and view of rows. Raises InputError where they are none of ours."""
     if split not in list(Split) or view not in list(View):
         raise InputError(
@@ -182,10 +182,10 @@ def read_header(path: str) -> PartHeader:
     Raises InputError when the file is not a part of a feature table.
     """
     with open_part(path) as parquet:
-        return header_of(parquet, path)
+        return part_header(parquet, path)
 
 
-def header_of(parquet: pq.ParquetFile, path: str) -> PartHeader:
+def part_header(parquet: pq.ParquetFile, path: str) -> PartHeader:
     """`read_header` of an open part."""
     schema, rows = parquet.schema_arrow, parquet.metadata.num_rows
     said = schema.metadata or {}
@@ -244,13 +244,13 @@ def read_footer(path: str) -> PartFooter:
 
 def part_names(path: str) -> list[str]:
     """The file names of a table's parts, in its order."""
-    return [name for name in storage.names(path) if name.endswith(".parquet")]
+    return [name for name in storage.list_names(path) if name.endswith(".parquet")]
 
 
 def read_headers(path: str) -> list[PartHeader]:
     """Every part's header, in the table's order; a folder that is not there has none."""
     return list(
-        ahead(
+        prefetch_map(
             lambda name: read_header(storage.join(path, name)),
             part_names(path),
             READERS,
@@ -259,7 +259,7 @@ def read_headers(path: str) -> list[PartHeader]:
     )
 
 
-def refuse_mixed(path: str, headers: Sequence[PartHeader]) -> None:
+def check_consistent_parts(path: str, headers: Sequence[PartHeader]) -> None:
     """Raise InputError where parts cannot stand in one table: of different networks, or of
     different numbers.
     """
@@ -281,7 +281,7 @@ def refuse_mixed(path: str, headers: Sequence[PartHeader]) -> None:
             )
 
 
-def list_rejected(table: str, rejected: Iterable[tuple[str, str | None, str, str]]) -> bool:
+def write_rejected(table: str, rejected: Iterable[tuple[str, str | None, str, str]]) -> bool:
     """Write what has no row, as (shard, key, reason, found), in that order; the key is None where
     it is the whole shard.
 
@@ -318,7 +318,7 @@ def read_rejected(table: str) -> pa.Table:
         return REJECTED_SCHEMA.empty_table()
     try:
         return parquet_files.read_table(path)
-    except parquet_files.DAMAGE as error:
+    except parquet_files.DAMAGE_ERRORS as error:
         raise InputError(
             f"{path} cannot be read ({error}), expected the list that embedding writes; run jobs/embed_gallery.py again as it "
             "was run before, which writes it from the parts"

@@ -17,20 +17,20 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.core import storage
-from pipeline.core.arrays import Floats, Halves, Whole
+from pipeline.core.arrays import Floats, Halves, Ints
 from pipeline.core.errors import InputError
-from pipeline.features.parquet_pages import Damaged, NotPlain, Pages, find_pages
-from pipeline.features.part import header_of, open_part
+from pipeline.features.parquet_pages import ColumnPages, DamagedPage, NotPlain, find_pages
+from pipeline.features.part import open_part, part_header
 
-OPEN_PARTS = 512
+MAX_OPEN_PARTS = 512
 "Mapped at once: each takes a file descriptor."
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Mapped:
+class _MappedPart:
     bytes_N: npt.NDArray[np.uint8]
     "The whole file."
-    pages: Pages
+    pages: ColumnPages
     dtype: "np.dtype[np.float16] | np.dtype[np.float32]"
     sound_P: npt.NDArray[np.bool_]
     "Pages whose checksum was found right."
@@ -43,9 +43,9 @@ class RowReader:
 
     def __init__(self, table: str, dimension: int) -> None:
         self._table, self._dimension = table, dimension
-        self._open: OrderedDict[str, _Mapped] = OrderedDict()
+        self._open: OrderedDict[str, _MappedPart] = OrderedDict()
 
-    def read(self, part: str, shard_sha256: str, row_R: Whole) -> Floats | Halves:
+    def read(self, part: str, shard_sha256: str, row_R: Ints) -> Floats | Halves:
         """Embeddings (R, D) of rows of a part, as stored, in the order asked for.
 
         `shard_sha256` is the shard that the part is of. Raises InputError where the part is gone, another's, or not stored
@@ -69,7 +69,7 @@ class RowReader:
             rows_RW[row] = self._across_pages(mapped, int(value_R[row]), int(page_R[row]))
         return rows_RW.view(mapped.dtype)
 
-    def _refuse_damaged(self, part: str, mapped: _Mapped, first_R: Whole, last_R: Whole) -> None:
+    def _refuse_damaged(self, part: str, mapped: _MappedPart, first_R: Ints, last_R: Ints) -> None:
         """Raise InputError where a page of rows that reach from a first to a last one is not what
         was written.
         """
@@ -83,13 +83,13 @@ class RowReader:
         for page in np.flatnonzero((np.cumsum(wanted_P)[:-1] > 0) & ~mapped.sound_P).tolist():
             try:
                 mapped.pages.refuse_damaged(mapped.bytes_N.data, page)
-            except Damaged as error:
+            except DamagedPage as error:
                 raise InputError(
                     f"{storage.join(self._table, part)} is damaged ({error}); delete it and embed its shard again"
                 ) from None
             mapped.sound_P[page] = True
 
-    def _across_pages(self, mapped: _Mapped, value: int, page: int) -> npt.NDArray[np.uint8]:
+    def _across_pages(self, mapped: _MappedPart, value: int, page: int) -> npt.NDArray[np.uint8]:
         """The bytes of a row that begins in one page and ends in another."""
         pages, width, pieces, missing = mapped.pages, mapped.dtype.itemsize, [], self._dimension
         while missing:
@@ -100,7 +100,7 @@ class RowReader:
             value, page, missing = value + here, page + 1, missing - here
         return np.concatenate(pieces)
 
-    def _part(self, name: str, shard_sha256: str) -> _Mapped:
+    def _part(self, name: str, shard_sha256: str) -> _MappedPart:
         if name in self._open:
             self._open.move_to_end(name)
             return self._open[name]
@@ -111,7 +111,7 @@ class RowReader:
                 "the index was built; put it back, or build the index again with jobs/build_index.py"
             )
         with open_part(path) as parquet:
-            header = header_of(parquet, path)
+            header = part_header(parquet, path)
             if header.footer.shard_sha256 != shard_sha256 or header.dimension != self._dimension:
                 raise InputError(
                     f"{path} is no longer of the shard that the index was built from; expected an unchanged part; build the "
@@ -119,21 +119,21 @@ class RowReader:
                 )
             mapped = _map(parquet, path, header.dtype)
         self._open[name] = mapped
-        if len(self._open) > OPEN_PARTS:
+        if len(self._open) > MAX_OPEN_PARTS:
             self._open.popitem(last=False)
         return mapped
 
 
-def readable(table: str) -> bool:
+def supports_row_reads(table: str) -> bool:
     """Whether single rows can be read: of a table on this machine's disks."""
     return storage.is_local(table)
 
 
-def _map(parquet: pq.ParquetFile, path: str, dtype: str) -> _Mapped:
+def _map(parquet: pq.ParquetFile, path: str, dtype: str) -> _MappedPart:
     embedding = pa.schema(parquet.schema_arrow).get_field_index(
         "embedding"
     )  # those before it have one column each
-    with open(storage.locate(path)[1], "rb") as stream:
+    with open(storage.resolve(path)[1], "rb") as stream:
         data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     try:
         kept = np.dtype(np.float16) if dtype == "float16" else np.dtype(np.float32)
@@ -145,4 +145,6 @@ def _map(parquet: pq.ParquetFile, path: str, dtype: str) -> _Mapped:
             "writes them; delete it and embed its shard again"
         ) from None
     sound_P = np.zeros(len(pages.first_P), np.bool_)
-    return _Mapped(bytes_N=np.frombuffer(data, np.uint8), pages=pages, dtype=kept, sound_P=sound_P)
+    return _MappedPart(
+        bytes_N=np.frombuffer(data, np.uint8), pages=pages, dtype=kept, sound_P=sound_P
+    )

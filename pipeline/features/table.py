@@ -19,10 +19,10 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from pipeline.core import storage
-from pipeline.core.arrays import Floats, Halves, Words
+from pipeline.core.arrays import Floats, Halves, Strings
 from pipeline.core.errors import InputError
 from pipeline.core.geo import Box
-from pipeline.core.prefetch import ahead
+from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import Split, View
 from pipeline.features import expected_parts
 from pipeline.features.part import (
@@ -30,14 +30,14 @@ from pipeline.features.part import (
     PartFooter,
     PartHeader,
     PartRows,
-    header_of,
-    kind_of,
+    check_consistent_parts,
     open_part,
+    parse_split_and_view,
+    part_header,
     part_names,
     part_schema,
     read_footer,
-    refuse_mixed,
-    sound,
+    validate_rows,
     verify_part,
     write_part,
 )
@@ -50,12 +50,12 @@ __all__ = [
     "Labels",
     "PartFooter",
     "PartRows",
-    "Words",
+    "Strings",
     "open_table",
     "part_names",
     "part_schema",
     "read_footer",
-    "verify",
+    "verify_table",
     "write_part",
 ]
 
@@ -63,8 +63,8 @@ BLOCK_BYTES = 64 * 2**20
 "Of a block as float32, where its rows are not said."
 TOLERANCE = 0.01
 "Of an embedding's length: what float16 and rounding take."
-KEYS_AT_OPENING = 1_000_000
-"""Rows up to which opening looks whether a key repeats, a third of a second; `verify` does for any
+UNIQUE_CHECK_ROWS = 1_000_000
+"""Rows up to which opening looks whether a key repeats, a third of a second; `verify_table` does for any
 number."""
 Counts = Counter[tuple[Split, View]]
 
@@ -73,8 +73,8 @@ Counts = Counter[tuple[Split, View]]
 class Labels:
     """What is known of each row besides its embedding; equal lengths, in the table's order."""
 
-    keys: Words
-    locations: Words
+    keys: Strings
+    locations: Strings
     lats: npt.NDArray[np.float64]
     "NaN where unknown."
     lons: npt.NDArray[np.float64]
@@ -183,7 +183,7 @@ class FeatureTable:
         tests = set().union(*(meant.columns for meant in self.selections))
         for part in self.parts:
             with open_part(storage.join(self.path, part)) as parquet:
-                found = sound(parquet.read(columns=sorted({*columns, *tests})))
+                found = validate_rows(parquet.read(columns=sorted({*columns, *tests})))
             found = found.append_column("part_row", pa.array(np.arange(len(found), dtype=np.int32)))
             for meant in self.selections:
                 found = found.filter(meant.mask(found))
@@ -209,7 +209,7 @@ class FeatureTable:
         """Embeddings of the selected rows as arrays (B, D), B <= rows, in the order of `labels`.
 
         No more than a block is in memory; without `rows` it has 64 MiB at most. `dtype` may be
-        `stored`: as the parts have them. Raises InputError where an embedding is NaN or not of unit
+        `list_tiles`: as the parts have them. Raises InputError where an embedding is NaN or not of unit
         length.
         """
         wanted = self.dtype if dtype == "stored" else dtype
@@ -244,7 +244,7 @@ class FeatureTable:
                     if all(meant.may_hold(parquet, group) for meant in self.selections)
                 ]
                 for batch in parquet.iter_batches(rows, groups, columns=sorted({*columns, *tests})):
-                    found = sound(pa.Table.from_batches([batch]))
+                    found = validate_rows(pa.Table.from_batches([batch]))
                     for meant in self.selections:
                         found = found.filter(meant.mask(found))
                     if len(found):
@@ -259,12 +259,12 @@ def open_table(path: str) -> FeatureTable:
     for in tables of up to KEYS_AT_OPENING rows).
     """
     table = _open(path)
-    if table.rows <= KEYS_AT_OPENING:
-        _refuse_repeats(table)
+    if table.rows <= UNIQUE_CHECK_ROWS:
+        _check_unique_keys(table)
     return table
 
 
-def verify(path: str) -> FeatureTable:
+def verify_table(path: str) -> FeatureTable:
     """`open_table`, and every byte and row is looked at: keys there once, embeddings of unit
     length. Takes 8 bytes a row.
 
@@ -273,7 +273,7 @@ def verify(path: str) -> FeatureTable:
     for name in part_names(path):
         verify_part(storage.join(path, name))
     table = _open(path)
-    _refuse_repeats(table)
+    _check_unique_keys(table)
     for _ in table.blocks(dtype="stored"):
         pass
     return table
@@ -285,12 +285,12 @@ def _open(path: str) -> FeatureTable:
         raise InputError(
             f"no feature table at {path}: found no Parquet part; make one with jobs/embed_gallery.py"
         )
-    expected_parts.refuse_missing(path, names)
+    expected_parts.check_expected(path, names)
     found = list(
-        ahead(lambda name: _open_one(storage.join(path, name)), names, READERS, 4 * READERS)
+        prefetch_map(lambda name: _open_one(storage.join(path, name)), names, READERS, 4 * READERS)
     )
     headers = [header for header, _ in found]
-    refuse_mixed(path, headers)
+    check_consistent_parts(path, headers)
     return FeatureTable(
         path=path,
         fingerprint=headers[0].footer.fingerprint,
@@ -305,14 +305,14 @@ def _open(path: str) -> FeatureTable:
 def _open_one(path: str) -> tuple[PartHeader, Counts]:
     counts: Counts = Counter()
     with open_part(path) as parquet:
-        header = header_of(parquet, path)
-        table = sound(parquet.read(columns=["split", "view"])).unify_dictionaries()
+        header = part_header(parquet, path)
+        table = validate_rows(parquet.read(columns=["split", "view"])).unify_dictionaries()
     for row in table.group_by(["split", "view"]).aggregate([([], "count_all")]).to_pylist():
-        counts[kind_of(path, row["split"], row["view"])] += row["count_all"]
+        counts[parse_split_and_view(path, row["split"], row["view"])] += row["count_all"]
     return header, counts
 
 
-def _refuse_repeats(table: FeatureTable) -> None:
+def _check_unique_keys(table: FeatureTable) -> None:
     """Raise InputError where a key is there twice. Keys are compared by 64-bit hashes, and those
     that agree by themselves.
     """

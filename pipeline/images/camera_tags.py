@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from pipeline.images.exif import XMP_TAG, Directory, read_exif
-from pipeline.images.image_blocks import Blocks, UnreadableTag
+from pipeline.images.image_blocks import MetadataBlocks, UnreadableTag
 from pipeline.images.xmp import read_xmp
 
 (
@@ -49,7 +49,7 @@ XMP_HEIGHT = ("AboveGroundAltitude", "RelativeAltitude")
 XMP_HEADING = ("GimbalYawDegree", "CameraYawDegree", "CameraOrientationNED.Yaw")
 XMP_BODY_HEADING = ("FlightYawDegree", "DroneYawDegree")
 XMP_PITCH = ("GimbalPitchDegree", "CameraPitchDegree", "CameraOrientationNED.Pitch")
-BEYOND_VERTICAL = 1.0  # degrees by which gimbals overshoot straight down: -90.1 is common
+GIMBAL_OVERSHOOT_DEG = 1.0  # degrees by which gimbals overshoot straight down: -90.1 is common
 NUMBER = re.compile(
     r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d{1,3})?", re.ASCII
 )  # in one way only: a square of time else
@@ -74,7 +74,7 @@ class CameraTags:
     "ISO 8601; without an offset the camera's own clock."
 
 
-def read_tags(blocks: Blocks) -> CameraTags:
+def read_tags(blocks: MetadataBlocks) -> CameraTags:
     """The tags of an image whose metadata blocks these are.
 
     EXIF's position is taken before XMP's; XMP's gimbal before EXIF's direction, and that before the
@@ -84,24 +84,24 @@ def read_tags(blocks: Blocks) -> CameraTags:
     exif = read_exif(blocks.exif or b"")
     packet = blocks.xmp or (exif.main[XMP_TAG].raw if XMP_TAG in exif.main else None)
     xmp = read_xmp(packet) if packet else {}
-    heading = _first(xmp, XMP_HEADING)
-    for other in (_direction(exif.gps), _first(xmp, XMP_BODY_HEADING)):
+    heading = _first_number(xmp, XMP_HEADING)
+    for other in (_direction(exif.gps), _first_number(xmp, XMP_BODY_HEADING)):
         heading = other if heading is None else heading
-    pitch = _first(xmp, XMP_PITCH)
+    pitch = _first_number(xmp, XMP_PITCH)
     if pitch is not None:
-        pitch = max(-90.0, min(90.0, pitch)) if abs(pitch) <= 90 + BEYOND_VERTICAL else None
+        pitch = max(-90.0, min(90.0, pitch)) if abs(pitch) <= 90 + GIMBAL_OVERSHOOT_DEG else None
     sea_level = _altitude(exif.gps)
     return CameraTags(
         position=_exif_position(exif.gps) or _xmp_position(xmp),
-        height_m=_first(xmp, XMP_HEIGHT),
-        sea_level_m=_first(xmp, ("AbsoluteAltitude",)) if sea_level is None else sea_level,
+        height_m=_first_number(xmp, XMP_HEIGHT),
+        sea_level_m=_first_number(xmp, ("AbsoluteAltitude",)) if sea_level is None else sea_level,
         heading_deg=None if heading is None else heading % 360,
         pitch_deg=pitch,
         taken_at=_taken_at(exif.photo),
     )
 
 
-def checked(lat: float, lon: float, said: str) -> tuple[float, float] | None:
+def validate_position(lat: float, lon: float, said: str) -> tuple[float, float] | None:
     """A position on the globe, or None at exactly 0, 0, which stands for no fix.
 
     Raises UnreadableTag, with `said` in its message, for anything else.
@@ -111,7 +111,7 @@ def checked(lat: float, lon: float, said: str) -> tuple[float, float] | None:
     return None if lat == 0 and lon == 0 else (lat, lon)
 
 
-def number(text: str) -> float | None:
+def parse_number(text: str) -> float | None:
     """A finite number as cameras write it, `+50.10`; None where the text is something else."""
     value = float(text) if NUMBER.fullmatch(text.strip()) else math.nan
     return value if math.isfinite(value) else None
@@ -130,7 +130,7 @@ def _exif_position(gps: Directory) -> tuple[float, float] | None:
             (lon, LONGITUDE_REF, "EW", "GPSLongitudeRef"),
         )
     ]
-    return checked(signed[0], signed[1], "GPS of the EXIF")
+    return validate_position(signed[0], signed[1], "GPS of the EXIF")
 
 
 def _angle(gps: Directory, tag: int, name: str) -> float:
@@ -164,24 +164,26 @@ def _xmp_position(xmp: Mapping[str, str]) -> tuple[float, float] | None:
             raise UnreadableTag(f"{half[0]} {xmp[half[0]]} without its other half")
         return None
     said = ", ".join(f"{name} {xmp[name]}" for name in pair)
-    lat, lon = (number(xmp[name]) for name in pair)
+    lat, lon = (parse_number(xmp[name]) for name in pair)
     if lat is None or lon is None:
         raise UnreadableTag(said)
-    return checked(lat, lon, "GPS of the XMP")
+    return validate_position(lat, lon, "GPS of the XMP")
 
 
-def _first(xmp: Mapping[str, str], names: tuple[str, ...]) -> float | None:
+def _first_number(xmp: Mapping[str, str], names: tuple[str, ...]) -> float | None:
     """The first of these properties that is a number."""
-    return next((value for name in names if (value := number(xmp.get(name, ""))) is not None), None)
+    return next(
+        (value for name in names if (value := parse_number(xmp.get(name, ""))) is not None), None
+    )
 
 
-def _ratio(gps: Directory, tag: int) -> float | None:
+def _first_rational(gps: Directory, tag: int) -> float | None:
     parts = gps[tag].rationals() if tag in gps else None
     return parts[0][0] / parts[0][1] if parts and parts[0][1] else None
 
 
 def _altitude(gps: Directory) -> float | None:
-    value = _ratio(gps, ALTITUDE)
+    value = _first_rational(gps, ALTITUDE)
     below = ALTITUDE_REF in gps and gps[ALTITUDE_REF].integer() in (
         1,
         3,
@@ -192,7 +194,7 @@ def _altitude(gps: Directory) -> float | None:
 def _direction(gps: Directory) -> float | None:
     """Degrees from true north; a magnetic direction is none, as its declination is not known here."""
     magnetic = DIRECTION_REF in gps and gps[DIRECTION_REF].text().upper() == "M"
-    value = _ratio(gps, DIRECTION)
+    value = _first_rational(gps, DIRECTION)
     return value if value is not None and not magnetic and 0 <= value <= 360 else None
 
 

@@ -14,11 +14,11 @@ import simplejpeg
 from PIL import Image, UnidentifiedImageError
 
 Pixels = npt.NDArray[np.uint8]
-FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF", "PPM")
+PILLOW_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF", "PPM")
 """What Pillow may take bytes for, whatever their name says. It knows forty more, some of them
 seldom looked at, and has Ghostscript run what calls itself EPS."""
 ORIENTATION_TAG = 0x0112
-UPRIGHT = {
+UPRIGHT_SLICES = {
     1: (slice(None), slice(None)),
     2: (slice(None), slice(None, None, -1)),
     3: (slice(None, None, -1), slice(None, None, -1)),
@@ -26,7 +26,7 @@ UPRIGHT = {
 }
 """What turns pixels upright, by EXIF orientation. Not ImageOps.exif_transpose: it writes all other
 tags again, and fails where a camera gave one of them a type that is not its own."""
-EXCHANGED = {5: 1, 6: 2, 7: 3, 8: 4}
+TRANSPOSED = {5: 1, 6: 2, 7: 3, 8: 4}
 "The orientations that are one of UPRIGHT's once rows and columns are exchanged."
 
 
@@ -46,16 +46,16 @@ def decode(data: bytes) -> Pixels:
     Raises DecodeError.
     """
     with (
-        refusing(data),
-        Image.open(io.BytesIO(data), formats=FORMATS) as opened,
+        decode_errors(data),
+        Image.open(io.BytesIO(data), formats=PILLOW_FORMATS) as opened,
     ):  # reads the header only
         if opened.format in ("JPEG", "MPO") and opened.mode in (
             "RGB",
             "L",
         ):  # MPO: a JPEG that others follow
-            return upright(simplejpeg.decode_jpeg(data, "RGB"), orientation_of(opened))
+            return to_upright(simplejpeg.decode_jpeg(data, "RGB"), orientation_of(opened))
         opened.load()  # Pillow turns a TIFF upright here, and its tag is gone
-        return upright(_rgb(opened), orientation_of(opened))
+        return to_upright(_rgb(opened), orientation_of(opened))
 
 
 def _rgb(image: Image.Image) -> Pixels:
@@ -68,7 +68,7 @@ def _rgb(image: Image.Image) -> Pixels:
 
 
 @contextmanager
-def refusing(data: bytes) -> Iterator[None]:
+def decode_errors(data: bytes) -> Iterator[None]:
     """Whatever goes wrong over an image's bytes becomes a DecodeError with a countable reason."""
     if not data:
         raise DecodeError("empty file", "0 bytes")
@@ -91,11 +91,11 @@ def orientation_of(image: Image.Image) -> int:
     meaning.
     """
     said = image.getexif().get(ORIENTATION_TAG, 1)
-    return said if said in UPRIGHT or said in EXCHANGED else 1
+    return said if said in UPRIGHT_SLICES or said in TRANSPOSED else 1
 
 
-def upright(image_HW3: Pixels, orientation: int) -> Pixels:
+def to_upright(image_HW3: Pixels, orientation: int) -> Pixels:
     """Pixels as an image with that EXIF orientation holds them -> upright, one block of memory."""
-    if orientation in EXCHANGED:
-        image_HW3, orientation = image_HW3.swapaxes(0, 1), EXCHANGED[orientation]
-    return np.ascontiguousarray(image_HW3[UPRIGHT[orientation]])
+    if orientation in TRANSPOSED:
+        image_HW3, orientation = image_HW3.swapaxes(0, 1), TRANSPOSED[orientation]
+    return np.ascontiguousarray(image_HW3[UPRIGHT_SLICES[orientation]])

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from pipeline.images.image_blocks import UnreadableTag
 
 XMP_TAG, EXIF_POINTER, GPS_POINTER = 0x02BC, 0x8769, 0x8825
-SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 7: 1, 9: 4, 10: 8}
+VALUE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 7: 1, 9: 4, 10: 8}
 "Bytes per value, by type; other types hold nothing that we read."
-LONGEST = 1 << 20
+MAX_VALUE_BYTES = 1 << 20
 "Bytes of one value; XMP packets of cameras have some kilobytes."
 ASCII, RATIONALS = 2, {5: "II", 10: "ii"}
 
@@ -81,13 +81,13 @@ def read_exif(block: bytes) -> Exif:
         raise UnreadableTag(f"EXIF that begins with {block[:4]!r}, not with a TIFF header")
     main = _directory(block, order, struct.unpack_from(order + "I", block, 4)[0], "main")
     try:
-        photo = _below(block, order, main, EXIF_POINTER, "photo")
+        photo = _subdirectory(block, order, main, EXIF_POINTER, "photo")
     except UnreadableTag:
         photo = {}
-    return Exif(main=main, photo=photo, gps=_below(block, order, main, GPS_POINTER, "GPS"))
+    return Exif(main=main, photo=photo, gps=_subdirectory(block, order, main, GPS_POINTER, "GPS"))
 
 
-def _below(block: bytes, order: str, main: Directory, pointer: int, name: str) -> Directory:
+def _subdirectory(block: bytes, order: str, main: Directory, pointer: int, name: str) -> Directory:
     if pointer not in main:
         return {}
     at = main[pointer].integer()
@@ -111,9 +111,9 @@ def _directory(block: bytes, order: str, at: int, name: str) -> Directory:
     entries: dict[int, Entry] = {}
     for start in range(at + 2, at + 2 + 12 * count, 12):
         tag, kind, values = struct.unpack_from(order + "HHI", block, start)
-        size = SIZES.get(kind, LONGEST + 1) * values
+        size = VALUE_BYTES.get(kind, MAX_VALUE_BYTES + 1) * values
         begin = start + 8 if size <= 4 else struct.unpack_from(order + "I", block, start + 8)[0]
-        fits = size <= LONGEST and begin + size <= len(block)
+        fits = size <= MAX_VALUE_BYTES and begin + size <= len(block)
         # Of a tag that stands there twice the first counts.
         entries.setdefault(
             tag, Entry(kind=kind, raw=block[begin : begin + size] if fits else None, order=order)

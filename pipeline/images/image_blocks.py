@@ -24,7 +24,7 @@ class UnreadableTag(ValueError):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Blocks:
+class MetadataBlocks:
     """The metadata blocks of an image file."""
 
     exif: bytes | None = None
@@ -35,7 +35,7 @@ class Blocks:
     "The bytes ended before the metadata could: read more of the file, if there is more."
 
 
-def find_blocks(data: bytes, whole: bool) -> Blocks:
+def find_metadata(data: bytes, whole: bool) -> MetadataBlocks:
     """The blocks in a JPEG, PNG, WebP or TIFF; none in anything else.
 
     `data`: from the file's first byte on. `whole`: whether that is the whole file. Raises nothing: what is no image is found
@@ -51,18 +51,18 @@ def find_blocks(data: bytes, whole: bool) -> Blocks:
         b"II*\0",
         b"MM\0*",
     ):  # directories may lie anywhere in a TIFF, most often at its end
-        return Blocks(exif=data) if whole else Blocks(cut=True)
-    return Blocks()
+        return MetadataBlocks(exif=data) if whole else MetadataBlocks(cut=True)
+    return MetadataBlocks()
 
 
-def _jpeg(data: bytes) -> Blocks:
+def _jpeg(data: bytes) -> MetadataBlocks:
     exif, xmp, at = None, None, 2
     while at + 4 <= len(data):
         if data[at] != 0xFF:
-            return Blocks(exif=exif, xmp=xmp)  # damaged: for the decoder to judge
+            return MetadataBlocks(exif=exif, xmp=xmp)  # damaged: for the decoder to judge
         marker = data[at + 1]
         if marker in (SCAN, END):
-            return Blocks(exif=exif, xmp=xmp)
+            return MetadataBlocks(exif=exif, xmp=xmp)
         if marker == 0xFF or marker in BARE_MARKERS:  # 0xFF: a fill byte
             at += 1 if marker == 0xFF else 2
             continue
@@ -74,16 +74,16 @@ def _jpeg(data: bytes) -> Blocks:
             elif xmp is None and content.startswith(XMP_HEADER):
                 xmp = content[len(XMP_HEADER) :]
         at = end
-    return Blocks(exif=exif, xmp=xmp, cut=True)
+    return MetadataBlocks(exif=exif, xmp=xmp, cut=True)
 
 
-def _png(data: bytes) -> Blocks:
+def _png(data: bytes) -> MetadataBlocks:
     exif, xmp, at = None, None, 8
     while at + 8 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
         content = data[at + 8 : at + 8 + length] if kind in (b"eXIf", b"iTXt") else b""
         if kind == b"IEND":
-            return Blocks(exif=exif, xmp=xmp)
+            return MetadataBlocks(exif=exif, xmp=xmp)
         if exif is None and kind == b"eXIf" and len(content) == length:
             exif = content.removeprefix(EXIF_HEADER)
         elif (
@@ -93,10 +93,10 @@ def _png(data: bytes) -> Blocks:
                 -1
             ]  # behind a language and a translated keyword
         at += 12 + length
-    return Blocks(exif=exif, xmp=xmp, cut=True)
+    return MetadataBlocks(exif=exif, xmp=xmp, cut=True)
 
 
-def _webp(data: bytes) -> Blocks:
+def _webp(data: bytes) -> MetadataBlocks:
     exif, xmp, at = None, None, 12
     end = 8 + int.from_bytes(data[4:8], "little")
     while at + 8 <= min(end, len(data)):
@@ -107,4 +107,4 @@ def _webp(data: bytes) -> Blocks:
         elif xmp is None and kind == b"XMP " and len(content) == length:
             xmp = content
         at += 8 + length + length % 2
-    return Blocks(exif=exif, xmp=xmp, cut=end > len(data))
+    return MetadataBlocks(exif=exif, xmp=xmp, cut=end > len(data))

@@ -11,7 +11,13 @@ from dataclasses import dataclass
 import simplejpeg
 from PIL import Image
 
-from pipeline.images.decode import FORMATS, DecodeError, decode, orientation_of, refusing
+from pipeline.images.decode import (
+    PILLOW_FORMATS,
+    DecodeError,
+    decode,
+    decode_errors,
+    orientation_of,
+)
 
 MAX_PIXELS = 178_956_970
 """Where Pillow sees a decompression bomb: twice what 24 bits a pixel make of a quarter of a GiB.
@@ -21,13 +27,13 @@ MIN_SIDE, MAX_SIDE = 8, 65_535
 source cuts into tiles."""
 MAX_RATIO = 100
 "Longer side over shorter one: what remains of a strip, squeezed into a square, shows no place."
-SIDEWAYS = 5
+FIRST_TRANSPOSED = 5
 "EXIF orientations from this one on turn an image so that its width becomes its height."
-PNG_ORIENTED = (b"Raw profile type exif\0", b"XML:com.adobe.xmp\0")
+PNG_METADATA_KEYWORDS = (b"Raw profile type exif\0", b"XML:com.adobe.xmp\0")
 "Keywords of the text chunks that may hold an orientation."
 
 
-def inspect(data: bytes, most_pixels: int = MAX_PIXELS) -> tuple[int, int]:
+def inspect(data: bytes, max_pixels: int = MAX_PIXELS) -> tuple[int, int]:
     """Encoded image -> (width, height), upright as its EXIF orientation says; JPEG, PNG and WebP
     without decoding.
 
@@ -35,28 +41,28 @@ def inspect(data: bytes, most_pixels: int = MAX_PIXELS) -> tuple[int, int]:
     `truncated image`, where the end is missing, and `absurd dimensions`. What it accepts may still not decode: flipped or
     overwritten bytes within the compressed pixels, and a hole that was filled so that the end is where it belongs, are not
     seen. CMYK JPEG, TIFF, BMP, GIF and all others are decoded, so of them all is seen; JPEG, PNG and WebP of more than
-    `most_pixels` never are.
+    `max_pixels` never are.
 
     Raises DecodeError.
     """
-    with refusing(data):
+    with decode_errors(data):
         if data.startswith(b"\xff\xd8\xff"):
-            size = _jpeg(data, most_pixels)
+            size = _jpeg(data, max_pixels)
         elif data.startswith(b"\x89PNG\r\n\x1a\n"):
-            size = _png(data, most_pixels)
+            size = _png(data, max_pixels)
         elif data.startswith(b"RIFF") and data[8:12] == b"WEBP":
             size = _webp(data)
         else:
-            size = _decoded(data)
-    _refuse_absurd(*size, most_pixels)
+            size = _size_by_decoding(data)
+    _check_dimensions(*size, max_pixels)
     return size
 
 
-def _refuse_absurd(width: int, height: int, most_pixels: int) -> None:
+def _check_dimensions(width: int, height: int, max_pixels: int) -> None:
     short, long = sorted((width, height))
-    if width * height > most_pixels:
+    if width * height > max_pixels:
         raise DecodeError(
-            "too many pixels", f"{width} x {height}, expected at most {most_pixels} pixels"
+            "too many pixels", f"{width} x {height}, expected at most {max_pixels} pixels"
         )
     if short < MIN_SIDE or long > MAX_SIDE or long > MAX_RATIO * short:
         raise DecodeError(
@@ -65,16 +71,16 @@ def _refuse_absurd(width: int, height: int, most_pixels: int) -> None:
         )
 
 
-def _decoded(data: bytes) -> tuple[int, int]:
+def _size_by_decoding(data: bytes) -> tuple[int, int]:
     height, width = decode(data).shape[:2]
     return width, height
 
 
-def _upright(data: bytes) -> tuple[int, int]:
+def _upright_size(data: bytes) -> tuple[int, int]:
     """The size of an image that may say how it is to be turned: decode's own reader is asked."""
-    with Image.open(io.BytesIO(data), formats=FORMATS) as opened:  # reads the header only
+    with Image.open(io.BytesIO(data), formats=PILLOW_FORMATS) as opened:  # reads the header only
         width, height = opened.size
-        return (height, width) if orientation_of(opened) >= SIDEWAYS else (width, height)
+        return (height, width) if orientation_of(opened) >= FIRST_TRANSPOSED else (width, height)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,21 +94,21 @@ class _JpegHeader:
     "Where the first scan begins."
 
 
-def _jpeg(data: bytes, most_pixels: int) -> tuple[int, int]:
+def _jpeg(data: bytes, max_pixels: int) -> tuple[int, int]:
     header = _jpeg_header(data)
-    _refuse_absurd(header.width, header.height, most_pixels)
+    _check_dimensions(header.width, header.height, max_pixels)
     if header.colours not in (
         1,
         3,
     ):  # decode leaves these to Pillow, which is milder than libjpeg about the end
-        return _decoded(data)
+        return _size_by_decoding(data)
     # The end marker cannot occur within compressed pixels. It may stand far from the file's end:
     # cameras append previews, depth maps and padding. A thumbnail in the header has one too, hence
     # the search from the first scan on.
     if data.rfind(b"\xff\xd9", header.scan) < 0:  # from the end: it is mostly there
         raise DecodeError("truncated image", f"{len(data)} bytes of JPEG without an end marker")
     simplejpeg.decode_jpeg_header(data)  # libjpeg's own opinion of tables and colours
-    return _upright(data) if header.described else (header.width, header.height)
+    return _upright_size(data) if header.described else (header.width, header.height)
 
 
 def _jpeg_header(data: bytes) -> _JpegHeader:
@@ -147,7 +153,7 @@ def _jpeg_header(data: bytes) -> _JpegHeader:
     raise DecodeError("truncated image", f"{end} bytes of JPEG that end within the header")
 
 
-def _png(data: bytes, most_pixels: int) -> tuple[int, int]:
+def _png(data: bytes, max_pixels: int) -> tuple[int, int]:
     at, described, pixels, end = 8, False, False, len(data)
     size: tuple[int, int] | None = None
     while at + 12 <= end:
@@ -156,9 +162,9 @@ def _png(data: bytes, most_pixels: int) -> tuple[int, int]:
             break
         if kind == b"IHDR":
             size = int.from_bytes(data[at + 8 : at + 12]), int.from_bytes(data[at + 12 : at + 16])
-            _refuse_absurd(*size, most_pixels)
+            _check_dimensions(*size, max_pixels)
         elif kind == b"eXIf" or (
-            kind in (b"iTXt", b"zTXt", b"tEXt") and data.startswith(PNG_ORIENTED, at + 8)
+            kind in (b"iTXt", b"zTXt", b"tEXt") and data.startswith(PNG_METADATA_KEYWORDS, at + 8)
         ):
             described = True
         pixels |= kind == b"IDAT"
@@ -169,19 +175,19 @@ def _png(data: bytes, most_pixels: int) -> tuple[int, int]:
         raise DecodeError(
             "damaged image", f"{end} bytes of PNG without {'pixels' if size else 'a header'}"
         )
-    return _upright(data) if described else size
+    return _upright_size(data) if described else size
 
 
 def _webp(data: bytes) -> tuple[int, int]:
     said = 8 + int.from_bytes(data[4:8], "little")
     if len(data) < said:
         raise DecodeError("truncated image", f"{len(data)} bytes of WebP that says it has {said}")
-    return _upright(data)
+    return _upright_size(data)
 
 
-IMAGE_NAMES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 "Endings of files that are taken for images, in lower case; upper case is fine too."
 
 
-def is_image(name: str) -> bool:
-    return name.lower().endswith(IMAGE_NAMES)
+def is_image_name(name: str) -> bool:
+    return name.lower().endswith(IMAGE_SUFFIXES)

@@ -8,20 +8,20 @@ from PIL import Image
 
 from pipeline.images.decode import DecodeError, decode
 
-Pictures = Callable[[Iterable[str]], dict[str, bytes]]
+ImageLoader = Callable[[Iterable[str]], dict[str, bytes]]
 "Encoded images by key; keys that are not known are absent."
 
 
-def no_pictures(keys: Iterable[str]) -> dict[str, bytes]:
+def no_images(keys: Iterable[str]) -> dict[str, bytes]:
     return {}
 
 
 QUERY_PX = 360
 ANSWER_PX = 180
-QUALITY, EFFORT = 78, 2  # of WebP: two thirds of JPEG's bytes at a like look
+WEBP_QUALITY, WEBP_EFFORT = 78, 2  # of WebP: two thirds of JPEG's bytes at a like look
 
 
-class Album:
+class ThumbnailCache:
     """Thumbnails by key, each made once."""
 
     def __init__(self, images: Mapping[str, bytes]) -> None:
@@ -48,5 +48,5 @@ def thumbnail(data: bytes | None, pixels: int) -> str | None:
         return None
     image.thumbnail((pixels, pixels), Image.Resampling.LANCZOS)
     stream = io.BytesIO()
-    image.save(stream, "WEBP", quality=QUALITY, method=EFFORT)
+    image.save(stream, "WEBP", quality=WEBP_QUALITY, method=WEBP_EFFORT)
     return f"data:image/webp;base64,{base64.b64encode(stream.getvalue()).decode()}"

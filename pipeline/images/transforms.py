@@ -14,7 +14,7 @@ Resizer = Literal["torch", "pillow"]
 on one without."""
 
 
-def preprocessing(by: Resizer = "torch") -> str:
+def preprocessing_name(by: Resizer = "torch") -> str:
     """Part of the fingerprint: tables made with another preprocessing do not mix."""
     return f"resize bicubic {by}, ImageNet normalisation"
 

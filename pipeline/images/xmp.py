@@ -10,11 +10,11 @@ from xml.parsers import expat
 
 from pipeline.images.image_blocks import UnreadableTag
 
-LONGEST = 1 << 20
+MAX_PACKET_BYTES = 1 << 20
 "Bytes of a packet; a JPEG segment holds 64 kB."
-DEEPEST = 32
+MAX_DEPTH = 32
 "Elements within elements; cameras need five."
-SCAFFOLD = {"xmpmeta", "xapmeta", "RDF", "Description", "Seq", "Bag", "Alt", "li"}
+STRUCTURAL_ELEMENTS = {"xmpmeta", "xapmeta", "RDF", "Description", "Seq", "Bag", "Alt", "li"}
 "Elements that hold properties and are none."
 
 
@@ -24,25 +24,25 @@ def read_xmp(packet: bytes) -> dict[str, str]:
 
     Of a property that is there twice the first counts. Raises UnreadableTag.
     """
-    if len(packet) > LONGEST:
-        raise UnreadableTag(f"XMP of {len(packet)} bytes, more than {LONGEST}")
+    if len(packet) > MAX_PACKET_BYTES:
+        raise UnreadableTag(f"XMP of {len(packet)} bytes, more than {MAX_PACKET_BYTES}")
     found: dict[str, str] = {}
     path: list[str] = []
     text: list[str] = []
 
     def begin(name: str, attributes: dict[str, str]) -> None:
-        path.append(_local(name))
+        path.append(_local_name(name))
         text.clear()
-        if len(path) > DEEPEST:
-            raise UnreadableTag(f"XMP with more than {DEEPEST} elements within each other")
+        if len(path) > MAX_DEPTH:
+            raise UnreadableTag(f"XMP with more than {MAX_DEPTH} elements within each other")
         for attribute, value in attributes.items():
             if not attribute.startswith(("xmlns", "rdf:")):
-                found.setdefault(_name([*path, _local(attribute)]), value.strip())
+                found.setdefault(_property_name([*path, _local_name(attribute)]), value.strip())
 
     def end(_: str) -> None:
         said = "".join(text).strip()
         if said:
-            found.setdefault(_name(path), said)
+            found.setdefault(_property_name(path), said)
         text.clear()
         path.pop()
 
@@ -64,9 +64,9 @@ def read_xmp(packet: bytes) -> dict[str, str]:
     return found
 
 
-def _local(name: str) -> str:
+def _local_name(name: str) -> str:
     return name.rpartition(":")[2]
 
 
-def _name(path: list[str]) -> str:
-    return ".".join(name for name in path if name not in SCAFFOLD)
+def _property_name(path: list[str]) -> str:
+    return ".".join(name for name in path if name not in STRUCTURAL_ELEMENTS)

@@ -17,27 +17,39 @@ import faiss
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.core.lock import one_at_a_time
+from pipeline.core.lock import locks_output
 from pipeline.core.progress import console
 from pipeline.core.records import Split, View
-from pipeline.features.row_reader import readable
-from pipeline.features.table import FeatureTable, open_table, verify
+from pipeline.features.row_reader import supports_row_reads
+from pipeline.features.table import FeatureTable, open_table, verify_table
 from pipeline.index.metadata import (
-    FACTS,
-    Effort,
-    IndexFacts,
-    as_said,
+    METADATA_FILE,
+    IndexMetadata,
+    SearchParams,
     check_files,
-    read_facts,
-    write_facts,
+    metadata_dict,
+    read_metadata,
+    write_metadata,
 )
-from pipeline.index.plan import Gallery, Plan, plan_factory, plan_index
-from pipeline.index.recall import Held, efforts, hold_queries, speed, tuned
+from pipeline.index.plan import GallerySpec, IndexPlan, plan_factory, plan_index
+from pipeline.index.recall import (
+    RecallQueries,
+    measure_speed,
+    sample_queries,
+    search_param_grid,
+    tune,
+)
 from pipeline.index.searcher import Index
-from pipeline.index.train import SPECTRUM_ROWS, effective_dimension, new_index, sample, train
-from pipeline.index.workspace import Workshop, rows_by_part
+from pipeline.index.train import (
+    SPECTRUM_ROWS,
+    effective_dimension,
+    new_index,
+    sample_rows,
+    train_index,
+)
+from pipeline.index.workspace import BuildWorkspace, rows_by_part
 
-UNITS = {"": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+BYTE_UNITS = {"": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,29 +110,29 @@ def parse_bytes(text: str) -> int:
         if match[2].endswith("B") or not match[2]
         else match[2] + "B"
     )
-    if match is None or unit not in UNITS:
+    if match is None or unit not in BYTE_UNITS:
         raise InputError(
             f"--memory-budget is {text!r}, expected a number with KB, MB, GB or TB, such as 4GB"
         )
-    return int(float(match[1]) * UNITS[unit])
+    return int(float(match[1]) * BYTE_UNITS[unit])
 
 
-@one_at_a_time(lambda settings: settings.out)
+@locks_output(lambda settings: settings.out)
 def build_index(settings: IndexSettings) -> dict[str, Any]:
     """Build the index of a table, or of one split or view of it; a finished one is left as it is.
     Returns its facts.
 
     Raises InputError on unusable input, and where no index fits the budget.
     """
-    table = verify(settings.table) if settings.verify else open_table(settings.table)
+    table = verify_table(settings.table) if settings.verify else open_table(settings.table)
     chosen = table.select(settings.split, settings.view)
     asked = {
         name: getattr(settings, name) for name in ("split", "view", "factory", "refine", "parts")
     }
-    if storage.exists(storage.join(settings.out, FACTS)):
-        told = _finished(settings.out, chosen, asked, settings.verify)
+    if storage.exists(storage.join(settings.out, METADATA_FILE)):
+        told = _load_finished(settings.out, chosen, asked, settings.verify)
         if told is not None:
-            return as_said(told)
+            return metadata_dict(told)
     rows_of_part = rows_by_part(chosen)
     if not rows_of_part:
         held = ", ".join(f"{count} {split} {view}" for (split, view), count in table.counts.items())
@@ -136,7 +148,7 @@ def build_index(settings: IndexSettings) -> dict[str, Any]:
         f"{plan.factory}: {plan.why}"
         + (f"; {plan.bytes / 1e9:.2f} GB of memory" if plan.bytes else "")
     )
-    workshop = Workshop(
+    workshop = BuildWorkspace(
         out=settings.out, table=chosen, workers=settings.workers,
         identity={"asked": asked, "table": table.digest, "plan": asdict(plan)},
     )  # fmt: skip
@@ -144,12 +156,12 @@ def build_index(settings: IndexSettings) -> dict[str, Any]:
     training_rows = 0 if index.is_trained else plan.training_rows
     if not workshop.is_trained():
         if training_rows:
-            train(index, plan.factory, sample(chosen, rows_of_part, training_rows)[1])
-        workshop.keep_trained(index)
+            train_index(index, plan.factory, sample_rows(chosen, rows_of_part, training_rows)[1])
+        workshop.save_trained(index)
     rows = sum(rows_of_part.values())
     part_rows = min(plan.part_rows, math.ceil(rows / settings.parts))
     parts = workshop.build(rows_of_part, plan.unit_rows, part_rows)
-    facts = IndexFacts(
+    facts = IndexMetadata(
         factory=plan.factory,
         metric="inner product",
         rows=rows,
@@ -160,7 +172,7 @@ def build_index(settings: IndexSettings) -> dict[str, Any]:
         why=plan.why,
         refine=plan.refine,
         on_disk=plan.on_disk,
-        effort=Effort(breadth=1),
+        effort=SearchParams(breadth=1),
         target_recall=settings.target_recall,
         training_sample=training_rows,
         build_seconds=0.0,
@@ -170,20 +182,24 @@ def build_index(settings: IndexSettings) -> dict[str, Any]:
         part_rows=part_rows,
         measured={},
         parts=parts,
-        trained=workshop.hand_out_trained(),
+        trained=workshop.publish_trained(),
     )
     others = table.select(Split.QUERY) if settings.split == Split.GALLERY else None
-    return finish(settings.out, facts, hold_queries(chosen, rows_of_part, others), workshop, start)
+    return finish_index(
+        settings.out, facts, sample_queries(chosen, rows_of_part, others), workshop, start
+    )
 
 
-def make_plan(settings: IndexSettings, table: FeatureTable, rows_of_part: dict[str, int]) -> Plan:
+def make_plan(
+    settings: IndexSettings, table: FeatureTable, rows_of_part: dict[str, int]
+) -> IndexPlan:
     """The planner's answer for a table, or what the user asked for."""
-    gallery = Gallery(
+    gallery = GallerySpec(
         rows=sum(rows_of_part.values()),
         dimension=table.dimension,
         budget=parse_bytes(settings.memory_budget),
         target_recall=settings.target_recall,
-        rows_readable=readable(table.path),
+        rows_readable=supports_row_reads(table.path),
         workers=settings.workers,
     )
     if settings.factory:
@@ -192,13 +208,13 @@ def make_plan(settings: IndexSettings, table: FeatureTable, rows_of_part: dict[s
     if not plan.training_rows:
         return plan
     directions = effective_dimension(
-        sample(table, rows_of_part, min(SPECTRUM_ROWS, plan.training_rows))[1]
+        sample_rows(table, rows_of_part, min(SPECTRUM_ROWS, plan.training_rows))[1]
     )
     return plan_index(replace(gallery, effective_dimension=directions))
 
 
-def finish(
-    out: str, facts: IndexFacts, held: Held, workshop: Workshop, start: float
+def finish_index(
+    out: str, facts: IndexMetadata, held: RecallQueries, workshop: BuildWorkspace, start: float
 ) -> dict[str, Any]:
     """Find the effort that reaches the recall, write what the index is, and clear the workshop.
     Returns its facts.
@@ -214,10 +230,10 @@ def finish(
     index = Index(
         out, told=whole
     )  # measured as if nothing had been removed: exact search knows of no removals
-    effort, at_1, at_10 = tuned(
+    effort, at_1, at_10 = tune(
         index,
         held,
-        efforts(new_index(facts.factory, facts.dimension), facts.refine),
+        search_param_grid(new_index(facts.factory, facts.dimension), facts.refine),
         facts.target_recall,
     )
     measured = {
@@ -226,7 +242,7 @@ def finish(
         "recall_queries": len(held.queries_QD),
         "recall_queries_from": held.source,
     }
-    measured |= speed(index, held, effort)
+    measured |= measure_speed(index, held, effort)
     facts = replace(
         facts,
         effort=effort,
@@ -234,7 +250,7 @@ def finish(
         bytes_per_vector=size / facts.rows,
         measured=measured,
     )
-    write_facts(out, facts)
+    write_metadata(out, facts)
     workshop.clear()
     if at_10 < facts.target_recall:
         console.print(
@@ -246,18 +262,18 @@ def finish(
         f"{out}: {facts.rows} rows, {facts.factory}, recall@10 {at_10:.3f} of exact, "
         f"{measured['queries_per_second']:.0f} queries/s"
     )
-    return as_said(facts)
+    return metadata_dict(facts)
 
 
-def _finished(
+def _load_finished(
     out: str, table: FeatureTable, asked: dict[str, Any], whole: bool
-) -> IndexFacts | None:
+) -> IndexMetadata | None:
     """A finished index of the same rows and settings; None where it was one, is damaged, and is to
     be built again.
 
     `whole`: every byte is looked at. Raises InputError where it is another's.
     """
-    told = read_facts(out)
+    told = read_metadata(out)
     held = told.table_parts
     missing = rows_by_part(table.only([name for name in table.parts if name not in held]))
     if (
@@ -270,17 +286,17 @@ def _finished(
                 f"{out} holds an index of {len(held)} parts of the table, which has {len(missing)} more by now; say --extend "
                 "to add them, or choose another --out"
             )
-        if _is_whole(out, told, whole):
+        if _files_intact(out, told, whole):
             console.print(f"{out} is complete: {told.rows} rows, {told.factory}; nothing to do")
             return told
-        storage.remove(storage.join(out, FACTS))
+        storage.remove(storage.join(out, METADATA_FILE))
         return None
     raise InputError(
         f"{out} holds an index of other rows or settings; choose another --out or delete it"
     )
 
 
-def _is_whole(out: str, told: IndexFacts, whole: bool) -> bool:
+def _files_intact(out: str, told: IndexMetadata, whole: bool) -> bool:
     """Whether each file of an index is there and has its size, or is what was written.
 
     Raises InputError where not, and building again would not give the same index.

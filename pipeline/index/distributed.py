@@ -12,43 +12,43 @@ import pyarrow as pa
 import ray
 
 from pipeline.core import cluster, storage
-from pipeline.core.arrays import Whole
+from pipeline.core.arrays import Ints
 from pipeline.core.errors import InputError
 from pipeline.features.table import Floats
-from pipeline.index.filters import Where
-from pipeline.index.metadata import Effort, as_said, read_facts
-from pipeline.index.part import NOBODY
-from pipeline.index.searcher import Hit, Index, hits_of, merged
+from pipeline.index.filters import Filter
+from pipeline.index.metadata import SearchParams, metadata_dict, read_metadata
+from pipeline.index.part import NO_ROW
+from pipeline.index.searcher import Hit, Index, make_hits, merge_results
 
-Found = tuple[Floats, Whole, pa.Table]
+PartResult = tuple[Floats, Ints, pa.Table]
 
 
-class SpreadIndex:
+class DistributedIndex:
     """An index whose parts are held by actors. Closing it, or leaving its `with`, ends them."""
 
     def __init__(self, path: str, actors: int, cores: int = 1) -> None:
         """`cores`: of each actor. More actors than parts are not made: a part is the smallest piece
         that an actor can hold.
 
-        Raises InputError when there is no index at `path`, or it is damaged.
+        Raises InputError when there is no index at `draw_path`, or it is damaged.
         """
-        told = read_facts(path)
-        self.facts = as_said(told)
+        told = read_metadata(path)
+        self.facts = metadata_dict(told)
         self.dimension = told.dimension
         cluster.connect()
-        kind: Any = ray.remote(num_cpus=cores)(_Holder)
+        kind: Any = ray.remote(num_cpus=cores)(_PartServer)
         shares = np.array_split(np.arange(len(told.parts)), min(actors, len(told.parts)))
         self._actors = [
             kind.remote(storage.absolute(path), share.tolist(), cores) for share in shares
         ]
         self._counts = [actor.rows.remote() for actor in self._actors]
         try:
-            self._rows: int = sum(_got(self._counts))
+            self._rows: int = sum(_get(self._counts))
         except InputError:
             self.close()
             raise
 
-    def __enter__(self) -> "SpreadIndex":
+    def __enter__(self) -> "DistributedIndex":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -60,34 +60,34 @@ class SpreadIndex:
 
     def close(self) -> None:
         for actor, count in zip(self._actors, self._counts, strict=True):
-            cluster.end_actor(actor, count)
+            cluster.stop_actor(actor, count)
         self._actors, self._counts = [], []
 
     def search(
         self,
         queries_QD: Floats,
         k: int = 10,
-        where: Where | None = None,
-        effort: Effort | None = None,
+        where: Filter | None = None,
+        effort: SearchParams | None = None,
     ) -> list[list[Hit]]:
         """As `Index.search`. Every actor searches its parts at the same time."""
         queries = ray.put(np.ascontiguousarray(queries_QD, np.float32))
-        found: list[Found] = _got(
+        found: list[PartResult] = _get(
             [actor.search.remote(queries, k, where, effort) for actor in self._actors]
         )
-        scores_QK, rows_QK = merged([(scores, rows) for scores, rows, _ in found], k)
+        scores_QK, rows_QK = merge_results([(scores, rows) for scores, rows, _ in found], k)
         names = pa.concat_tables([names for _, _, names in found])
         at = {
             row: place
             for place, row in enumerate(
-                row for _, rows, _ in found for row in rows[rows != NOBODY].tolist()
+                row for _, rows, _ in found for row in rows[rows != NO_ROW].tolist()
             )
         }
-        wanted = [at[row] for row in rows_QK[rows_QK != NOBODY].tolist()]
-        return hits_of(scores_QK, rows_QK, names.take(pa.array(wanted, pa.int64())))
+        wanted = [at[row] for row in rows_QK[rows_QK != NO_ROW].tolist()]
+        return make_hits(scores_QK, rows_QK, names.take(pa.array(wanted, pa.int64())))
 
 
-class _Holder:
+class _PartServer:
     """The actor: some parts of an index."""
 
     def __init__(self, path: str, parts: list[int], threads: int) -> None:
@@ -102,8 +102,8 @@ class _Holder:
         return len(self._opened())
 
     def search(
-        self, queries_QD: Floats, k: int, where: Where | None, effort: Effort | None
-    ) -> Found:
+        self, queries_QD: Floats, k: int, where: Filter | None, effort: SearchParams | None
+    ) -> PartResult:
         scores_QK, rows_QK = self._opened().search_rows(queries_QD, k, where, effort)
         return scores_QK, rows_QK, self._opened().names(rows_QK)
 
@@ -113,7 +113,7 @@ class _Holder:
         return self._index
 
 
-def _got(answers: list[Any]) -> Any:
+def _get(answers: list[Any]) -> Any:
     """What actors answer; an InputError of theirs as the sentence that it is."""
     try:
         return ray.get(answers)

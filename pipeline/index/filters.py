@@ -12,16 +12,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline.core.arrays import Doubles, Mask
-from pipeline.core.geo import Box, Near, haversine_m
+from pipeline.core.geo import Box, Circle, haversine_m
 from pipeline.core.records import View
 
 
 @dataclass(frozen=True, kw_only=True)
-class Where:
+class Filter:
     """Conditions that a row meets all of. None: any will do."""
 
     box: Box | None = None
-    near: Near | None = None
+    near: Circle | None = None
     view: View | None = None
     locations: frozenset[str] | None = None
 
@@ -31,9 +31,9 @@ class Where:
         """
         meant_N = np.ones(len(rows), np.bool_)
         if self.view is not None:
-            meant_N &= _truth(pc.equal(rows["view"], str(self.view)))
+            meant_N &= _to_mask(pc.equal(rows["view"], str(self.view)))
         if self.locations is not None:
-            meant_N &= _truth(
+            meant_N &= _to_mask(
                 pc.is_in(rows["location"], pa.array(sorted(self.locations), pa.string()))
             )
         if self.box or self.near:
@@ -46,16 +46,16 @@ class Where:
                     [(west <= lons_N) & (lons_N <= east) for west, east in self.box.spans()], axis=0
                 )
             if self.near:
-                meant_N &= _within(lats_N, lons_N, self.near, meant_N)
+                meant_N &= _within_circle(lats_N, lons_N, self.near, meant_N)
         return meant_N
 
 
-def _truth(found: pa.Array) -> Mask:
+def _to_mask(found: pa.Array) -> Mask:
     mask: Mask = found.to_numpy(zero_copy_only=False)
     return mask
 
 
-def _within(lats_N: Doubles, lons_N: Doubles, near: Near, asked_N: Mask) -> Mask:
+def _within_circle(lats_N: Doubles, lons_N: Doubles, near: Circle, asked_N: Mask) -> Mask:
     """Of the rows asked for, those in the circle. Most rows lie outside its band of latitudes and
     cost no trigonometry.
     """

@@ -14,13 +14,13 @@ import pyarrow as pa
 
 from pipeline.core import parquet as parquet_files
 from pipeline.core import storage
-from pipeline.core.arrays import Mask, Whole
+from pipeline.core.arrays import Ints, Mask
 from pipeline.core.errors import InputError
-from pipeline.index.filters import Where
-from pipeline.index.metadata import AGAIN
+from pipeline.index.filters import Filter
+from pipeline.index.metadata import REBUILD_HINT
 
-COLUMNS = ("key", "location", "view", "lat", "lon")
-SCHEMA = pa.schema(
+ID_COLUMNS = ("key", "location", "view", "lat", "lon")
+IDS_SCHEMA = pa.schema(
     [
         ("row", pa.int64()),
         ("key", pa.string()),
@@ -43,9 +43,9 @@ def write_ids(
     columns COLUMNS.
     """
     with (
-        parquet_files.writer(parquet, SCHEMA) as columns,
-        storage.atomic(arrow) as other,
-        pa.ipc.new_file(other, SCHEMA) as mapped,
+        parquet_files.writer(parquet, IDS_SCHEMA) as columns,
+        storage.atomic_write(arrow) as other,
+        pa.ipc.new_file(other, IDS_SCHEMA) as mapped,
     ):
         for batch in _batches(first_row, parts):
             columns.write_table(batch)
@@ -64,8 +64,8 @@ def _batches(first_row: int, parts: Iterable[tuple[int, pa.Table]]) -> Iterable[
             "table_part": pa.array(np.full(len(rows), number, np.int32)),
             "part_row": rows["part_row"],
         }
-        columns |= {name: rows[name].cast(SCHEMA.field(name).type) for name in COLUMNS}
-        waiting.append(pa.table([columns[name] for name in SCHEMA.names], schema=SCHEMA))
+        columns |= {name: rows[name].cast(IDS_SCHEMA.field(name).type) for name in ID_COLUMNS}
+        waiting.append(pa.table([columns[name] for name in IDS_SCHEMA.names], schema=IDS_SCHEMA))
         first_row += len(rows)
         if sum(map(len, waiting)) >= BATCH_ROWS:
             yield pa.concat_tables(waiting).combine_chunks()
@@ -74,23 +74,23 @@ def _batches(first_row: int, parts: Iterable[tuple[int, pa.Table]]) -> Iterable[
         yield pa.concat_tables(waiting).combine_chunks()
 
 
-class Ids:
+class RowIds:
     """The rows of one part of an index, mapped from its Arrow file."""
 
     def __init__(self, path: str) -> None:
-        """`path` is on a local disk. Raises InputError where it is no such file."""
+        """`draw_path` is on a local disk. Raises InputError where it is no such file."""
         try:
             with pa.memory_map(path) as source:
                 reader = pa.ipc.open_file(source)
                 self._batches = [reader.get_batch(i) for i in range(reader.num_record_batches)]
         except (pa.ArrowException, OSError) as error:
-            raise InputError(f"{path} is damaged ({error}); {AGAIN}") from None
+            raise InputError(f"{path} is damaged ({error}); {REBUILD_HINT}") from None
         self._begin = np.cumsum([0, *(len(batch) for batch in self._batches)])
 
     def __len__(self) -> int:
         return int(self._begin[-1])
 
-    def take(self, row_R: Whole, columns: Iterable[str] = COLUMNS) -> pa.Table:
+    def take(self, row_R: Ints, columns: Iterable[str] = ID_COLUMNS) -> pa.Table:
         """Columns of these rows, counted within the part, in the order asked for."""
         order_R = np.argsort(row_R, kind="stable")
         sorted_R = row_R[order_R]
@@ -103,12 +103,12 @@ class Ids:
             )
             if last > first
         ]
-        whole = pa.Table.from_batches(pieces, pa.schema([SCHEMA.field(name) for name in names]))
+        whole = pa.Table.from_batches(pieces, pa.schema([IDS_SCHEMA.field(name) for name in names]))
         back_R = np.empty(len(row_R), np.int64)
         back_R[order_R] = np.arange(len(row_R))
         return whole.take(pa.array(back_R))
 
-    def mask(self, where: Where) -> Mask:
+    def mask(self, where: Filter) -> Mask:
         """Which rows meet the conditions (N,)."""
         return np.concatenate(
             [np.empty(0, np.bool_), *(where.mask(batch) for batch in self._batches)]
@@ -118,7 +118,7 @@ class Ids:
 def local_copy(path: str, folder: str) -> str:
     """A path of this machine's at which the file can be mapped: its own, or a copy's in `folder`."""
     if storage.is_local(path):
-        return str(storage.locate(path)[1])
+        return str(storage.resolve(path)[1])
     target = storage.join(folder, path.rsplit("/", 1)[-1])
     with storage.open_read(path) as source, open(target, "wb") as copy:
         shutil.copyfileobj(source, copy, 1 << 24)

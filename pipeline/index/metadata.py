@@ -11,17 +11,17 @@ from typing import Any
 
 from pipeline.core import json_files, storage
 from pipeline.core.errors import InputError
-from pipeline.core.json_files import as_told, is_file_name
+from pipeline.core.json_files import from_json, is_file_name
 from pipeline.core.records import excerpt
 from pipeline.index.plan import Refine
 
 SCHEMA_VERSION = 2
-FACTS = "index.json"
-AGAIN = "delete it and build the index again with jobs/build_index.py"
+METADATA_FILE = "index.json"
+REBUILD_HINT = "delete it and build the index again with jobs/build_index.py"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Effort:
+class SearchParams:
     """How hard a search tries: measured against exact search when the index is built."""
 
     breadth: int
@@ -31,7 +31,7 @@ class Effort:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PartFacts:
+class PartMetadata:
     """One part of an index."""
 
     faiss: str
@@ -51,7 +51,7 @@ class PartFacts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class IndexFacts:
+class IndexMetadata:
     """A whole index."""
 
     factory: str
@@ -70,7 +70,7 @@ class IndexFacts:
     "The planner's sentence."
     refine: Refine
     on_disk: bool
-    effort: Effort
+    effort: SearchParams
     target_recall: float
     "Of recall@10, which the effort was chosen for."
     unit_rows: int
@@ -86,7 +86,7 @@ class IndexFacts:
     "Memory that the plan reckons with; None for a --factory of the user's."
     measured: dict[str, Any]
     "recall_at_1, recall_at_10, of how many queries from where, queries per second."
-    parts: tuple[PartFacts, ...]
+    parts: tuple[PartMetadata, ...]
     trained: dict[str, dict[str, Any]]
     "The trained index without rows, which growing copies: name, and its `bytes` and `sha256`."
     schema_version: int = field(default=SCHEMA_VERSION)
@@ -104,37 +104,39 @@ class IndexFacts:
         return {name: shard for part in self.parts for name, shard in part.table_parts.items()}
 
 
-def as_said(facts: IndexFacts) -> dict[str, Any]:
+def metadata_dict(facts: IndexMetadata) -> dict[str, Any]:
     """The facts as `index.json` has them: what was measured beside the rest."""
     said = asdict(facts)
     measured: dict[str, Any] = said.pop("measured")
     return said | measured
 
 
-def write_facts(folder: str, facts: IndexFacts) -> None:
-    json_files.write_checksummed(storage.join(folder, FACTS), as_said(facts))
+def write_metadata(folder: str, facts: IndexMetadata) -> None:
+    json_files.write_checksummed(storage.join(folder, METADATA_FILE), metadata_dict(facts))
 
 
-def read_facts(folder: str) -> IndexFacts:
+def read_metadata(folder: str) -> IndexMetadata:
     """What the index in a folder says of itself.
 
     Raises InputError when there is none, or it was written by another version.
     """
-    path = storage.join(folder, FACTS)
+    path = storage.join(folder, METADATA_FILE)
     if not storage.exists(path):
         raise InputError(
-            f"no index at {folder}: found no {FACTS}; make one with jobs/build_index.py"
+            f"no index at {folder}: found no {METADATA_FILE}; make one with jobs/build_index.py"
         )
     try:
         said = json_files.read_checksummed(path)
         if said["schema_version"] != SCHEMA_VERSION:
             raise InputError(
-                f"{path} is of version {said['schema_version']}, expected {SCHEMA_VERSION}; {AGAIN}"
+                f"{path} is of version {said['schema_version']}, expected {SCHEMA_VERSION}; {REBUILD_HINT}"
             )
         own = {
-            name: said.pop(name) for name in IndexFacts.__dataclass_fields__ if name != "measured"
+            name: said.pop(name)
+            for name in IndexMetadata.__dataclass_fields__
+            if name != "measured"
         }
-        facts = as_told(IndexFacts, {**own, "measured": said})
+        facts = from_json(IndexMetadata, {**own, "measured": said})
         listed = (name for files in facts.files for name in files)
         named = [
             *listed,
@@ -163,11 +165,11 @@ def read_facts(folder: str) -> IndexFacts:
         return facts
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(
-            f"{path} is damaged ({error!r}), expected what build_index writes; {AGAIN}"
+            f"{path} is damaged ({error!r}), expected what build_index writes; {REBUILD_HINT}"
         ) from None
 
 
-def measure_file(folder: str, name: str) -> dict[str, Any]:
+def file_checksum(folder: str, name: str) -> dict[str, Any]:
     """Size and hash of a file of the index."""
     digest, size = hashlib.sha256(), 0
     with storage.open_read(storage.join(folder, name)) as stream:
@@ -187,9 +189,9 @@ def check_files(folder: str, files: dict[str, dict[str, Any]], whole: bool = Fal
         if found != expected["bytes"]:
             seen = "is not there" if found is None else f"has {found:,} bytes"
             raise InputError(
-                f"{path} {seen}, expected {expected['bytes']:,} bytes; the index is damaged; {AGAIN}"
+                f"{path} {seen}, expected {expected['bytes']:,} bytes; the index is damaged; {REBUILD_HINT}"
             )
-        if whole and measure_file(folder, name) != expected:
+        if whole and file_checksum(folder, name) != expected:
             raise InputError(
-                f"{path} holds other bytes than were written; the index is damaged; {AGAIN}"
+                f"{path} holds other bytes than were written; the index is damaged; {REBUILD_HINT}"
             )

@@ -11,21 +11,21 @@ import faiss
 import numpy as np
 
 from pipeline.core import storage
-from pipeline.core.arrays import Mask, Whole
+from pipeline.core.arrays import Ints, Mask
 from pipeline.core.errors import InputError
 from pipeline.features.row_reader import RowReader
 from pipeline.features.table import Floats
-from pipeline.index.filters import Where
-from pipeline.index.ids import Ids, local_copy
-from pipeline.index.metadata import AGAIN, Effort, PartFacts, check_files
-from pipeline.index.plan import REFINING
+from pipeline.index.filters import Filter
+from pipeline.index.ids import RowIds, local_copy
+from pipeline.index.metadata import REBUILD_HINT, PartMetadata, SearchParams, check_files
+from pipeline.index.plan import RERANK_FACTOR
 
-EXACT_ROWS = 5_000
+FILTERED_EXACT_ROWS = 5_000
 """Allowed rows up to which each is scored: about what a search over lists costs, and no recall is
 lost to a narrow filter."""
-REFINED_AT_ONCE = 1_024
+RERANK_BLOCK = 1_024
 "Vectors of candidates in memory at a time: 8 MB at 2,048 dimensions, which stay near the core."
-NOBODY = -1
+NO_ROW = -1
 FAISS: Any = faiss  # whose types know nothing of its keyword arguments
 
 
@@ -35,7 +35,7 @@ class IndexPart:
     def __init__(
         self,
         folder: str,
-        facts: PartFacts,
+        facts: PartMetadata,
         reader: RowReader | None,
         on_disk: bool,
         scratch: str,
@@ -48,17 +48,17 @@ class IndexPart:
         """
         check_files(folder, facts.files, whole)
         self.facts, self._reader = facts, reader
-        self.ids = Ids(local_copy(storage.join(folder, facts.ids), scratch))
+        self.ids = RowIds(local_copy(storage.join(folder, facts.ids), scratch))
         self.index = read_faiss(local_copy(storage.join(folder, facts.faiss), scratch), on_disk)
         if not self.index.ntotal == len(self.ids) == facts.rows:
             raise InputError(
                 f"{folder} has {self.index.ntotal} vectors in {facts.faiss}, {len(self.ids)} rows in {facts.ids}, expected "
-                f"{facts.rows} of both; the index is damaged; {AGAIN}"
+                f"{facts.rows} of both; the index is damaged; {REBUILD_HINT}"
             )
         self._table_parts = list(facts.table_parts.items())
         self._removed = self._mask_of_removed()
 
-    def allowed(self, where: Where | None) -> Mask | None:
+    def allowed(self, where: Filter | None) -> Mask | None:
         """Which rows may answer (N,); None: all."""
         if where is None:
             return self._removed
@@ -66,18 +66,18 @@ class IndexPart:
         return mask if self._removed is None else mask & self._removed
 
     def search(
-        self, queries_QD: Floats, k: int, effort: Effort, where: Where | None = None
-    ) -> tuple[Floats, Whole]:
+        self, queries_QD: Floats, k: int, effort: SearchParams, where: Filter | None = None
+    ) -> tuple[Floats, Ints]:
         """Scores and rows (Q, K), counted within the part, best first; NOBODY where fewer may
         answer.
         """
         allowed_N = self.allowed(where)
         count = self.facts.rows if allowed_N is None else int(np.count_nonzero(allowed_N))
         if not count:
-            return _nothing(len(queries_QD), k)
-        if allowed_N is not None and count <= EXACT_ROWS and self._reader is not None:
+            return _empty_result(len(queries_QD), k)
+        if allowed_N is not None and count <= FILTERED_EXACT_ROWS and self._reader is not None:
             rows_C = np.flatnonzero(allowed_N)
-            return _best(
+            return _top_k(
                 self._scores(queries_QD, rows_C),
                 np.broadcast_to(rows_C, (len(queries_QD), count)),
                 k,
@@ -89,18 +89,18 @@ class IndexPart:
         ):  # the fewer may answer, the more lists it takes to meet as many of them
             breadth = int(np.ceil(breadth * self.facts.rows / count))
         scores_QC, rows_QC = self.index.search(
-            queries_QD, wanted, params=search_parameters(self.index, breadth, allowed_N)
+            queries_QD, wanted, params=faiss_parameters(self.index, breadth, allowed_N)
         )
         if effort.candidates > 1 and self._reader is not None:
             scores_QC = self._refined(queries_QD, rows_QC)
-        return _best(scores_QC, rows_QC, k)
+        return _top_k(scores_QC, rows_QC, k)
 
-    def vectors(self, row_R: Whole) -> Floats:
+    def vectors(self, row_R: Ints) -> Floats:
         """The table's vectors (R, D) of these rows, which ascend."""
         assert self._reader is not None
         places = self.ids.take(row_R, ("table_part", "part_row"))
         part_R, place_R = (places[name].to_numpy() for name in ("table_part", "part_row"))
-        bounds = np.flatnonzero(np.diff(part_R, prepend=NOBODY, append=NOBODY))
+        bounds = np.flatnonzero(np.diff(part_R, prepend=NO_ROW, append=NO_ROW))
         blocks = []
         for first, last in pairwise(bounds.tolist()):
             name, shard = self._table_parts[int(part_R[first])]
@@ -108,22 +108,22 @@ class IndexPart:
         found_RD: Floats = np.concatenate(blocks, dtype=np.float32)
         return found_RD
 
-    def _scores(self, queries_QD: Floats, rows_C: Whole) -> Floats:
+    def _scores(self, queries_QD: Floats, rows_C: Ints) -> Floats:
         """Exact scores (Q, C) of the same candidates, which ascend, for all queries."""
         scores_QC = np.empty((len(queries_QD), len(rows_C)), np.float32)
-        for begin in range(0, len(rows_C), REFINED_AT_ONCE):
-            block = slice(begin, begin + REFINED_AT_ONCE)
+        for begin in range(0, len(rows_C), RERANK_BLOCK):
+            block = slice(begin, begin + RERANK_BLOCK)
             scores_QC[:, block] = queries_QD @ self.vectors(rows_C[block]).T
         return scores_QC
 
-    def _refined(self, queries_QD: Floats, rows_QC: Whole) -> Floats:
+    def _refined(self, queries_QD: Floats, rows_QC: Ints) -> Floats:
         """Exact scores (Q, C) of each query's own candidates."""
         scores_QC = np.full(rows_QC.shape, -np.inf, np.float32)
-        query_P, column_P = np.nonzero(rows_QC != NOBODY)
+        query_P, column_P = np.nonzero(rows_QC != NO_ROW)
         row_P = rows_QC[query_P, column_P]
         order_P = np.argsort(row_P, kind="stable")
-        for begin in range(0, len(order_P), REFINED_AT_ONCE):
-            pairs = order_P[begin : begin + REFINED_AT_ONCE]
+        for begin in range(0, len(order_P), RERANK_BLOCK):
+            pairs = order_P[begin : begin + RERANK_BLOCK]
             query = query_P[pairs]
             scores_QC[query, column_P[pairs]] = np.einsum(
                 "rd,rd->r", self.vectors(row_P[pairs]), queries_QD[query]
@@ -133,7 +133,7 @@ class IndexPart:
     def _mask_of_removed(self) -> Mask | None:
         if not self.facts.removed:
             return None
-        return ~self.ids.mask(Where(locations=frozenset(self.facts.removed)))
+        return ~self.ids.mask(Filter(locations=frozenset(self.facts.removed)))
 
 
 def read_faiss(path: str, on_disk: bool) -> Any:
@@ -145,10 +145,10 @@ def read_faiss(path: str, on_disk: bool) -> Any:
         return faiss.read_index(path, faiss.IO_FLAG_MMAP if on_disk else 0)
     except RuntimeError as error:
         reason = str(error).rsplit("Error: ", 1)[-1].splitlines()[0]
-        raise InputError(f"{path} is damaged ({reason}); {AGAIN}") from None
+        raise InputError(f"{path} is damaged ({reason}); {REBUILD_HINT}") from None
 
 
-def search_parameters(index: Any, breadth: int, allowed_N: Mask | None) -> Any:
+def faiss_parameters(index: Any, breadth: int, allowed_N: Mask | None) -> Any:
     """FAISS's parameters of a search in any index that we build: how broad, and which rows may
     answer.
     """
@@ -157,11 +157,11 @@ def search_parameters(index: Any, breadth: int, allowed_N: Mask | None) -> Any:
     )  # under another name: it lives only as long as what it is a view of
     if isinstance(kind, FAISS.IndexPreTransform):
         return FAISS.SearchParametersPreTransform(
-            index_params=search_parameters(kind.index, breadth, allowed_N)
+            index_params=faiss_parameters(kind.index, breadth, allowed_N)
         )
     if isinstance(kind, FAISS.IndexRefine):
-        inner = search_parameters(kind.base_index, breadth, allowed_N)
-        return FAISS.IndexRefineSearchParameters(k_factor=REFINING, base_index_params=inner)
+        inner = faiss_parameters(kind.base_index, breadth, allowed_N)
+        return FAISS.IndexRefineSearchParameters(k_factor=RERANK_FACTOR, base_index_params=inner)
     chosen: dict[str, Any] = {}
     if allowed_N is not None:
         chosen["sel"] = FAISS.IDSelectorBitmap(np.packbits(allowed_N, bitorder="little"))
@@ -179,17 +179,17 @@ def _without_graph(index: Any) -> Any:
     return FAISS.downcast_index(index.storage) if isinstance(index, FAISS.IndexHNSW) else index
 
 
-def _nothing(queries: int, k: int) -> tuple[Floats, Whole]:
-    return np.full((queries, k), -np.inf, np.float32), np.full((queries, k), NOBODY, np.int64)
+def _empty_result(queries: int, k: int) -> tuple[Floats, Ints]:
+    return np.full((queries, k), -np.inf, np.float32), np.full((queries, k), NO_ROW, np.int64)
 
 
-def _best(scores_QC: Floats, rows_QC: Whole, k: int) -> tuple[Floats, Whole]:
+def _top_k(scores_QC: Floats, rows_QC: Ints, k: int) -> tuple[Floats, Ints]:
     """The K best of C candidates: higher scores first, at equal scores the lower row; NOBODY last."""
-    scores_QC = np.where(rows_QC == NOBODY, np.float32(-np.inf), scores_QC)
+    scores_QC = np.where(rows_QC == NO_ROW, np.float32(-np.inf), scores_QC)
     order_QK = np.lexsort((rows_QC, -scores_QC), axis=1)[:, :k]
     found = np.take_along_axis(scores_QC, order_QK, 1), np.take_along_axis(rows_QC, order_QK, 1)
     missing = k - order_QK.shape[1]
     if missing <= 0:
         return found
-    more = _nothing(len(scores_QC), missing)
+    more = _empty_result(len(scores_QC), missing)
     return np.concatenate([found[0], more[0]], axis=1), np.concatenate([found[1], more[1]], axis=1)

@@ -27,25 +27,25 @@ MASK_BYTES = 1.125
 from the disk."""
 TRAINING_SHARE = 0.25
 "Of the memory, for the rows that an index is trained on."
-COPIED = 1.75
+TRAINING_COPIES = 1.75
 "FAISS's residuals and reduced copies of them, the rows themselves included."
-MERGED = 1.3
+MERGE_FACTOR = 1.3
 "Of the codes, what merging them and reading them back took, as measured with lists of 8-bit codes."
-MOST_TRAINING_ROWS = 2_000_000
+MAX_TRAINING_ROWS = 2_000_000
 ROWS_PER_LIST = 50  # that train a centroid: FAISS warns below 39 and uses no more than 256
 UNIT_SHARE = 1 / 16
 "Of the memory, for the codes of one unit of work; while lists grow they take twice that."
-LEAST_UNIT_ROWS = 20_000
+MIN_UNIT_ROWS = 20_000
 PART_SHARE = 1 / 3
 "Of the memory, for merging a part of an index whose lists then stay on the disk."
-PIECE = 8  # dimensions of a 4-bit subquantiser: 256 of them at 2,048 dimensions
-REFINING = 10
+SUBQUANTISER_DIM = 8  # dimensions of a 4-bit subquantiser: 256 of them at 2,048 dimensions
+RERANK_FACTOR = 10
 "Candidates per wanted row whose vectors are read from the table."
 Refine = Literal["none", "table"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gallery:
+class GallerySpec:
     """What is to be indexed, and within what."""
 
     rows: int
@@ -63,7 +63,7 @@ class Gallery:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class IndexPlan:
     """How to build, what it will take, and why."""
 
     factory: str
@@ -91,7 +91,7 @@ class Plan:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Family:
+class _IndexFamily:
     """A kind of index."""
 
     name: str
@@ -103,7 +103,7 @@ class _Family:
     on_disk: bool = False
     graph: bool = False
     "Built in one piece, for FAISS cannot merge graphs."
-    merging: float = MERGED
+    merging: float = MERGE_FACTOR
     "Its codes' room, while units become one, as a multiple of the codes: appended ones double."
     reduces: bool = False
     "Whether it is used behind a projection onto the leading directions, or without one."
@@ -115,26 +115,30 @@ class _Family:
             "HNSW32,SQ8": dimension + 4.0 * 2 * 32 + 24,
             "SQ8": dimension + 8.0,
             "SQfp16": 2 * dimension + 8.0,
-            "PQfs": dimension / (2 * PIECE) + 8,
+            "PQfs": dimension / (2 * SUBQUANTISER_DIM) + 8,
             "RaBitQ": dimension / 8 + 16,
             "RaBitQ4": dimension / 2 + 24,
         }[self.name]
 
 
 FAMILIES = (
-    _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985, refine="table", reduces=True),
-    _Family(name="HNSW32,SQ8", form="HNSW32,SQ8", ceiling=0.985, graph=True, merging=2),
-    _Family(name="PQfs", form="IVF{lists},PQ{pieces}x4fs", ceiling=0.98, refine="table", merging=2),
-    _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985),
-    _Family(name="SQfp16", form="IVF{lists},SQfp16", ceiling=0.999),
-    _Family(name="RaBitQ", form="IVF{lists},RaBitQ", ceiling=0.97, refine="table", on_disk=True),
-    _Family(name="RaBitQ4", form="IVF{lists},RaBitQ4", ceiling=0.9),
-    _Family(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985, on_disk=True),
+    _IndexFamily(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985, refine="table", reduces=True),
+    _IndexFamily(name="HNSW32,SQ8", form="HNSW32,SQ8", ceiling=0.985, graph=True, merging=2),
+    _IndexFamily(
+        name="PQfs", form="IVF{lists},PQ{pieces}x4fs", ceiling=0.98, refine="table", merging=2
+    ),
+    _IndexFamily(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985),
+    _IndexFamily(name="SQfp16", form="IVF{lists},SQfp16", ceiling=0.999),
+    _IndexFamily(
+        name="RaBitQ", form="IVF{lists},RaBitQ", ceiling=0.97, refine="table", on_disk=True
+    ),
+    _IndexFamily(name="RaBitQ4", form="IVF{lists},RaBitQ4", ceiling=0.9),
+    _IndexFamily(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985, on_disk=True),
 )
-EXACT = _Family(name="Flat", form="Flat", ceiling=1.0, merging=2)
+EXACT = _IndexFamily(name="Flat", form="Flat", ceiling=1.0, merging=2)
 
 
-def plan_index(gallery: Gallery) -> Plan:
+def plan_index(gallery: GallerySpec) -> IndexPlan:
     """The plan for a gallery.
 
     Raises InputError where no family fits the memory, with what would.
@@ -154,15 +158,15 @@ def plan_index(gallery: Gallery) -> Plan:
     return max(fitting, key=lambda plan: plan.expected_recall)
 
 
-def plan_factory(gallery: Gallery, factory: str, refine: Refine = "none") -> Plan:
+def plan_factory(gallery: GallerySpec, factory: str, refine: Refine = "none") -> IndexPlan:
     """The plan for a factory string of the user's. What it takes and reaches is not foreseen: 0."""
     lists = re.search(r"IVF(\d+)", factory)
-    return Plan(
+    return IndexPlan(
         factory=factory,
         refine=refine,
         on_disk=False,
         training_rows=_training_rows(gallery, int(lists[1]) if lists else 0),
-        unit_rows=max(LEAST_UNIT_ROWS, int(gallery.budget * UNIT_SHARE / (4 * gallery.dimension))),
+        unit_rows=max(MIN_UNIT_ROWS, int(gallery.budget * UNIT_SHARE / (4 * gallery.dimension))),
         part_rows=gallery.rows,
         search_bytes=0,
         build_bytes=0,
@@ -171,7 +175,7 @@ def plan_factory(gallery: Gallery, factory: str, refine: Refine = "none") -> Pla
     )
 
 
-def _plans(gallery: Gallery) -> Iterator[Plan]:
+def _plans(gallery: GallerySpec) -> Iterator[IndexPlan]:
     """Every family that suits the gallery, the fastest first, whatever it takes."""
     if gallery.rows <= EXACT_ROWS:
         yield _plan(EXACT, gallery)
@@ -186,7 +190,7 @@ def _plans(gallery: Gallery) -> Iterator[Plan]:
             yield _plan(family, gallery)
 
 
-def _plan(family: _Family, gallery: Gallery) -> Plan:
+def _plan(family: _IndexFamily, gallery: GallerySpec) -> IndexPlan:
     reduced = (
         gallery.effective_dimension
         if family.reduces and gallery.effective_dimension
@@ -203,7 +207,7 @@ def _plan(family: _Family, gallery: Gallery) -> Plan:
     codes, masks = gallery.rows * code, MASK_BYTES * gallery.rows
     unit = min(
         gallery.rows,
-        max(LEAST_UNIT_ROWS, int(gallery.budget * UNIT_SHARE / code / max(1, gallery.workers))),
+        max(MIN_UNIT_ROWS, int(gallery.budget * UNIT_SHARE / code / max(1, gallery.workers))),
     )
     if family.graph:
         unit = gallery.rows
@@ -212,8 +216,9 @@ def _plan(family: _Family, gallery: Gallery) -> Plan:
     growing = max(1, gallery.workers) * (fixed + BLOCK_BYTES + 2 * unit * code) + (
         PROCESS_BYTES if gallery.workers else 0
     )
-    return Plan(
-        factory=(f"PCA{reduced}," if family.reduces else "") + form_of(family, lists, reduced),
+    return IndexPlan(
+        factory=(f"PCA{reduced}," if family.reduces else "")
+        + factory_string(family, lists, reduced),
         refine=family.refine,
         on_disk=family.on_disk,
         training_rows=trained,
@@ -221,37 +226,38 @@ def _plan(family: _Family, gallery: Gallery) -> Plan:
         part_rows=part,
         search_bytes=fixed + masks + (0 if family.on_disk else codes),
         build_bytes=max(
-            growing, fixed + BLOCK_BYTES + max(merging, COPIED * 4.0 * trained * gallery.dimension)
+            growing,
+            fixed + BLOCK_BYTES + max(merging, TRAINING_COPIES * 4.0 * trained * gallery.dimension),
         ),
         expected_recall=family.ceiling,
         why=_reason(family, gallery, reduced, code),
     )
 
 
-def form_of(family: _Family, lists: int, dimension: int) -> str:
+def factory_string(family: _IndexFamily, lists: int, dimension: int) -> str:
     """A family's factory string. FAISS wants as many subquantisers as divide the dimension."""
-    most = max(1, dimension // PIECE)
+    most = max(1, dimension // SUBQUANTISER_DIM)
     pieces = next(count for count in range(most, 0, -1) if dimension % count == 0)
     return family.form.format(lists=lists, pieces=pieces)
 
 
-def _lists(gallery: Gallery) -> int:
+def _lists(gallery: GallerySpec) -> int:
     """About twice the root of the rows, as a power of two; no more than the memory allows to train."""
-    most = max(1, _most_training_rows(gallery) // ROWS_PER_LIST)
+    most = max(1, _max_training_rows(gallery) // ROWS_PER_LIST)
     return int(2 ** min(round(math.log2(2 * math.sqrt(gallery.rows))), math.floor(math.log2(most))))
 
 
-def _most_training_rows(gallery: Gallery) -> int:
+def _max_training_rows(gallery: GallerySpec) -> int:
     by_memory = int(gallery.budget * TRAINING_SHARE / (4 * gallery.dimension))
-    return max(1, min(gallery.rows, by_memory, MOST_TRAINING_ROWS))
+    return max(1, min(gallery.rows, by_memory, MAX_TRAINING_ROWS))
 
 
-def _training_rows(gallery: Gallery, lists: int) -> int:
+def _training_rows(gallery: GallerySpec, lists: int) -> int:
     """At least 16,384, which codes and projections are trained on as well."""
-    return min(_most_training_rows(gallery), max(16_384, ROWS_PER_LIST * lists))
+    return min(_max_training_rows(gallery), max(16_384, ROWS_PER_LIST * lists))
 
 
-def _reason(family: _Family, gallery: Gallery, reduced: int, code: float) -> str:
+def _reason(family: _IndexFamily, gallery: GallerySpec, reduced: int, code: float) -> str:
     what = {
         "Flat": f"exact search: {gallery.rows:,} rows are few enough to look at each",
         "HNSW32,SQ8": "a graph over 8-bit codes",

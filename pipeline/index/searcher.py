@@ -15,16 +15,16 @@ import faiss
 import numpy as np
 import pyarrow as pa
 
-from pipeline.core.arrays import Whole
+from pipeline.core.arrays import Ints
 from pipeline.core.errors import InputError
 from pipeline.core.records import View
-from pipeline.features.row_reader import RowReader, readable
+from pipeline.features.row_reader import RowReader, supports_row_reads
 from pipeline.features.table import Floats
-from pipeline.index.filters import Where
-from pipeline.index.metadata import Effort, IndexFacts, as_said, read_facts
-from pipeline.index.part import NOBODY, IndexPart
+from pipeline.index.filters import Filter
+from pipeline.index.metadata import IndexMetadata, SearchParams, metadata_dict, read_metadata
+from pipeline.index.part import NO_ROW, IndexPart
 
-LOOKED_AT = 1 << 30
+HASHED_ON_OPEN_BYTES = 1 << 30
 "Bytes of an index up to which opening it hashes them: a second, about."
 
 
@@ -52,7 +52,7 @@ class Searchable(Protocol):
     def __len__(self) -> int: ...
 
     def search(
-        self, queries_QD: Floats, k: int = 10, where: Where | None = None
+        self, queries_QD: Floats, k: int = 10, where: Filter | None = None
     ) -> list[list[Hit]]: ...
 
 
@@ -66,17 +66,17 @@ class Index:
         path: str,
         parts: Sequence[int] | None = None,
         threads: int | None = None,
-        told: IndexFacts | None = None,
+        told: IndexMetadata | None = None,
         whole: bool | None = None,
     ) -> None:
         """`parts`: numbers of those to open; all by default. `threads`: of FAISS; by default one
-        per core. `told`: what index.json says, where it is not written yet. `whole`: whether every
+        per core. `summary`: what index.json says, where it is not written yet. `whole`: whether every
         byte is looked at, by default of small parts.
 
-        Raises InputError when there is no index at `path`, or it is damaged.
+        Raises InputError when there is no index at `draw_path`, or it is damaged.
         """
-        self.path, self.told = path, told or read_facts(path)
-        self.facts = as_said(self.told)
+        self.path, self.told = path, told or read_metadata(path)
+        self.facts = metadata_dict(self.told)
         self.dimension = self.told.dimension
         # Ray sets OMP_NUM_THREADS to a task's cores before FAISS is loaded, and in its jobs that is
         # one.
@@ -84,7 +84,7 @@ class Index:
         with (
             tempfile.TemporaryDirectory() as scratch
         ):  # what is mapped of it lives on without its name
-            self._parts = list(opened_parts(path, self.told, scratch, parts, whole))
+            self._parts = list(open_parts(path, self.told, scratch, parts, whole))
 
     def __len__(self) -> int:
         """Rows that may answer."""
@@ -99,8 +99,8 @@ class Index:
         self,
         queries_QD: Floats,
         k: int = 10,
-        where: Where | None = None,
-        effort: Effort | None = None,
+        where: Filter | None = None,
+        effort: SearchParams | None = None,
     ) -> list[list[Hit]]:
         """The K best rows of each query that may answer, best first; fewer where fewer may.
 
@@ -108,15 +108,15 @@ class Index:
         another dimension.
         """
         scores_QK, rows_QK = self.search_rows(queries_QD, k, where, effort)
-        return hits_of(scores_QK, rows_QK, self.names(rows_QK))
+        return make_hits(scores_QK, rows_QK, self.names(rows_QK))
 
     def search_rows(
         self,
         queries_QD: Floats,
         k: int = 10,
-        where: Where | None = None,
-        effort: Effort | None = None,
-    ) -> tuple[Floats, Whole]:
+        where: Filter | None = None,
+        effort: SearchParams | None = None,
+    ) -> tuple[Floats, Ints]:
         """Scores and row numbers (Q, K) of the whole index, best first; NOBODY where fewer rows may
         answer.
         """
@@ -130,14 +130,14 @@ class Index:
         for part in self._parts:
             scores_QK, rows_QK = part.search(queries_QD, k, effort or self.told.effort, where)
             found.append(
-                (scores_QK, np.where(rows_QK == NOBODY, NOBODY, rows_QK + part.facts.first_row))
+                (scores_QK, np.where(rows_QK == NO_ROW, NO_ROW, rows_QK + part.facts.first_row))
             )
-        return merged(found, k)
+        return merge_results(found, k)
 
-    def names(self, rows_QK: Whole) -> pa.Table:
+    def names(self, rows_QK: Ints) -> pa.Table:
         """What is known of the rows found, in their order, NOBODY left out."""
-        rows = rows_QK[rows_QK != NOBODY]
-        order: list[Whole] = []
+        rows = rows_QK[rows_QK != NO_ROW]
+        order: list[Ints] = []
         tables = []
         for part in self._parts:
             here = np.flatnonzero(
@@ -150,40 +150,43 @@ class Index:
         return pa.concat_tables(tables).take(pa.array(back))
 
 
-def opened_parts(
+def open_parts(
     path: str,
-    told: IndexFacts,
+    told: IndexMetadata,
     scratch: str,
     parts: Sequence[int] | None = None,
     whole: bool | None = None,
 ) -> Iterator[IndexPart]:
     """The parts of an index, opened. By default every byte is looked at where they are small: FAISS
     may end the process over a damaged file."""
-    reader = RowReader(told.table, told.dimension) if readable(told.table) else None
+    reader = RowReader(told.table, told.dimension) if supports_row_reads(told.table) else None
     wanted = [facts for number, facts in enumerate(told.parts) if parts is None or number in parts]
     if whole is None:
-        whole = sum(file["bytes"] for facts in wanted for file in facts.files.values()) <= LOOKED_AT
+        whole = (
+            sum(file["bytes"] for facts in wanted for file in facts.files.values())
+            <= HASHED_ON_OPEN_BYTES
+        )
     for facts in wanted:
         yield IndexPart(path, facts, reader, told.on_disk, scratch, whole)
 
 
-def merged(found: Sequence[tuple[Floats, Whole]], k: int) -> tuple[Floats, Whole]:
+def merge_results(found: Sequence[tuple[Floats, Ints]], k: int) -> tuple[Floats, Ints]:
     """The K best of what several parts found: higher scores first, at equal scores the lower row,
     NOBODY last.
     """
     scores_QM = np.concatenate([scores for scores, _ in found], axis=1)
     rows_QM = np.concatenate([rows for _, rows in found], axis=1)
     order_QK = np.lexsort(
-        (np.where(rows_QM == NOBODY, np.iinfo(np.int64).max, rows_QM), -scores_QM), axis=1
+        (np.where(rows_QM == NO_ROW, np.iinfo(np.int64).max, rows_QM), -scores_QM), axis=1
     )[:, :k]
     return np.take_along_axis(scores_QM, order_QK, 1), np.take_along_axis(rows_QM, order_QK, 1)
 
 
-def hits_of(scores_QK: Floats, rows_QK: Whole, names: pa.Table) -> list[list[Hit]]:
-    """Hits of each query from what `search_rows` and `names` give."""
+def make_hits(scores_QK: Floats, rows_QK: Ints, names: pa.Table) -> list[list[Hit]]:
+    """Hits of each query from what `search_rows` and `list_names` give."""
     said, found, begin = names.to_pylist(), [], 0
     for scores_K, count in zip(
-        scores_QK, np.count_nonzero(rows_QK != NOBODY, axis=1).tolist(), strict=True
+        scores_QK, np.count_nonzero(rows_QK != NO_ROW, axis=1).tolist(), strict=True
     ):
         rows = zip(said[begin : begin + count], scores_K[:count].tolist(), strict=True)
         found.append(

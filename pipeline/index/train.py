@@ -11,21 +11,23 @@ from typing import Any
 import faiss
 import numpy as np
 
-from pipeline.core.arrays import Whole
+from pipeline.core.arrays import Ints
 from pipeline.core.errors import InputError
 from pipeline.features.table import FeatureTable, Floats
 
 FAISS: Any = faiss  # whose types know nothing of its keyword arguments
 SPECTRUM_ROWS = 16_384
 "Rows by which the table's directions are weighed."
-SAMPLED_AT_ONCE = 4_096
+SAMPLE_BLOCK = 4_096
 ENERGY = 0.999
 "Of the vectors' squared length, what a projection has to keep."
-STEP = 32
+PROJECTION_STEP = 32
 "Projections have a multiple of so many directions."
 
 
-def sample(table: FeatureTable, rows_of_part: dict[str, int], rows: int) -> tuple[Whole, Floats]:
+def sample_rows(
+    table: FeatureTable, rows_of_part: dict[str, int], rows: int
+) -> tuple[Ints, Floats]:
     """About `rows` row numbers (S,) with their vectors (S, D), of each part its share: the first
     ones, as parts are ordered by hash. `rows_of_part`: of the table, in its order."""
     share = min(1.0, rows / max(1, sum(rows_of_part.values())))
@@ -38,7 +40,7 @@ def sample(table: FeatureTable, rows_of_part: dict[str, int], rows: int) -> tupl
             numbers_S[taken : taken + wanted] = np.arange(begin, begin + wanted)
             _fill(
                 vectors_SD[taken : taken + wanted],
-                table.only([part]).blocks(min(wanted, SAMPLED_AT_ONCE)),
+                table.only([part]).blocks(min(wanted, SAMPLE_BLOCK)),
             )
         begin, taken = begin + held, taken + wanted
     return numbers_S[:taken], vectors_SD[:taken]
@@ -57,9 +59,9 @@ def _fill(vectors_SD: Floats, blocks: Iterator[Floats]) -> None:
 
 def effective_dimension(sample_SD: Floats) -> int:
     """Leading directions that hold ENERGY of the squared length, rounded up to a multiple of STEP."""
-    energy_D = np.maximum(_directions(sample_SD)[0], 0)
+    energy_D = np.maximum(_principal_directions(sample_SD)[0], 0)
     count = 1 + int(np.searchsorted(np.cumsum(energy_D), ENERGY * energy_D.sum()))
-    return min(int(sample_SD.shape[1]), math.ceil(count / STEP) * STEP)
+    return min(int(sample_SD.shape[1]), math.ceil(count / PROJECTION_STEP) * PROJECTION_STEP)
 
 
 def new_index(factory: str, dimension: int) -> Any:
@@ -76,7 +78,7 @@ def new_index(factory: str, dimension: int) -> Any:
         ) from None
 
 
-def train(index: Any, factory: str, sample_SD: Floats) -> None:
+def train_index(index: Any, factory: str, sample_SD: Floats) -> None:
     """Train a new index on a sample.
 
     Raises InputError where FAISS cannot, as from too few rows.
@@ -95,7 +97,7 @@ def train(index: Any, factory: str, sample_SD: Floats) -> None:
         ) from None
 
 
-def _directions(sample_SD: Floats) -> tuple[Floats, Floats]:
+def _principal_directions(sample_SD: Floats) -> tuple[Floats, Floats]:
     """Energy (D,) of the directions and the directions (D, D) as rows, the strongest first.
 
     Of the second moments, not the covariance: FAISS's own PCA takes the mean away, which changes
@@ -107,7 +109,7 @@ def _directions(sample_SD: Floats) -> tuple[Floats, Floats]:
 
 
 def _set_projection(transform: Any, sample_SD: Floats) -> None:
-    kept = np.ascontiguousarray(_directions(sample_SD)[1][: transform.d_out], np.float32)
+    kept = np.ascontiguousarray(_principal_directions(sample_SD)[1][: transform.d_out], np.float32)
     FAISS.copy_array_to_vector(kept.ravel(), transform.A)
     FAISS.copy_array_to_vector(np.zeros(transform.d_out, np.float32), transform.b)
     transform.have_bias, transform.is_trained = False, True

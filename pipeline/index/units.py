@@ -17,26 +17,26 @@ import numpy as np
 from pipeline.core import json_files, storage
 from pipeline.features.table import FeatureTable
 from pipeline.index.ids import local_copy
-from pipeline.index.metadata import measure_file
+from pipeline.index.metadata import file_checksum
 from pipeline.index.part import read_faiss
 
 FAISS: Any = faiss  # whose types know nothing of its keyword arguments
 
 
 @dataclass(frozen=True, kw_only=True)
-class Unit:
+class WorkUnit:
     """Consecutive parts of the table."""
 
     table_parts: tuple[str, ...]
     rows: int
 
 
-def units_of(rows_of_part: dict[str, int], rows: int) -> list[Unit]:
+def plan_units(rows_of_part: dict[str, int], rows: int) -> list[WorkUnit]:
     """The table's parts in their order, in units of about so many rows."""
     names = list(rows_of_part)
     groups = even_groups(list(rows_of_part.values()), rows)
     return [
-        Unit(
+        WorkUnit(
             table_parts=tuple(names[i] for i in group),
             rows=sum(rows_of_part[names[i]] for i in group),
         )
@@ -54,7 +54,7 @@ def even_groups(sizes: Sequence[int], wanted: int) -> list[list[int]]:
     return list(groups.values())
 
 
-def build_unit(trained: str, table: FeatureTable, unit: Unit, out: str, threads: int) -> int:
+def build_unit(trained: str, table: FeatureTable, unit: WorkUnit, out: str, threads: int) -> int:
     """Add a unit's rows to a copy of the trained index and write it to `out`. Returns its rows."""
     FAISS.omp_set_num_threads(threads)
     with tempfile.TemporaryDirectory() as scratch:
@@ -63,30 +63,30 @@ def build_unit(trained: str, table: FeatureTable, unit: Unit, out: str, threads:
         index.add(block_BD)
     with storage.atomic_file(out) as local:
         FAISS.write_index(index, local)
-    vouch(out)
+    write_checksum(out)
     return int(index.ntotal)
 
 
-def vouch(file: str) -> None:
+def write_checksum(file: str) -> None:
     """Write beside a finished file how many bytes it has, and their hash: without that it is not
     believed later.
     """
     folder, name = file.rsplit("/", 1)
-    json_files.write_checksummed(f"{file}.json", measure_file(folder, name))
+    json_files.write_checksummed(f"{file}.json", file_checksum(folder, name))
 
 
-def is_whole(file: str) -> bool:
+def checksum_ok(file: str) -> bool:
     """Whether a file is there and every byte is what was vouched for."""
     folder, name = file.rsplit("/", 1)
     try:
         return storage.exists(f"{file}.json") and json_files.read_checksummed(
             f"{file}.json"
-        ) == measure_file(folder, name)
+        ) == file_checksum(folder, name)
     except (OSError, ValueError):
         return False
 
 
-def mergeable(index: Any) -> bool:
+def can_merge(index: Any) -> bool:
     """Whether units of such an index can become one: lists and plain codes can, graphs and refined
     indexes cannot.
     """
@@ -94,11 +94,11 @@ def mergeable(index: Any) -> bool:
         index
     )  # under another name: it lives only as long as what it is a view of
     if isinstance(kind, FAISS.IndexPreTransform):
-        return mergeable(kind.index)
+        return can_merge(kind.index)
     return isinstance(kind, FAISS.IndexIVF | FAISS.IndexFlatCodes)
 
 
-def merge(trained: str, files: Sequence[str]) -> Any:
+def merge_units(trained: str, files: Sequence[str]) -> Any:
     """One index of all units, their rows one after the other. Files are mapped, so no more than the
     result is in memory.
     """

@@ -17,27 +17,27 @@ import numpy as np
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.core.lock import one_at_a_time
+from pipeline.core.lock import locks_output
 from pipeline.core.progress import console
 from pipeline.core.records import Split, View
 from pipeline.features.table import FeatureTable, open_table
-from pipeline.index.build import finish
-from pipeline.index.filters import Where
-from pipeline.index.ids import Ids, local_copy
+from pipeline.index.build import finish_index
+from pipeline.index.filters import Filter
+from pipeline.index.ids import RowIds, local_copy
 from pipeline.index.metadata import (
-    IndexFacts,
-    PartFacts,
-    as_said,
+    IndexMetadata,
+    PartMetadata,
     check_files,
-    read_facts,
-    write_facts,
+    metadata_dict,
+    read_metadata,
+    write_metadata,
 )
-from pipeline.index.recall import hold_queries
+from pipeline.index.recall import sample_queries
 from pipeline.index.searcher import Index
-from pipeline.index.workspace import Workshop, rows_by_part
+from pipeline.index.workspace import BuildWorkspace, rows_by_part
 
 
-@one_at_a_time(lambda table, out, workers=0: out)
+@locks_output(lambda table, out, workers=0: out)
 def extend_index(table: str, out: str, workers: int = 0) -> dict[str, Any]:
     """Add the rows of those parts of a table that an index does not hold yet; with none it is left
     as it is.
@@ -46,23 +46,23 @@ def extend_index(table: str, out: str, workers: int = 0) -> dict[str, Any]:
     built from.
     """
     start = time.perf_counter()
-    told, whole = read_facts(out), open_table(table)
+    told, whole = read_metadata(out), open_table(table)
     split, view = told.asked["split"], told.asked["view"]
     chosen = whole.select(Split(split) if split else None, View(view) if view else None)
-    _refuse_another(out, told, chosen)
+    _check_same_table(out, told, chosen)
     held = told.table_parts
     missing = [name for name in chosen.parts if name not in held]
     added = rows_by_part(chosen.only(missing))
     if not added:
         console.print(f"{out} holds all of {table}: {told.rows} rows; nothing to do")
-        return as_said(told)
+        return metadata_dict(told)
     faiss.omp_set_num_threads(
         os.cpu_count() or 1
     )  # Ray sets OMP_NUM_THREADS in its jobs; this one uses all cores
     check_files(out, told.trained, whole=True)
     identity = {"extends": [asdict(part) for part in told.parts], "by": chosen.only(missing).digest}
-    workshop = Workshop(out=out, table=chosen, identity=identity, workers=workers)
-    workshop.take_trained()
+    workshop = BuildWorkspace(out=out, table=chosen, identity=identity, workers=workers)
+    workshop.reuse_trained()
     parts = workshop.build(added, told.unit_rows, told.part_rows, told.rows, len(told.parts))
     facts = replace(
         told,
@@ -72,19 +72,19 @@ def extend_index(table: str, out: str, workers: int = 0) -> dict[str, Any]:
     )
     now = chosen.only([*held, *added])  # the order of the index's rows
     others = whole.select(Split.QUERY) if split == Split.GALLERY else None
-    return finish(out, facts, hold_queries(now, rows_by_part(now), others), workshop, start)
+    return finish_index(out, facts, sample_queries(now, rows_by_part(now), others), workshop, start)
 
 
-@one_at_a_time(lambda out, locations: out)
+@locks_output(lambda out, locations: out)
 def remove_locations(out: str, locations: Iterable[str]) -> dict[str, Any]:
     """Make locations of an index answer no more. Their vectors stay in its files until it is built
     again.
 
     Raises InputError, and removes none, when one of them is not there.
     """
-    told, wanted = read_facts(out), frozenset(locations)
+    told, wanted = read_metadata(out), frozenset(locations)
     with tempfile.TemporaryDirectory() as scratch:
-        thinned = [_without(out, part, wanted, scratch) for part in told.parts]
+        thinned = [_mark_removed(out, part, wanted, scratch) for part in told.parts]
     parts = tuple(part for part, _ in thinned)
     gone = {
         name
@@ -98,18 +98,18 @@ def remove_locations(out: str, locations: Iterable[str]) -> dict[str, Any]:
             "their names in its ids.parquet"
         )
     facts = replace(told, parts=parts)
-    write_facts(out, facts)
+    write_metadata(out, facts)
     left = sum(answering for _, answering in thinned)
     console.print(f"{out}: {len(gone)} locations removed, {left:,} of {told.rows:,} rows answer")
-    return as_said(facts)
+    return metadata_dict(facts)
 
 
-def verify_index(out: str) -> IndexFacts:
+def verify_index(out: str) -> IndexMetadata:
     """Look at every byte of an index.
 
     Raises InputError where one is not what was written.
     """
-    told = read_facts(out)
+    told = read_metadata(out)
     check_files(out, told.trained, whole=True)
     Index(out, whole=True)
     console.print(
@@ -118,23 +118,23 @@ def verify_index(out: str) -> IndexFacts:
     return told
 
 
-def _without(
-    out: str, part: PartFacts, locations: frozenset[str], scratch: str
-) -> tuple[PartFacts, int]:
+def _mark_removed(
+    out: str, part: PartMetadata, locations: frozenset[str], scratch: str
+) -> tuple[PartMetadata, int]:
     """The part with those of the locations that it holds among the removed ones, and how many of
     its rows answer then.
     """
     check_files(out, part.files)
-    ids = Ids(local_copy(storage.join(out, part.ids), scratch))
-    rows = np.flatnonzero(ids.mask(Where(locations=locations)))
+    ids = RowIds(local_copy(storage.join(out, part.ids), scratch))
+    rows = np.flatnonzero(ids.mask(Filter(locations=locations)))
     found = set(ids.take(rows, ["location"])["location"].to_pylist())
     thinned = replace(part, removed=tuple(sorted({*part.removed, *found})))
     return thinned, part.rows - int(
-        np.count_nonzero(ids.mask(Where(locations=frozenset(thinned.removed))))
+        np.count_nonzero(ids.mask(Filter(locations=frozenset(thinned.removed))))
     )
 
 
-def _refuse_another(out: str, told: IndexFacts, table: FeatureTable) -> None:
+def _check_same_table(out: str, told: IndexMetadata, table: FeatureTable) -> None:
     """Raise InputError where a table is not the one that the index was built from, with more."""
     if told.fingerprint != table.fingerprint:
         raise InputError(

@@ -17,24 +17,24 @@ import ray
 from pipeline.core import cluster, json_files, storage
 from pipeline.core.progress import progress
 from pipeline.features.table import FeatureTable
-from pipeline.index.ids import COLUMNS, local_copy, write_ids
-from pipeline.index.metadata import PartFacts, measure_file
+from pipeline.index.ids import ID_COLUMNS, local_copy, write_ids
+from pipeline.index.metadata import PartMetadata, file_checksum
 from pipeline.index.part import read_faiss
 from pipeline.index.units import (
-    Unit,
+    WorkUnit,
     build_unit,
+    can_merge,
+    checksum_ok,
     even_groups,
-    is_whole,
-    merge,
-    mergeable,
-    units_of,
-    vouch,
+    merge_units,
+    plan_units,
+    write_checksum,
 )
 
-BUILDING, PLAN, TRAINED = "_building", "plan.json", "trained.faiss"
+WORK_FOLDER, PLAN, TRAINED = "_building", "plan.json", "trained.faiss"
 
 
-class Workshop:
+class BuildWorkspace:
     """Where one index is built or grown."""
 
     def __init__(
@@ -44,10 +44,10 @@ class Workshop:
         Ray tasks, 0 for none.
         """
         self._out, self._table, self._workers = out, table, workers
-        self._scratch = storage.join(out, BUILDING)
+        self._scratch = storage.join(out, WORK_FOLDER)
         wanted = json.loads(json.dumps(identity))
         plan = storage.join(self._scratch, PLAN)
-        if _plan(plan) != wanted:
+        if _read_plan(plan) != wanted:
             self.clear()
             json_files.write_checksummed(plan, wanted)
 
@@ -55,23 +55,23 @@ class Workshop:
         storage.remove_folder(self._scratch)
 
     def is_trained(self) -> bool:
-        return is_whole(self._trained)
+        return checksum_ok(self._trained)
 
-    def keep_trained(self, index: Any) -> None:
+    def save_trained(self, index: Any) -> None:
         with storage.atomic_file(self._trained) as local:
             faiss.write_index(index, local)
-        vouch(self._trained)
+        write_checksum(self._trained)
 
-    def take_trained(self) -> None:
+    def reuse_trained(self) -> None:
         """Go on with the trained index of the finished one."""
         if not self.is_trained():
-            storage.copy(storage.join(self._out, TRAINED), self._trained)
-            vouch(self._trained)
+            storage.link_or_copy(storage.join(self._out, TRAINED), self._trained)
+            write_checksum(self._trained)
 
-    def hand_out_trained(self) -> dict[str, dict[str, Any]]:
+    def publish_trained(self) -> dict[str, dict[str, Any]]:
         """Put the trained index beside what was built; its name, size and hash."""
-        storage.copy(self._trained, storage.join(self._out, TRAINED))
-        return {TRAINED: measure_file(self._out, TRAINED)}
+        storage.link_or_copy(self._trained, storage.join(self._out, TRAINED))
+        return {TRAINED: file_checksum(self._out, TRAINED)}
 
     @property
     def _trained(self) -> str:
@@ -84,25 +84,25 @@ class Workshop:
         part_rows: int,
         first_row: int = 0,
         first_part: int = 0,
-    ) -> tuple[PartFacts, ...]:
+    ) -> tuple[PartMetadata, ...]:
         """Index these parts of the table, and write the parts of the index, of about `part_rows`
         rows.
 
         `first_row`, `first_part`: how many of each the index has already.
         """
         whole = self._can_merge()
-        units = units_of(rows_of_part, min(unit_rows, part_rows) if whole else part_rows)
+        units = plan_units(rows_of_part, min(unit_rows, part_rows) if whole else part_rows)
         files = [
             storage.join(self._scratch, f"unit-{number:06d}.faiss") for number in range(len(units))
         ]
         self._build_units(units, files)
-        parts: list[PartFacts] = []
+        parts: list[PartMetadata] = []
         for group in (
             even_groups([unit.rows for unit in units], part_rows)
             if whole
             else [[i] for i in range(len(units))]
         ):
-            ending = _ending(first_part + len(parts))
+            ending = _part_suffix(first_part + len(parts))
             self._merge(
                 [files[number] for number in group], storage.join(self._out, f"index{ending}.faiss")
             )
@@ -112,20 +112,20 @@ class Workshop:
 
     def _can_merge(self) -> bool:
         with tempfile.TemporaryDirectory() as scratch:
-            return mergeable(read_faiss(local_copy(self._trained, scratch), on_disk=False))
+            return can_merge(read_faiss(local_copy(self._trained, scratch), on_disk=False))
 
     def _merge(self, files: Sequence[str], out: str) -> None:
         """Make units one file of the index."""
         if len(files) == 1:
-            storage.copy(files[0], out)
+            storage.link_or_copy(files[0], out)
             return
         with tempfile.TemporaryDirectory() as scratch, storage.atomic_file(out) as local:
             units = [local_copy(file, scratch) for file in files]
-            faiss.write_index(merge(local_copy(self._trained, scratch), units), local)
-        give_memory_back()
+            faiss.write_index(merge_units(local_copy(self._trained, scratch), units), local)
+        release_memory()
 
-    def _build_units(self, units: Sequence[Unit], files: Sequence[str]) -> None:
-        missing = [number for number, file in enumerate(files) if not is_whole(file)]
+    def _build_units(self, units: Sequence[WorkUnit], files: Sequence[str]) -> None:
+        missing = [number for number, file in enumerate(files) if not checksum_ok(file)]
         with progress(sum(unit.rows for unit in units), "indexing", "rows") as meter:
             meter.advance(
                 sum(units[number].rows for number in range(len(units)) if number not in missing)
@@ -140,7 +140,7 @@ class Workshop:
                         os.cpu_count() or 1,
                     )
                     meter.advance(rows)
-                give_memory_back()
+                release_memory()
                 return
             cluster.connect()
             task: Any = ray.remote(num_cpus=1)(build_unit)
@@ -151,10 +151,10 @@ class Workshop:
                     trained, table, units[number], storage.absolute(files[number]), 1
                 )
 
-            for _, rows in cluster.bounded(submit, missing, self._workers):
+            for _, rows in cluster.bounded_map(submit, missing, self._workers):
                 meter.advance(rows)
 
-    def _describe(self, units: Sequence[Unit], first_row: int, ending: str) -> PartFacts:
+    def _describe(self, units: Sequence[WorkUnit], first_row: int, ending: str) -> PartMetadata:
         """Write whose rows the vectors of a part are, and say what it holds."""
         held = {
             name: number
@@ -167,20 +167,20 @@ class Workshop:
             parquet,
             arrow,
             first_row,
-            ((held[name], rows) for name, rows in table.numbered(COLUMNS)),
+            ((held[name], rows) for name, rows in table.numbered(ID_COLUMNS)),
         )
         names = (f"index{ending}.faiss", *ids.values())
-        return PartFacts(
+        return PartMetadata(
             faiss=names[0],
             ids=ids["arrow"],
             first_row=first_row,
             rows=sum(unit.rows for unit in units),
             table_parts=table.shards,
-            files={name: measure_file(self._out, name) for name in names},
+            files={name: file_checksum(self._out, name) for name in names},
         )
 
 
-def _plan(path: str) -> dict[str, Any] | None:
+def _read_plan(path: str) -> dict[str, Any] | None:
     """What unfinished work is of; None where there is none, or where that cannot be told."""
     try:
         return json_files.read_checksummed(path) if storage.exists(path) else None
@@ -188,7 +188,7 @@ def _plan(path: str) -> dict[str, Any] | None:
         return None
 
 
-def give_memory_back() -> None:
+def release_memory() -> None:
     """Let the system have what FAISS has freed: glibc keeps thousands of lists' room, and an index
     that is read next would come on top of it. Elsewhere there is nothing to call."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
@@ -196,7 +196,7 @@ def give_memory_back() -> None:
         trim(0)
 
 
-def _ending(number: int) -> str:
+def _part_suffix(number: int) -> str:
     """Of the names of a part's files; the first one has the names that plain readers look for."""
     return f"-{number:06d}" if number else ""
 

@@ -16,17 +16,17 @@ from pipeline.core.geo import haversine_m
 from pipeline.core.records import View
 from pipeline.features.table import Floats
 from pipeline.index.searcher import Hit, Searchable
-from pipeline.locate.calibration import Example
-from pipeline.locate.locate import places
-from pipeline.locate.track import TRACKED
+from pipeline.locate.calibration import CalibrationExample
+from pipeline.locate.locate import coordinates
+from pipeline.locate.track import TRACK_CANDIDATES
 
-OWN_STEPS = 2.0
+OWN_LOCATION_SPACINGS = 2.0
 """Spacings of the gallery within which an image belongs to a photo's place, too: neighbours of one
 that overlap show it."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Labelled:
+class LabelledImages:
     """Images with what is known of them, in the order of their embeddings."""
 
     facts: Sequence[dict[str, Any]]
@@ -39,27 +39,31 @@ class Labelled:
         return (geotag["lat"], geotag["lon"]) if geotag else (None, None)
 
 
-def examples(
-    photos: Labelled,
-    overhead: Labelled,
+def make_examples(
+    photos: LabelledImages,
+    overhead: LabelledImages,
     index: Searchable,
     spacing_m: float | None,
     tolerance_m: float,
-) -> list[Example]:
+) -> list[CalibrationExample]:
     """One example per photo."""
     own: dict[str, list[int]] = {}
     for number, facts in enumerate(overhead.facts):
         own.setdefault(facts["location"], []).append(number)
-    apart_m = max(tolerance_m, OWN_STEPS * (spacing_m or 0.0))
-    made: list[Example | None] = [None] * len(photos.facts)
-    todo, k = list(range(len(photos.facts))), 2 * TRACKED
+    apart_m = max(tolerance_m, OWN_LOCATION_SPACINGS * (spacing_m or 0.0))
+    made: list[CalibrationExample | None] = [None] * len(photos.facts)
+    todo, k = list(range(len(photos.facts))), 2 * TRACK_CANDIDATES
     while todo:
         found = index.search(photos.embeddings_QD[todo], k)
         whole = k >= len(index)
         for number, hits in zip(todo, found, strict=True):
             location, (lat, lon) = photos.facts[number]["location"], photos.place(number)
-            others = [hit for hit in elsewhere(hits, lat, lon, apart_m) if hit.location != location]
-            if len(others) < TRACKED and not whole:
+            others = [
+                hit
+                for hit in hits_outside_radius(hits, lat, lon, apart_m)
+                if hit.location != location
+            ]
+            if len(others) < TRACK_CANDIDATES and not whole:
                 continue  # its place has so many rows that one must look further down
             rows = own.get(location, [])
             score_N = overhead.embeddings_QD[rows] @ photos.embeddings_QD[number]
@@ -70,28 +74,28 @@ def examples(
             inside = sorted(
                 [*hits, *(hit for hit in added if hit.key not in held)], key=lambda hit: -hit.score
             )
-            made[number] = Example(
+            made[number] = CalibrationExample(
                 location=location,
                 lat=lat,
                 lon=lon,
-                inside=tuple(inside[:TRACKED]),
-                outside=tuple(others[:TRACKED]),
+                inside=tuple(inside[:TRACK_CANDIDATES]),
+                outside=tuple(others[:TRACK_CANDIDATES]),
             )
         todo, k = [number for number in todo if made[number] is None], 4 * k
     return [example for example in made if example]
 
 
-def elsewhere(
+def hits_outside_radius(
     hits: Sequence[Hit], lat: float | None, lon: float | None, apart_m: float
 ) -> list[Hit]:
     """The candidates that are not known to lie within so many metres of a position."""
     if lat is None or lon is None or not hits:
         return list(hits)
-    near_K = haversine_m(places(hits), np.array([lat, lon])) <= apart_m  # false of a NaN
+    near_K = haversine_m(coordinates(hits), np.array([lat, lon])) <= apart_m  # false of a NaN
     return [hit for hit, near in zip(hits, near_K, strict=True) if not near]
 
 
-def _hit(images: Labelled, number: int, score: float) -> Hit:
+def _hit(images: LabelledImages, number: int, score: float) -> Hit:
     facts, (lat, lon) = images.facts[number], images.place(number)
     return Hit(
         key=facts["key"],

@@ -13,17 +13,17 @@ import numpy as np
 from pipeline.core import json_files, storage
 from pipeline.core.arrays import Doubles
 from pipeline.core.errors import InputError
-from pipeline.core.json_files import as_told
+from pipeline.core.json_files import from_json
 from pipeline.locate.consensus import Consensus
-from pipeline.locate.logistic import Logistic
-from pipeline.locate.reliability import Bin
+from pipeline.locate.logistic import LogisticModel
+from pipeline.locate.reliability import ReliabilityBin
 
 SCHEMA_VERSION = 1
-FILE = "calibration.json"
-FEATURES = ("score", "margin", "depth", "share")
+CALIBRATION_FILE = "calibration.json"
+FEATURE_NAMES = ("score", "margin", "depth", "share")
 
 
-def features(agreed: Consensus, scores_K: Doubles) -> Doubles:
+def confidence_features(agreed: Consensus, scores_K: Doubles) -> Doubles:
     """What tells right from wrong answers (F,): the place's best score, by how much it beats the
     best candidate elsewhere, by how much it beats the mean of the candidates, and which share of
     them lies at the place."""
@@ -34,7 +34,7 @@ def features(agreed: Consensus, scores_K: Doubles) -> Doubles:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Confidence:
+class Calibration:
     """A calibration of one network over one gallery."""
 
     fingerprint: str
@@ -45,7 +45,7 @@ class Confidence:
     "Which photos it was fitted on, in words."
     spacing_m: float | None
     "Median distance of a gallery position to the next one; None where no two are known."
-    within_m: float
+    agreement_radius_m: float
     """How far apart candidates may lie that agree on a place: what served the calibration's photos
     best."""
     tolerance_m: float
@@ -53,11 +53,11 @@ class Confidence:
     position."""
     outside: float
     "Share of photos that were supposed to show no place of the gallery."
-    model: Logistic
+    model: LogisticModel
     threshold: float
     """Below it an answer is `unknown`: where the share of right answers kept less that of others
     kept is greatest."""
-    sharpness: float
+    inverse_temperature: float
     "Of the track's choice among candidates: log-odds per unit of score."
     elsewhere: float
     """Of the track's choice: the log-odds of none of the candidates, at the level of the last one
@@ -75,34 +75,37 @@ class Confidence:
     "Share of the photos without their place that it answers `unknown`."
     calibration_error: float
     "Expected calibration error."
-    bins: tuple[Bin, ...]
+    bins: tuple[ReliabilityBin, ...]
     "The reliability diagram's."
 
     def probability(self, agreed: Consensus, scores_K: Doubles) -> float:
         """That the place is right, by the candidates considered."""
-        return float(self.model.probabilities(features(agreed, scores_K)[None])[0])
+        return float(self.model.probabilities(confidence_features(agreed, scores_K)[None])[0])
 
 
-def write_confidence(path: str, confidence: Confidence) -> None:
+def write_calibration(path: str, confidence: Calibration) -> None:
     """The calibration as a JSON file, whole or not at all."""
     json_files.write_checksummed(
-        path, {"schema_version": SCHEMA_VERSION, "features": FEATURES, **asdict(confidence)}
+        path, {"schema_version": SCHEMA_VERSION, "features": FEATURE_NAMES, **asdict(confidence)}
     )
 
 
-def read_confidence(path: str, facts: dict[str, Any]) -> Confidence:
+def read_calibration(path: str, facts: dict[str, Any]) -> Calibration:
     """The calibration of an index that says `facts` of itself.
 
     Raises InputError when the file is none, or another network's.
     """
     try:
         said = json_files.read_checksummed(path)
-        if said.pop("schema_version") != SCHEMA_VERSION or tuple(said.pop("features")) != FEATURES:
+        if (
+            said.pop("schema_version") != SCHEMA_VERSION
+            or tuple(said.pop("features")) != FEATURE_NAMES
+        ):
             raise ValueError("another version")
-        confidence = as_told(Confidence, said)
+        confidence = from_json(Calibration, said)
         model = confidence.model
         if any(
-            len(each) != len(FEATURES)
+            len(each) != len(FEATURE_NAMES)
             for each in (model.mean_F, model.scale_F, model.coefficient_F)
         ):
             raise ValueError("another number of features")
@@ -131,9 +134,9 @@ def read_confidence(path: str, facts: dict[str, Any]) -> Confidence:
     return confidence
 
 
-def find_confidence(index: str, facts: dict[str, Any]) -> Confidence | None:
+def find_calibration(index: str, facts: dict[str, Any]) -> Calibration | None:
     """The calibration beside an index, if there is one. Raises InputError when it is another
     network's.
     """
-    path = storage.join(index, FILE)
-    return read_confidence(path, facts) if storage.exists(path) else None
+    path = storage.join(index, CALIBRATION_FILE)
+    return read_calibration(path, facts) if storage.exists(path) else None

@@ -19,7 +19,7 @@ from pipeline.core.geo import haversine_m, on_sphere
 Flags = npt.NDArray[np.bool_]
 # of Weiszfeld's iteration, which halves the error every few: far below a metre on areas of
 # kilometres
-STEPS = 60
+WEISZFELD_STEPS = 60
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,7 @@ class Consensus:
     "The best score of a candidate that lies elsewhere; where there is none, the last candidate's."
 
 
-def weights(scores_K: Doubles) -> Doubles:
+def support_weights(scores_K: Doubles) -> Doubles:
     """How much each candidate counts, 0 to 1: the square of its score above the last one's, in
     shares of the best one's.
 
@@ -55,17 +55,19 @@ def weights(scores_K: Doubles) -> Doubles:
     )
 
 
-def agree(locations_K: Sequence[str], places_K2: Doubles, within_m: float) -> Flags:
-    """Which candidates lie at one place (K, K): those of one location, and those at most `within_m`
+def agreement(locations_K: Sequence[str], places_K2: Doubles, agreement_radius_m: float) -> Flags:
+    """Which candidates lie at one place (K, K): those of one location, and those at most `agreement_radius_m`
     metres apart.
     """
     names_K = np.asarray(locations_K, dtype=np.str_)
-    near_KK = haversine_m(places_K2[:, None], places_K2[None]) <= within_m  # false of a NaN
+    near_KK = (
+        haversine_m(places_K2[:, None], places_K2[None]) <= agreement_radius_m
+    )  # false of a NaN
     return np.asarray((names_K[:, None] == names_K[None]) | near_KK)
 
 
-def consensus(
-    scores_K: Doubles, locations_K: Sequence[str], places_K2: Doubles, within_m: float
+def find_consensus(
+    scores_K: Doubles, locations_K: Sequence[str], places_K2: Doubles, agreement_radius_m: float
 ) -> Consensus:
     """The candidate with the highest sum of weights around it, and all that agree with it; K >= 1,
     best first.
@@ -74,8 +76,8 @@ def consensus(
     together pull harder than that one holds, so that one unlike neighbour moves nothing while a
     ring of overlapping images draws it to their middle.
     """
-    weight_K = weights(scores_K)
-    agree_KK = agree(locations_K, places_K2, within_m)
+    weight_K = support_weights(scores_K)
+    agree_KK = agreement(locations_K, places_K2, agreement_radius_m)
     members_K = agree_KK[int(np.argmax(agree_KK @ weight_K))]
     leader = int(np.argmax(members_K))
     others_K = scores_K[~members_K]
@@ -113,7 +115,7 @@ def geometric_median(places_N2: Doubles, weight_N: Doubles) -> tuple[float, floa
     if holds_N.any():
         return float(places_N2[holds_N][0, 0]), float(places_N2[holds_N][0, 1])
     middle_3 = np.average(points_N3, axis=0, weights=weight_N)
-    for _ in range(STEPS):
+    for _ in range(WEISZFELD_STEPS):
         share_N = weight_N / np.maximum(np.linalg.norm(points_N3 - middle_3, axis=1), 1e-6)
         middle_3 = np.average(points_N3, axis=0, weights=share_N)
     lat = np.degrees(np.arctan2(middle_3[2], np.hypot(middle_3[0], middle_3[1])))

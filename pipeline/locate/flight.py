@@ -10,23 +10,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.locate.confidence import Confidence
+from pipeline.locate.confidence import Calibration
 from pipeline.locate.gallery_map import GalleryMap
-from pipeline.locate.locate import Answer, Position, levelled, places
-from pipeline.locate.logistic import choices
-from pipeline.locate.track import Motion, Photo, Smoothed, Start, smooth
+from pipeline.locate.locate import Answer, Position, coordinates, relative_scores
+from pipeline.locate.logistic import choice_log_probabilities
+from pipeline.locate.track import Motion, SmoothedPhoto, TrackPhoto, TrackStart, smooth_track
 
-LIKELIER = 0.5
+TRACK_THRESHOLD = 0.5
 """A flight's photo is known where its place is likelier than all others and elsewhere together;
 this needs no threshold."""
 
 
-def settle(
+def apply_track(
     answers: Sequence[Answer],
     times_s: Sequence[float],
-    confidence: Confidence,
+    confidence: Calibration,
     motion: Motion,
-    start: Start | None = None,
+    start: TrackStart | None = None,
 ) -> list[Answer]:
     """What the flight says of each photo, in the order given. A photo that the track passes over is
     not known.
@@ -38,15 +38,16 @@ def settle(
     # The calibration's share of photos from outside the gallery is another than the flight's.
     outside = confidence.elsewhere - _log_odds(confidence.outside) + _log_odds(motion.elsewhere)
     flight = [
-        _photo(answers[number], times_s[number], confidence.sharpness, outside) for number in order
+        _track_photo(answers[number], times_s[number], confidence.inverse_temperature, outside)
+        for number in order
     ]
     settled = list(answers)
-    for number, found in zip(order, smooth(flight, motion, start), strict=True):
-        settled[number] = _settled(answers[number], found, confidence)
+    for number, found in zip(order, smooth_track(flight, motion, start), strict=True):
+        settled[number] = _apply_smoothed(answers[number], found, confidence)
     return settled
 
 
-def motion_over(gallery: GalleryMap, max_speed: float, elsewhere: float = 0.1) -> Motion:
+def motion_for_gallery(gallery: GalleryMap, max_speed: float, elsewhere: float = 0.1) -> Motion:
     """The motion of a UAV over a gallery: at either end of a way a photo may lie half a spacing
     from its gallery image.
     """
@@ -64,18 +65,22 @@ def _log_odds(share: float) -> float:
     return math.log(share / (1 - share))
 
 
-def _photo(answer: Answer, time_s: float, sharpness: float, outside: float) -> Photo:
+def _track_photo(
+    answer: Answer, time_s: float, inverse_temperature: float, outside: float
+) -> TrackPhoto:
     hits = answer.candidates
-    log_chance_C = choices(levelled(hits)[None], sharpness, outside)[0]
-    return Photo(
+    log_chance_C = choice_log_probabilities(
+        relative_scores(hits)[None], inverse_temperature, outside
+    )[0]
+    return TrackPhoto(
         time_s=time_s,
-        places_K2=places(hits),
+        places_K2=coordinates(hits),
         log_chance_K=log_chance_C[:-1],
         log_elsewhere=float(log_chance_C[-1]),
     )
 
 
-def _settled(answer: Answer, found: Smoothed, confidence: Confidence) -> Answer:
+def _apply_smoothed(answer: Answer, found: SmoothedPhoto, confidence: Calibration) -> Answer:
     """The answer's place is that of the candidate chosen; its probability that of all candidates of
     this location.
     """
@@ -95,5 +100,5 @@ def _settled(answer: Answer, found: Smoothed, confidence: Confidence) -> Answer:
         location=location,
         probability=probability,
         agreeing=int(at_K.sum()),
-        known=probability >= LIKELIER,
+        known=probability >= TRACK_THRESHOLD,
     )

@@ -10,11 +10,11 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.core.arrays import Doubles, Whole, Words
+from pipeline.core.arrays import Doubles, Ints, Strings
 from pipeline.core.geo import on_sphere
 from pipeline.index.searcher import Index
 
-MOST = 200_000
+MAX_GALLERY_ROWS = 200_000
 "Rows that are read at most: enough for the spacing, and more than a page can draw."
 
 
@@ -22,20 +22,20 @@ MOST = 200_000
 class GalleryMap:
     """Rows of an index."""
 
-    keys: Words
+    keys: Strings
     places_N2: Doubles
     rows: int
     "Of the whole index, of which these may be a sample."
 
     @cached_property
-    def distinct_P2(self) -> Doubles:
+    def distinct_positions_P2(self) -> Doubles:
         """Positions (P, 2) that are known, each once."""
         return np.unique(self.places_N2[~np.isnan(self.places_N2).any(axis=1)], axis=0)
 
     @property
     def distinct(self) -> float:
         """How many there are in the whole index, about."""
-        return len(self.distinct_P2) * self.rows / max(len(self.keys), 1)
+        return len(self.distinct_positions_P2) * self.rows / max(len(self.keys), 1)
 
     @cached_property
     def spacing_m(self) -> float | None:
@@ -45,13 +45,13 @@ class GalleryMap:
         From a sample of n of N rows it is taken for sqrt(n / N) of what the sample shows, as on an
         area.
         """
-        if len(self.distinct_P2) < 2:
+        if len(self.distinct_positions_P2) < 2:
             return None
-        points_P3 = on_sphere(self.distinct_P2)
+        points_P3 = on_sphere(self.distinct_positions_P2)
         apart_P2, _ = cKDTree(points_P3).query(points_P3, k=2)
         return float(np.median(apart_P2[:, 1]) * np.sqrt(len(self.keys) / self.rows))
 
-    def nearest(self, lat: float, lon: float, count: int) -> Whole:
+    def nearest(self, lat: float, lon: float, count: int) -> Ints:
         """Numbers of the rows nearest to a position, nearest first, at most `count`."""
         known = np.flatnonzero(~np.isnan(self.places_N2).any(axis=1))
         here_13 = on_sphere(np.array([[lat, lon]]))
@@ -59,12 +59,12 @@ class GalleryMap:
         return np.asarray(known[np.argsort(away_N, kind="stable")[:count]])
 
 
-def gallery_map(index: Index) -> GalleryMap:
+def read_gallery_map(index: Index) -> GalleryMap:
     """The rows of an index, or MOST of them from all over it; without the locations that were
     removed.
     """
     rows = np.unique(
-        np.linspace(0, index.told.rows - 1, min(index.told.rows, MOST)).astype(np.int64)
+        np.linspace(0, index.told.rows - 1, min(index.told.rows, MAX_GALLERY_ROWS)).astype(np.int64)
     )
     names = index.names(rows[None])
     location_N = np.asarray(names["location"].to_pylist(), dtype=np.str_)

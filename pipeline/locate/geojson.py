@@ -15,7 +15,7 @@ from typing import Any
 from pipeline.core.records import Rejection
 from pipeline.locate.locate import Answer
 
-COLUMNS = (
+CSV_COLUMNS = (
     "photo",
     "taken_at",
     "known",
@@ -33,7 +33,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Located:
+class LocatedPhoto:
     """A photo, or several of one place, and what is said of it."""
 
     name: str
@@ -48,7 +48,7 @@ class Located:
     "When, as far as it is known."
 
 
-def geojson(located: Sequence[Located], about: dict[str, Any], track: bool) -> bytes:
+def to_geojson(located: Sequence[LocatedPhoto], about: dict[str, Any], track: bool) -> bytes:
     """A FeatureCollection (RFC 7946): a feature per answer, and with `track` first a LineString
     through those that are known.
 
@@ -56,17 +56,17 @@ def geojson(located: Sequence[Located], about: dict[str, Any], track: bool) -> b
     """
     features = [_feature(one) for one in located]
     if track:
-        features.insert(0, _line(located))
+        features.insert(0, _track_feature(located))
     collection = {"type": "FeatureCollection", "pvda": about, "features": features}
     return (
         json.dumps(collection, indent=1) + "\n"
     ).encode()  # ASCII: file names need not be Unicode
 
 
-def _feature(one: Located) -> dict[str, Any]:
+def _feature(one: LocatedPhoto) -> dict[str, Any]:
     row = _row(one)
     candidates = [asdict(hit) for hit in one.answer.candidates] if one.answer else []
-    properties = {name: row[name] for name in COLUMNS[: COLUMNS.index("candidate")]}
+    properties = {name: row[name] for name in CSV_COLUMNS[: CSV_COLUMNS.index("candidate")]}
     properties |= {
         "photos": one.photos,
         "candidates": candidates,
@@ -80,7 +80,7 @@ def _feature(one: Located) -> dict[str, Any]:
     return {"type": "Feature", "geometry": point, "properties": properties}
 
 
-def _line(located: Sequence[Located]) -> dict[str, Any]:
+def _track_feature(located: Sequence[LocatedPhoto]) -> dict[str, Any]:
     """The flight; without geometry where fewer than two photos are known, since a line has two
     ends.
     """
@@ -101,10 +101,10 @@ def _line(located: Sequence[Located]) -> dict[str, Any]:
     }
 
 
-def table(located: Sequence[Located]) -> bytes:
+def to_csv(located: Sequence[LocatedPhoto]) -> bytes:
     """CSV with a row per answer; empty is unknown."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=COLUMNS, lineterminator="\n")
+    writer = csv.DictWriter(text, fieldnames=CSV_COLUMNS, lineterminator="\n")
     writer.writeheader()
     writer.writerows(
         _row(one) | {"known": str(bool(one.answer and one.answer.known)).lower()} for one in located
@@ -112,9 +112,9 @@ def table(located: Sequence[Located]) -> bytes:
     return text.getvalue().encode("utf-8", "surrogateescape")
 
 
-def _row(one: Located) -> dict[str, Any]:
+def _row(one: LocatedPhoto) -> dict[str, Any]:
     answer = one.answer
-    row: dict[str, Any] = dict.fromkeys(COLUMNS) | {
+    row: dict[str, Any] = dict.fromkeys(CSV_COLUMNS) | {
         "photo": one.name,
         "taken_at": one.taken_at,
         "known": False,

@@ -13,18 +13,18 @@ import numpy as np
 
 from pipeline.core.arrays import Doubles
 from pipeline.features.table import Floats
-from pipeline.index.filters import Where
+from pipeline.index.filters import Filter
 from pipeline.index.searcher import Hit, Searchable
-from pipeline.locate.confidence import Confidence
-from pipeline.locate.consensus import Consensus, consensus
+from pipeline.locate.confidence import Calibration
+from pipeline.locate.consensus import Consensus, find_consensus
 
-CONSIDERED = 10
+CONSENSUS_CANDIDATES = 10
 """Candidates that decide on place and probability, whatever number is shown: a calibration holds
 for one number only. Ten, since a place that agrees with none of the ten best has little to say, and
 the tenth is well within what comes by chance."""
 
 
-UNCALIBRATED = 0.5
+UNCALIBRATED_SPACINGS = 0.5
 """Of the gallery's spacing: how far apart candidates may lie that agree, where no calibration has
 chosen. Only images of one place: whether neighbours overlap is not known, and unlike ones would
 lead away."""
@@ -61,18 +61,18 @@ class Answer:
     "How many of the candidates considered lie at the place."
 
 
-NOTHING = Answer(
+NO_ANSWER = Answer(
     position=None, location=None, probability=None, known=False, candidates=(), agreeing=0
 )
 "What is said where the search found nothing."
 
 
-def locate(
+def locate_embeddings(
     index: Searchable,
     embeddings_QD: Floats,
-    k: int = CONSIDERED,
-    where: Where | None = None,
-    confidence: Confidence | None = None,
+    k: int = CONSENSUS_CANDIDATES,
+    where: Filter | None = None,
+    confidence: Calibration | None = None,
     spacing_m: float | None = None,
 ) -> list[Answer]:
     """One answer per embedding (Q, D), each with its `k` best candidates.
@@ -81,29 +81,33 @@ def locate(
     far apart candidates may lie that agree; without either they agree where they are of one location.
     Raises InputError where the embeddings are not the index's.
     """
-    most = max(k, CONSIDERED)
-    return answers(index.search(embeddings_QD, most, where), k, confidence, spacing_m)
+    most = max(k, CONSENSUS_CANDIDATES)
+    return answers_from_hits(index.search(embeddings_QD, most, where), k, confidence, spacing_m)
 
 
-def answers(
+def answers_from_hits(
     found: Sequence[Sequence[Hit]],
     k: int,
-    confidence: Confidence | None = None,
+    confidence: Calibration | None = None,
     spacing_m: float | None = None,
 ) -> list[Answer]:
     """What the candidates of each photo, best first, amount to; `k` of them go into the answer."""
     spacing = (confidence.spacing_m if confidence else spacing_m) or 0.0
-    within_m = confidence.within_m if confidence else UNCALIBRATED * spacing
+    agreement_radius_m = (
+        confidence.agreement_radius_m if confidence else UNCALIBRATED_SPACINGS * spacing
+    )
     return [
-        _answer(hits, judged(hits, within_m), k, confidence, spacing) if hits else NOTHING
+        _answer(hits, consensus_of(hits, agreement_radius_m), k, confidence, spacing)
+        if hits
+        else NO_ANSWER
         for hits in found
     ]
 
 
 def _answer(
-    hits: Sequence[Hit], agreed: Consensus, k: int, confidence: Confidence | None, spacing: float
+    hits: Sequence[Hit], agreed: Consensus, k: int, confidence: Calibration | None, spacing: float
 ) -> Answer:  # fmt: skip
-    probability = confidence.probability(agreed, scores_of(hits)) if confidence else None
+    probability = confidence.probability(agreed, consensus_scores(hits)) if confidence else None
     position = None
     if agreed.lat is not None and agreed.lon is not None:
         radius_m = math.hypot(agreed.spread_m, spacing / 2)
@@ -115,25 +119,30 @@ def _answer(
     )  # fmt: skip
 
 
-def judged(hits: Sequence[Hit], within_m: float) -> Consensus:
+def consensus_of(hits: Sequence[Hit], agreement_radius_m: float) -> Consensus:
     """The place that the best CONSIDERED candidates agree on."""
-    hits = hits[:CONSIDERED]
-    return consensus(scores_of(hits), [hit.location for hit in hits], places(hits), within_m)
+    hits = hits[:CONSENSUS_CANDIDATES]
+    return find_consensus(
+        consensus_scores(hits),
+        [hit.location for hit in hits],
+        coordinates(hits),
+        agreement_radius_m,
+    )
 
 
-def scores_of(hits: Sequence[Hit]) -> Doubles:
+def consensus_scores(hits: Sequence[Hit]) -> Doubles:
     """Scores (K,) of the candidates considered, best first."""
-    return np.array([hit.score for hit in hits[:CONSIDERED]])
+    return np.array([hit.score for hit in hits[:CONSENSUS_CANDIDATES]])
 
 
-def levelled(hits: Sequence[Hit]) -> Doubles:
+def relative_scores(hits: Sequence[Hit]) -> Doubles:
     """Scores of any number of candidates above that of the last one considered: what a gallery
     holds by chance differs from photo to photo."""
     scores_K = np.array([hit.score for hit in hits])
-    return np.asarray(scores_K - scores_K[:CONSIDERED][-1:].sum())
+    return np.asarray(scores_K - scores_K[:CONSENSUS_CANDIDATES][-1:].sum())
 
 
-def places(hits: Sequence[Hit]) -> Doubles:
+def coordinates(hits: Sequence[Hit]) -> Doubles:
     """Latitudes and longitudes (K, 2) of candidates, NaN where unknown."""
     return np.array([(hit.lat, hit.lon) for hit in hits], dtype=np.float64).reshape(
         -1, 2

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core.arrays import Doubles, Whole
+from pipeline.core.arrays import Doubles, Ints
 
-STEPS = 50  # Newton's converges in about ten; both losses are convex
+NEWTON_STEPS = 50  # Newton's converges in about ten; both losses are convex
 RIDGE = 1.0
 """Of the standardised coefficients' squares, halved, beside the summed loss of all examples: as if
 one more example said that nothing matters. It keeps coefficients finite where the examples part
@@ -18,7 +18,7 @@ perfectly."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Logistic:
+class LogisticModel:
     """P(yes | x) = sigmoid(intercept + sum of coefficient * (x - mean) / scale)."""
 
     mean_F: tuple[float, ...]
@@ -37,7 +37,7 @@ def sigmoid(x: Doubles) -> Doubles:
     return np.asarray(np.exp(-np.logaddexp(0, -x)))
 
 
-def fit_logistic(x_NF: Doubles, yes_N: Doubles, weight_N: Doubles) -> Logistic:
+def fit_logistic(x_NF: Doubles, yes_N: Doubles, weight_N: Doubles) -> LogisticModel:
     """The model with the greatest likelihood of these weighted examples, less the ridge. A feature
     without spread counts 0.
     """
@@ -49,7 +49,7 @@ def fit_logistic(x_NF: Doubles, yes_N: Doubles, weight_N: Doubles) -> Logistic:
         [[1e-6], np.full(x_NF.shape[1], RIDGE)]
     )  # nearly nothing on the intercept
     beta_G = np.zeros(design_NG.shape[1])
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         p_N = sigmoid(design_NG @ beta_G)
         gradient_G = design_NG.T @ (weight_N * (p_N - yes_N)) + ridge_G * beta_G
         curvature_GG = (design_NG.T * (weight_N * p_N * (1 - p_N))) @ design_NG + np.diag(ridge_G)
@@ -57,7 +57,7 @@ def fit_logistic(x_NF: Doubles, yes_N: Doubles, weight_N: Doubles) -> Logistic:
         beta_G -= step_G
         if np.abs(step_G).max() < 1e-9:
             break
-    return Logistic(
+    return LogisticModel(
         mean_F=tuple(mean_F.tolist()),
         scale_F=tuple(scale_F.tolist()),
         coefficient_F=tuple(beta_G[1:].tolist()),
@@ -65,17 +65,17 @@ def fit_logistic(x_NF: Doubles, yes_N: Doubles, weight_N: Doubles) -> Logistic:
     )
 
 
-def choices(x_NK: Doubles, sharpness: float, outside: float) -> Doubles:
+def choice_log_probabilities(x_NK: Doubles, inverse_temperature: float, outside: float) -> Doubles:
     """Log-probabilities (N, K + 1) of each choice, and last of none of them: softmax of sharpness *
     x, and of `outside`.
 
     -inf in x is a choice that is not there.
     """
-    logits = np.column_stack([sharpness * x_NK, np.full(len(x_NK), outside)])
+    logits = np.column_stack([inverse_temperature * x_NK, np.full(len(x_NK), outside)])
     return np.asarray(logits - np.logaddexp.reduce(logits, axis=1, keepdims=True))
 
 
-def fit_choices(x_NK: Doubles, chosen_N: Whole, weight_N: Doubles) -> tuple[float, float]:
+def fit_choice_model(x_NK: Doubles, chosen_N: Ints, weight_N: Doubles) -> tuple[float, float]:
     """(sharpness, outside) under which the choices made (K: none) are likeliest; a conditional
     logit (McFadden 1974).
     """
@@ -85,8 +85,8 @@ def fit_choices(x_NK: Doubles, chosen_N: Whole, weight_N: Doubles) -> tuple[floa
     feature_NC2[:, :-1, 0] = np.where(finite_NK, x_NK, 0)
     feature_NC2[:, -1, 1] = 1
     made_N2 = feature_NC2[np.arange(len(x_NK)), chosen_N]
-    for _ in range(STEPS):
-        p_NC = np.exp(choices(x_NK, max(float(beta_2[0]), 1e-6), float(beta_2[1])))
+    for _ in range(NEWTON_STEPS):
+        p_NC = np.exp(choice_log_probabilities(x_NK, max(float(beta_2[0]), 1e-6), float(beta_2[1])))
         mean_N2 = np.einsum("nc,ncf->nf", p_NC, feature_NC2)
         gradient_2 = (weight_N[:, None] * (mean_N2 - made_N2)).sum(axis=0) + 1e-3 * beta_2
         centred_NC2 = feature_NC2 - mean_N2[:, None]

@@ -15,49 +15,57 @@ import numpy as np
 
 from pipeline.core.geo import haversine_m
 from pipeline.images.thumbnails import ANSWER_PX, QUERY_PX, thumbnail
-from pipeline.locate.confidence import Confidence
+from pipeline.locate.confidence import Calibration
 from pipeline.locate.gallery_map import GalleryMap
-from pipeline.locate.geojson import Located
+from pipeline.locate.geojson import LocatedPhoto
 from pipeline.locate.locate import Answer
-from pipeline.locate.page_map import SIDE, Footprint, View, keys_around, overview, place_map
+from pipeline.locate.page_map import (
+    MAP_SIDE_PX,
+    Footprint,
+    MapView,
+    nearby_keys,
+    overview_map,
+    position_map,
+)
 
-SHOWN = 60
+MAX_SHOWN = 60
 "Answers on the page at most, evenly spread: some 100 kB each."
 TILE_PX = 96
 Pictures = Callable[[Iterable[str]], Mapping[str, bytes]]
 "Encoded images by key or by path; what is not at hand is absent."
-Place = tuple[float, float]
+LatLon = tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Surroundings:
+class PageContext:
     """What the page shows besides the answers."""
 
     title: str
     gallery: GalleryMap
-    confidence: Confidence | None
+    confidence: Calibration | None
     fingerprint: str
     track: bool = False
     footprints: Callable[[Iterable[str]], Mapping[str, Footprint]] = lambda keys: {}
     """Corners of gallery images by key, where they are known; the others are drawn as squares as
     wide as the spacing."""
-    truths: Mapping[str, Place] = field(default_factory=dict)
+    true_positions: Mapping[str, LatLon] = field(default_factory=dict)
     "Where photos were really taken, by name, where that is known."
 
 
-def render(
-    located: Sequence[Located], around: Surroundings, photos: Pictures, tiles: Pictures
+def render_page(
+    located: Sequence[LocatedPhoto], around: PageContext, photos: Pictures, tiles: Pictures
 ) -> str:
     """The page."""
     shown = [
-        located[round(at)] for at in np.linspace(0, len(located) - 1, min(len(located), SHOWN))
+        located[round(at)] for at in np.linspace(0, len(located) - 1, min(len(located), MAX_SHOWN))
     ]
     answered = [one.answer for one in shown if one.answer]
     footprints = around.footprints(
-        sorted({key for answer in answered for key in keys_around(answer, around.gallery)})
+        sorted({key for answer in answered for key in nearby_keys(answer, around.gallery)})
     )
     maps = [
-        place_map(one.answer, around.gallery, footprints) if one.answer else None for one in shown
+        position_map(one.answer, around.gallery, footprints) if one.answer else None
+        for one in shown
     ]
     keys = {tile.key for view in maps if view for tile in view.tiles}
     keys |= {hit.key for answer in answered for hit in answer.candidates}
@@ -80,25 +88,25 @@ def render(
         known=sum(answer.known for _, answer in answers),
         damaged=sum(len(one.rejected) for one in located),
         track=around.track,
-        overview=overview(answers, around.gallery, around.track),
+        overview=overview_map(answers, around.gallery, around.track),
         tiles={key: thumbnail(held[key], TILE_PX) for key in on_maps},
         panels=panels,
-        side=SIDE,
+        side=MAP_SIDE_PX,
     )
 
 
 def _panel(
-    one: Located,
-    view: View | None,
+    one: LocatedPhoto,
+    view: MapView | None,
     tiles: Mapping[str, bytes],
     photos: Mapping[str, bytes],
-    around: Surroundings,
+    around: PageContext,
 ) -> dict[str, Any]:
     """One answer as the template shows it."""
-    answer, truth = one.answer, around.truths.get(one.name)
+    answer, truth = one.answer, around.true_positions.get(one.name)
     point = view.frame.pixels(np.array([truth]))[0].tolist() if view and truth else None
     return {
-        "name": short(one.name),
+        "name": short_name(one.name),
         "path": one.name,
         "count": len(one.photos),
         "taken_at": one.taken_at,
@@ -106,8 +114,8 @@ def _panel(
         "map": view,
         "answer": answer,
         "rejected": one.rejected,
-        "truth": point if point and all(0 <= at <= SIDE for at in point) else None,
-        "error": told_m(away_m(answer, truth)) if answer and truth else "",
+        "truth": point if point and all(0 <= at <= MAP_SIDE_PX for at in point) else None,
+        "error": format_distance(distance_to_m(answer, truth)) if answer and truth else "",
         "candidates": [
             {
                 "rank": rank,
@@ -116,8 +124,8 @@ def _panel(
                 "score": hit.score,
                 "picture": thumbnail(tiles.get(hit.key), ANSWER_PX),
                 "here": hit.location == answer.location,
-                "away": told_m(
-                    away_m(
+                "away": format_distance(
+                    distance_to_m(
                         answer,
                         (hit.lat, hit.lon) if hit.lat is not None and hit.lon is not None else None,
                     )
@@ -130,14 +138,14 @@ def _panel(
     }
 
 
-def away_m(answer: Answer, place: Place | None) -> float | None:
+def distance_to_m(answer: Answer, place: LatLon | None) -> float | None:
     """Metres from an answer's position to a place; None where either is unknown."""
     if answer.position is None or place is None:
         return None
     return float(haversine_m(np.array([answer.position.lat, answer.position.lon]), np.array(place)))
 
 
-def told_m(metres: float | None) -> str:
+def format_distance(metres: float | None) -> str:
     """A distance in words."""
     if metres is None:
         return ""
@@ -146,6 +154,6 @@ def told_m(metres: float | None) -> str:
     return f"{metres:.0f} m away" if metres < 1000 else f"{metres / 1000:.1f} km away"
 
 
-def short(name: str) -> str:
+def short_name(name: str) -> str:
     """The last two parts of a path: a photo and its folder."""
     return "/".join(name.rstrip("/").split("/")[-2:])

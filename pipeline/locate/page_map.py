@@ -13,25 +13,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.core.arrays import Doubles
-from pipeline.core.geo import EARTH_M
+from pipeline.core.geo import EARTH_RADIUS_M
 from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.locate import Answer
 
-SIDE = 320
+MAP_SIDE_PX = 320
 "Pixels of a map's side, before it is scaled to the page."
-STEPS = 2.6
+MAP_HALF_SPACINGS = 2.6
 """Half the side of a map around a place, in spacings of the gallery: its neighbours are seen, and
 theirs in part."""
-TILES = 64
+MAX_TILES = 64
 "Gallery images that a map shows at most."
-DOTS = 4000
+MAX_DOTS = 4000
 "Gallery positions that the overview shows at most."
 Footprint = Sequence[Sequence[float]]
 "Corners, latitude and longitude, from the image's upper left clockwise."
 
 
 @dataclass(frozen=True, kw_only=True)
-class Frame:
+class MapFrame:
     """The square of ground that a map shows."""
 
     lat: float
@@ -41,13 +41,15 @@ class Frame:
     def pixels(self, places_N2: Doubles) -> Doubles:
         """Pixels (N, 2) of positions (N, 2). The difference of longitudes goes the short way round."""
         away_N = (places_N2[:, 1] - self.lon + 180) % 360 - 180
-        east_N = EARTH_M * np.radians(away_N) * math.cos(math.radians(self.lat))
-        south_N = EARTH_M * np.radians(self.lat - places_N2[:, 0])
-        return np.stack([east_N, south_N], axis=1) * (SIDE / 2 / self.half_m) + SIDE / 2
+        east_N = EARTH_RADIUS_M * np.radians(away_N) * math.cos(math.radians(self.lat))
+        south_N = EARTH_RADIUS_M * np.radians(self.lat - places_N2[:, 0])
+        return (
+            np.stack([east_N, south_N], axis=1) * (MAP_SIDE_PX / 2 / self.half_m) + MAP_SIDE_PX / 2
+        )
 
     def length(self, metres: float) -> float:
         """Pixels of a length."""
-        return metres * SIDE / 2 / self.half_m
+        return metres * MAP_SIDE_PX / 2 / self.half_m
 
     @property
     def bar_m(self) -> float:
@@ -57,7 +59,7 @@ class Frame:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tile:
+class MapTile:
     """A gallery image on the ground."""
 
     key: str
@@ -66,7 +68,7 @@ class Tile:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mark:
+class MapMark:
     """Something at a point of the map."""
 
     x: float
@@ -78,51 +80,51 @@ class Mark:
 
 
 @dataclass(frozen=True, kw_only=True)
-class View:
+class MapView:
     """One map."""
 
-    frame: Frame
+    frame: MapFrame
     summary: str
     "The map in words, for those who cannot see it."
-    tiles: tuple[Tile, ...] = ()
+    tiles: tuple[MapTile, ...] = ()
     dots: tuple[tuple[float, float], ...] = ()
-    marks: tuple[Mark, ...] = ()
+    marks: tuple[MapMark, ...] = ()
     circle: tuple[float, float, float] | None = None
     "x, y and radius of the uncertainty."
     line: str = ""
     "Points of the flight's polyline."
 
 
-def keys_around(answer: Answer, gallery: GalleryMap) -> list[str]:
+def nearby_keys(answer: Answer, gallery: GalleryMap) -> list[str]:
     """The gallery images that the map around an answer may show."""
     if answer.position is None:
         return []
     return [
         str(gallery.keys[number])
-        for number in gallery.nearest(answer.position.lat, answer.position.lon, TILES)
+        for number in gallery.nearest(answer.position.lat, answer.position.lon, MAX_TILES)
     ]
 
 
-def place_map(
+def position_map(
     answer: Answer, gallery: GalleryMap, footprints: Mapping[str, Footprint]
-) -> View | None:
+) -> MapView | None:
     """The surroundings of an answer, drawn with the gallery's own images; None without a position."""
     position = answer.position
     if position is None:
         return None
     spacing = gallery.spacing_m or position.radius_m or 1.0
-    half_m = max(STEPS * spacing, 1.3 * position.radius_m)
-    frame = Frame(lat=position.lat, lon=position.lon, half_m=half_m)
+    half_m = max(MAP_HALF_SPACINGS * spacing, 1.3 * position.radius_m)
+    frame = MapFrame(lat=position.lat, lon=position.lon, half_m=half_m)
     tiles = []
-    for number in gallery.nearest(position.lat, position.lon, TILES).tolist():
+    for number in gallery.nearest(position.lat, position.lon, MAX_TILES).tolist():
         key, (lat, lon) = str(gallery.keys[number]), gallery.places_N2[number].tolist()
         corners_32 = frame.pixels(
-            np.array(footprints.get(key) or square(lat, lon, 0.96 * spacing))[[0, 1, 3]]
+            np.array(footprints.get(key) or square_footprint(lat, lon, 0.96 * spacing))[[0, 1, 3]]
         )
-        if (corners_32.max(axis=0) > 0).all() and (corners_32.min(axis=0) < SIDE).all():
-            tiles.append(Tile(key=key, matrix=matrix(corners_32)))
+        if (corners_32.max(axis=0) > 0).all() and (corners_32.min(axis=0) < MAP_SIDE_PX).all():
+            tiles.append(MapTile(key=key, matrix=svg_matrix(corners_32)))
     (x, y), *_ = frame.pixels(np.array([[position.lat, position.lon]])).tolist()
-    return View(
+    return MapView(
         frame=frame,
         tiles=tuple(reversed(tiles)),
         marks=tuple(candidate_marks(answer, frame)),
@@ -131,24 +133,24 @@ def place_map(
     )
 
 
-def overview(
+def overview_map(
     answers: Sequence[tuple[str, Answer]], gallery: GalleryMap, track: bool
-) -> View | None:
+) -> MapView | None:
     """All of the gallery as dots, with a mark for each answer that is known; None where no position
     is known.
     """
-    known_N2 = gallery.places_N2[~np.isnan(gallery.places_N2).any(axis=1)][:DOTS]
+    known_N2 = gallery.places_N2[~np.isnan(gallery.places_N2).any(axis=1)][:MAX_DOTS]
     if not len(known_N2):
         return None
     found = [(name, one.position) for name, one in answers if one.known and one.position]
     at_M2 = np.array([(position.lat, position.lon) for _, position in found]).reshape(-1, 2)
-    frame = frame_of(np.concatenate([known_N2, at_M2]))
+    frame = fit_frame(np.concatenate([known_N2, at_M2]))
     points_M2 = frame.pixels(at_M2)
-    return View(
+    return MapView(
         frame=frame,
         dots=tuple(map(tuple, frame.pixels(known_N2).round(1).tolist())),
         marks=tuple(
-            Mark(x=x, y=y, label="", title=name, kind="answer")
+            MapMark(x=x, y=y, label="", title=name, kind="answer")
             for (name, _), (x, y) in zip(found, points_M2.tolist(), strict=True)
         ),
         line=" ".join(f"{x:.1f},{y:.1f}" for x, y in points_M2.tolist()) if track else "",
@@ -156,31 +158,31 @@ def overview(
     )
 
 
-def frame_of(places_N2: Doubles) -> Frame:
+def fit_frame(places_N2: Doubles) -> MapFrame:
     """The square around positions; N >= 1. Around the first one, so that the meridian of 180
     degrees is no border.
     """
     lon_N = (places_N2[:, 1] - places_N2[0, 1] + 180) % 360 - 180
     lat = float((places_N2[:, 0].min() + places_N2[:, 0].max()) / 2)
     lon = float((lon_N.min() + lon_N.max()) / 2 + places_N2[0, 1] + 180) % 360 - 180
-    half = Frame(lat=lat, lon=lon, half_m=SIDE / 2)  # a pixel is a metre
-    return Frame(
+    half = MapFrame(lat=lat, lon=lon, half_m=MAP_SIDE_PX / 2)  # a pixel is a metre
+    return MapFrame(
         lat=lat,
         lon=lon,
-        half_m=1.06 * max(float(np.abs(half.pixels(places_N2) - SIDE / 2).max()), 10.0),
+        half_m=1.06 * max(float(np.abs(half.pixels(places_N2) - MAP_SIDE_PX / 2).max()), 10.0),
     )
 
 
-def candidate_marks(answer: Answer, frame: Frame) -> list[Mark]:
+def candidate_marks(answer: Answer, frame: MapFrame) -> list[MapMark]:
     """The candidates that lie within a map, numbered by rank."""
     marks = []
     for rank, hit in enumerate(answer.candidates, 1):
         if hit.lat is None or hit.lon is None:
             continue
         x, y = frame.pixels(np.array([[hit.lat, hit.lon]]))[0].tolist()
-        if 0 <= x <= SIDE and 0 <= y <= SIDE:
+        if 0 <= x <= MAP_SIDE_PX and 0 <= y <= MAP_SIDE_PX:
             marks.append(
-                Mark(
+                MapMark(
                     x=x,
                     y=y,
                     label=str(rank),
@@ -191,11 +193,11 @@ def candidate_marks(answer: Answer, frame: Frame) -> list[Mark]:
     return marks
 
 
-def square(lat: float, lon: float, side_m: float) -> Footprint:
+def square_footprint(lat: float, lon: float, side_m: float) -> Footprint:
     """Corners, from the upper left clockwise, of a square of ground with its sides to the north and
     east.
     """
-    north = math.degrees(side_m / 2 / EARTH_M)
+    north = math.degrees(side_m / 2 / EARTH_RADIUS_M)
     east = north / max(math.cos(math.radians(lat)), 1e-6)
     return (
         (lat + north, lon - east),
@@ -205,7 +207,7 @@ def square(lat: float, lon: float, side_m: float) -> Footprint:
     )
 
 
-def matrix(corners_32: Doubles) -> str:
+def svg_matrix(corners_32: Doubles) -> str:
     """The transform that brings (0, 0), (1, 0), (0, 1) to three corners: upper left, upper right,
     lower left.
     """

@@ -13,8 +13,8 @@ from datetime import UTC, datetime
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.images.camera_tags import read_tags
-from pipeline.images.image_blocks import UnreadableTag, find_blocks
-from pipeline.images.inspect import is_image
+from pipeline.images.image_blocks import UnreadableTag, find_metadata
+from pipeline.images.inspect import is_image_name
 
 
 def find_photos(named: Sequence[str]) -> list[str]:
@@ -26,7 +26,7 @@ def find_photos(named: Sequence[str]) -> list[str]:
     photos: dict[str, None] = {}
     for path in named:
         if storage.is_folder(path):
-            found = [storage.join(path, name) for name in storage.walk(path) if is_image(name)]
+            found = [storage.join(path, name) for name in storage.walk(path) if is_image_name(name)]
             if not found:
                 raise InputError(
                     f"no images below {path}; expected a folder of photos; name another"
@@ -43,20 +43,20 @@ def find_photos(named: Sequence[str]) -> list[str]:
     return list(photos)
 
 
-def folder_of(photo: str) -> str:
+def parent_folder(photo: str) -> str:
     """The folder that a photo lies in."""
     return photo.rpartition("/")[0] or "."
 
 
-def taken_at(data: bytes) -> str | None:
+def read_taken_at(data: bytes) -> str | None:
     """When the camera says that it took a photo, ISO 8601; None where it does not say."""
     try:
-        return read_tags(find_blocks(data, whole=True)).taken_at
+        return read_tags(find_metadata(data, whole=True)).taken_at
     except UnreadableTag:
         return None
 
 
-def seconds(said: str) -> float:
+def parse_time(said: str) -> float:
     """Seconds since 1970 of an ISO 8601 time, or of a plain number of seconds. Without an offset it
     is taken for UTC: within a flight only differences count.
 
@@ -103,7 +103,7 @@ def read_times(path: str, photos: Sequence[str]) -> dict[str, str]:
                 f"{path} says nothing of {photo}; expected a time for each photo; add a row for it"
             )
         try:
-            seconds(time)
+            parse_time(time)
         except ValueError:
             raise InputError(
                 f"{path} says {time!r} of {photo}; expected seconds or an ISO 8601 time such as 2026-11-24T09:30:00"

@@ -13,12 +13,12 @@ import numpy as np
 
 from pipeline.core.arrays import Doubles
 
-BINS = 10
-SIDE, EDGE = 260, 56
+BIN_COUNT = 10
+DIAGRAM_SIDE, DIAGRAM_MARGIN = 260, 56
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bin:
+class ReliabilityBin:
     """Examples with much the same probability."""
 
     said: float
@@ -29,9 +29,9 @@ class Bin:
     "Of all examples, by weight."
 
 
-def reliability(said_N: Doubles, true_N: Doubles, weight_N: Doubles) -> list[Bin]:
+def reliability_bins(said_N: Doubles, true_N: Doubles, weight_N: Doubles) -> list[ReliabilityBin]:
     """The bins of equal width from 0 to 1 that hold any example."""
-    bin_N = np.minimum((said_N * BINS).astype(np.int64), BINS - 1)
+    bin_N = np.minimum((said_N * BIN_COUNT).astype(np.int64), BIN_COUNT - 1)
     bins = []
     for number in np.unique(bin_N):
         inside_N = bin_N == number
@@ -39,32 +39,34 @@ def reliability(said_N: Doubles, true_N: Doubles, weight_N: Doubles) -> list[Bin
         said, seen = (
             float(np.average(values[inside_N], weights=weight)) for values in (said_N, true_N)
         )
-        bins.append(Bin(said=said, seen=seen, share=float(weight.sum() / weight_N.sum())))
+        bins.append(
+            ReliabilityBin(said=said, seen=seen, share=float(weight.sum() / weight_N.sum()))
+        )
     return bins
 
 
-def calibration_error(bins: Sequence[Bin]) -> float:
+def expected_calibration_error(bins: Sequence[ReliabilityBin]) -> float:
     """Expected calibration error: mean distance of said and seen, by the bins' shares (Naeini et
     al. 2015).
     """
     return sum(one.share * abs(one.said - one.seen) for one in bins)
 
 
-def diagram(bins: Sequence[Bin], title: str) -> str:
+def reliability_diagram(bins: Sequence[ReliabilityBin], title: str) -> str:
     """The reliability diagram: a dot per bin over the probability said, its area the share of
     examples; true is the line.
     """
-    inner = SIDE - EDGE
+    inner = DIAGRAM_SIDE - DIAGRAM_MARGIN
 
     def x(value: float) -> str:
-        return f"{EDGE + value * inner:.1f}"
+        return f"{DIAGRAM_MARGIN + value * inner:.1f}"
 
     def y(value: float) -> str:
         return f"{inner + 10 - value * inner:.1f}"
 
     ticks = "".join(
         f'<text x="{x(at)}" y="{inner + 27}" text-anchor="middle">{at:g}</text>'
-        f'<text x="{EDGE - 7}" y="{y(at)}" dy="4" text-anchor="end">{at:g}</text>'
+        f'<text x="{DIAGRAM_MARGIN - 7}" y="{y(at)}" dy="4" text-anchor="end">{at:g}</text>'
         for at in (0, 0.25, 0.5, 0.75, 1)
     )
     dots = "".join(
@@ -73,7 +75,7 @@ def diagram(bins: Sequence[Bin], title: str) -> str:
         for one in bins
     )
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {SIDE + 20} {inner + 56}" width="{2 * SIDE}" role="img" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {DIAGRAM_SIDE + 20} {inner + 56}" width="{2 * DIAGRAM_SIDE}" role="img" '
         f'aria-label="{html.escape(title)}" font-family="sans-serif" font-size="11" fill="#5d666f">'
         f'<rect width="100%" height="100%" fill="#fff"/><rect x="{x(0)}" y="{y(1)}" width="{inner}" height="{inner}" '
         f'fill="none" stroke="#e3e0d8"/><path d="M{x(0)} {y(0)}L{x(1)} {y(1)}" stroke="#5d666f" stroke-dasharray="3 4"/>'

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.core.arrays import Doubles, Whole
+from pipeline.core.arrays import Doubles, Ints
 from pipeline.core.errors import InputError
-from pipeline.core.geo import EARTH_M, on_sphere
+from pipeline.core.geo import EARTH_RADIUS_M, on_sphere
 
-TRACKED = 30
+TRACK_CANDIDATES = 30
 """Candidates of a photo that the track may pass through. More than decide on a single answer: the
 flight tells them apart, and what has not been found cannot be chosen."""
 Combine = Callable[[Doubles], Doubles]
@@ -41,7 +41,7 @@ class Motion:
     "Of the gallery: a square of this side for each place."
     elsewhere: float = 0.1
     "Share of the photos that are expected to show no place of the gallery."
-    remembered: int = 60
+    max_gap_photos: int = 60
     """Photos over which the limit holds: with as many between two places, the UAV may have come
     from anywhere, and mostly could have. It bounds the time that a long flight takes."""
 
@@ -62,7 +62,7 @@ class Motion:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Photo:
+class TrackPhoto:
     """One photo of the flight."""
 
     time_s: float
@@ -76,7 +76,7 @@ class Photo:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Start:
+class TrackStart:
     """Where the flight roughly began, at the first photo's time."""
 
     lat: float
@@ -85,7 +85,7 @@ class Start:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Smoothed:
+class SmoothedPhoto:
     """What the flight says of one photo."""
 
     chosen: int | None
@@ -97,18 +97,20 @@ class Smoothed:
     "Of each candidate, likewise."
 
 
-def smooth(photos: Sequence[Photo], motion: Motion, start: Start | None = None) -> list[Smoothed]:
+def smooth_track(
+    photos: Sequence[TrackPhoto], motion: Motion, start: TrackStart | None = None
+) -> list[SmoothedPhoto]:
     """The likeliest track through photos that are in time order.
 
     A chain's weight is the product of its photos' chances and of what the ways between them gain;
     one that is faster than the motion allows has none. Takes time for all pairs of candidates
-    within `remembered` photos.
+    within `max_gap_photos` photos.
     """
     if not photos:
         return []
-    flight = _Flight.of(photos, start, motion)
-    best_N, came_from_N = flight.forward(lambda x_MK: x_MK.max(axis=0), trace=True)
-    chosen = flight.traced(best_N, came_from_N)
+    flight = _Trellis.of(photos, start, motion)
+    best_N, predecessor_N = flight.forward(lambda x_MK: x_MK.max(axis=0), trace=True)
+    chosen = flight.backtrace(best_N, predecessor_N)
     before_N, _ = flight.forward(_logsum)
     after_N = flight.backward()
     total = _logsum(np.concatenate([[0.0], before_N])[:, None])[0]
@@ -118,12 +120,12 @@ def smooth(photos: Sequence[Photo], motion: Motion, start: Start | None = None) 
         chance_K = chance_N[begin:end]
         at = chosen[number]
         probability = max(0.0, 1 - chance_K.sum()) if at is None else float(chance_K[at])
-        smoothed.append(Smoothed(chosen=at, probability=float(probability), chance_K=chance_K))
+        smoothed.append(SmoothedPhoto(chosen=at, probability=float(probability), chance_K=chance_K))
     return smoothed
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Flight:
+class _Trellis:
     """All candidates in one row. A chain's weight is told against that of the chain that passes
     over all photos, which is 1; so a photo passed over costs nothing, and a candidate gains its
     chance over that of elsewhere."""
@@ -138,7 +140,7 @@ class _Flight:
     motion: Motion
 
     @staticmethod
-    def of(photos: Sequence[Photo], start: Start | None, motion: Motion) -> "_Flight":
+    def of(photos: Sequence[TrackPhoto], start: TrackStart | None, motion: Motion) -> "_Trellis":
         ends = np.cumsum([len(photo.log_chance_K) for photo in photos]).tolist()
         place_N2 = np.concatenate([photo.places_K2.reshape(-1, 2) for photo in photos])
         gain_N = np.concatenate([photo.log_chance_K - photo.log_elsewhere for photo in photos])
@@ -150,9 +152,9 @@ class _Flight:
             begun_13 = on_sphere(np.array([[start.lat, start.lon]]))
             way_N = start.radius_m + motion.slack_m + motion.max_speed * (time_N - photos[0].time_s)
             entry_N = np.where(
-                _reach(begun_13, point_N3, way_N[None])[0], motion.gain(way_N), -np.inf
+                _within_reach(begun_13, point_N3, way_N[None])[0], motion.gain(way_N), -np.inf
             )
-        return _Flight(
+        return _Trellis(
             point_N3=point_N3,
             time_N=time_N,
             gain_N=np.where(np.isnan(place_N2).any(axis=1), -np.inf, gain_N),
@@ -170,22 +172,22 @@ class _Flight:
             + self.motion.slack_m
         )
         return np.where(
-            _reach(self.point_N3[some], self.point_N3[others], way_MK),
+            _within_reach(self.point_N3[some], self.point_N3[others], way_MK),
             self.motion.gain(way_MK),
             -np.inf,
         )
 
-    def forward(self, combine: Combine, trace: bool = False) -> tuple[Doubles, Whole]:
+    def forward(self, combine: Combine, trace: bool = False) -> tuple[Doubles, Ints]:
         """Weight of the chains up to and with each candidate, and for `trace` the candidate before
         it (-1: none).
         """
-        weight_N, came_from_N = np.full(len(self.gain_N), -np.inf), np.full(len(self.gain_N), -1)
+        weight_N, predecessor_N = np.full(len(self.gain_N), -np.inf), np.full(len(self.gain_N), -1)
         for number, (begin, end) in enumerate(self.spans):
-            first = self.spans[max(0, number - self.motion.remembered)][0]
+            first = self.spans[max(0, number - self.motion.max_gap_photos)][0]
             near_MK = weight_N[first:begin, None] + self.flown(
                 slice(first, begin), slice(begin, end)
             )
-            far_1K = np.full((1, end - begin), _whole(combine, weight_N[:first]))
+            far_1K = np.full((1, end - begin), _combine_all(combine, weight_N[:first]))
             to_MK = np.concatenate(
                 [near_MK, far_1K, self.entry_N[None, begin:end]]
             )  # the last row: nothing came before
@@ -193,26 +195,26 @@ class _Flight:
             if trace and end > begin:
                 last_K = first + to_MK.argmax(axis=0)
                 far = int(weight_N[:first].argmax()) if first else -1
-                came_from_N[begin:end] = np.where(
+                predecessor_N[begin:end] = np.where(
                     last_K < begin, last_K, np.where(last_K == begin, far, -1)
                 )
-        return weight_N, came_from_N
+        return weight_N, predecessor_N
 
     def backward(self) -> Doubles:
         """Weight of what may follow each candidate, nothing included."""
         weight_N = np.zeros(len(self.gain_N))
         for number in range(len(self.spans) - 1, -1, -1):
             begin, end = self.spans[number]
-            last = self.spans[min(len(self.spans) - 1, number + self.motion.remembered)][1]
+            last = self.spans[min(len(self.spans) - 1, number + self.motion.max_gap_photos)][1]
             follow_N = self.gain_N[end:] + weight_N[end:]
             near_MK = follow_N[: last - end, None] + self.flown(slice(end, last), slice(begin, end))
-            far_1K = np.full((1, end - begin), _whole(_logsum, follow_N[last - end :]))
+            far_1K = np.full((1, end - begin), _combine_all(_logsum, follow_N[last - end :]))
             weight_N[begin:end] = _logsum(
                 np.concatenate([near_MK, far_1K, np.zeros((1, end - begin))])
             )
         return weight_N
 
-    def traced(self, best_N: Doubles, came_from_N: Whole) -> list[int | None]:
+    def backtrace(self, best_N: Doubles, predecessor_N: Ints) -> list[int | None]:
         """For each photo the number of its candidate in the best chain."""
         chosen: list[int | None] = [None] * len(self.spans)
         at = int(best_N.argmax()) if len(best_N) and best_N.max() > 0 else -1
@@ -220,20 +222,20 @@ class _Flight:
             begin, end = self.spans[number]
             if begin <= at < end:
                 chosen[number] = at - begin
-                at = int(came_from_N[at])
+                at = int(predecessor_N[at])
         return chosen
 
 
-def _reach(some_M3: Doubles, others_K3: Doubles, way_MK: Doubles) -> npt.NDArray[np.bool_]:
+def _within_reach(some_M3: Doubles, others_K3: Doubles, way_MK: Doubles) -> npt.NDArray[np.bool_]:
     """Whether great circles between points are at most that long; by their chords, which a matrix
     product gives.
     """
-    squared_MK = 2 * (EARTH_M**2 - some_M3 @ others_K3.T)
-    chord_MK = 2 * EARTH_M * np.sin(np.minimum(way_MK / (2 * EARTH_M), np.pi / 2))
+    squared_MK = 2 * (EARTH_RADIUS_M**2 - some_M3 @ others_K3.T)
+    chord_MK = 2 * EARTH_RADIUS_M * np.sin(np.minimum(way_MK / (2 * EARTH_RADIUS_M), np.pi / 2))
     return np.asarray(squared_MK <= chord_MK**2 + 1.0)  # a metre's square: the product's rounding
 
 
-def _whole(combine: Combine, weight_M: Doubles) -> float:
+def _combine_all(combine: Combine, weight_M: Doubles) -> float:
     """All of them as one; -inf of none."""
     return float(combine(weight_M[:, None])[0]) if len(weight_M) else -math.inf
 

@@ -17,7 +17,7 @@ from PIL import Image
 
 from pipeline.core import storage
 from pipeline.images.decode import DecodeError, decode
-from pipeline.images.thumbnails import Pictures
+from pipeline.images.thumbnails import ImageLoader
 from pipeline.report import figure_charts
 from pipeline.report.error_map import error_map
 from pipeline.report.inputs import Extras, Findings, Format
@@ -47,7 +47,7 @@ NO_DATES = {"png": {"Software": None}, "pdf": {"CreationDate": None}}
 
 
 def write_figures(
-    findings: Findings, pictures: Pictures, folder: str, formats: tuple[Format, ...]
+    findings: Findings, pictures: ImageLoader, folder: str, formats: tuple[Format, ...]
 ) -> list[str]:
     """Write every figure that the evaluation has data for into `folder`; returns their names
     without endings.

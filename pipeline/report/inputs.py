@@ -89,7 +89,7 @@ def read_findings(folder: str) -> Findings:
     path = storage.join(folder, RESULTS)
     try:
         results = parquet.read_table(path)
-    except parquet.DAMAGE as error:
+    except parquet.DAMAGE_ERRORS as error:
         raise InputError(
             f"{path} cannot be read ({error}), expected the rows of a finished evaluation; delete {folder} and evaluate again "
             "with jobs/evaluate.py"

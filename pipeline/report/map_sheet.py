@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.core.arrays import Doubles
-from pipeline.core.geo import EARTH_M
+from pipeline.core.geo import EARTH_RADIUS_M
 from pipeline.report.svg import Tick, nice_ticks
 
 WIDTH, HEIGHT, MARGIN = 520, 360, 22
 SMALLEST_M = 100.0  # across: a single place gets a map too
 GRID_FROM_M = 50_000.0  # meridians and parallels mean something from here on
-METRES_PER_DEGREE = EARTH_M * math.pi / 180
+METRES_PER_DEGREE = EARTH_RADIUS_M * math.pi / 180
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ from typing import Any
 import jinja2
 
 from pipeline.features.table import Floats
-from pipeline.images.thumbnails import Album, Pictures
+from pipeline.images.thumbnails import ImageLoader, ThumbnailCache
 from pipeline.report import charts, map_sheet, svg
 from pipeline.report.charts import scatter, scores_chart, views_chart
 from pipeline.report.error_map import distance_chart, error_map
@@ -37,7 +37,7 @@ OPENED = (
 def render(
     findings: Findings,
     extras: Extras,
-    pictures: Pictures,
+    pictures: ImageLoader,
     vectors: Vectors = no_vectors,
     panels: int = PANELS,
 ) -> str:
@@ -80,7 +80,7 @@ def render(
     choices = choose(tasks, panels)
     keys = sorted(set[str]().union(*(choice.keys for choice in choices)))
     parts = {row["task"]: row["parts"] for row in findings.parts}
-    album, known = Album(pictures(keys)), vectors(keys) if parts else {}
+    album, known = ThumbnailCache(pictures(keys)), vectors(keys) if parts else {}
     maps = [error_map(task.name, task.rows) for task in single]
     return environment.get_template("report.html").render(
         title=extras.title,
@@ -106,7 +106,7 @@ def render(
 
 
 def _section(
-    choice: Choice, album: Album, known: Mapping[str, Floats], parts: int
+    choice: Choice, album: ThumbnailCache, known: Mapping[str, Floats], parts: int
 ) -> dict[str, Any]:
     """A task's panels."""
     hits, misses = (

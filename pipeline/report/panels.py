@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline.features.table import Floats
-from pipeline.images.thumbnails import ANSWER_PX, QUERY_PX, Album
+from pipeline.images.thumbnails import ANSWER_PX, QUERY_PX, ThumbnailCache
 from pipeline.retrieval.parts import cosines_by_part
 from pipeline.retrieval.subsets import evenly
 
@@ -92,10 +92,10 @@ def keys_shown(rows: Iterable[Mapping[str, Any]]) -> set[str]:
 
 
 def make_panel(
-    row: Mapping[str, Any], album: Album, vectors: Mapping[str, Floats] | None = None, parts: int = 1,
+    row: Mapping[str, Any], album: ThumbnailCache, vectors: Mapping[str, Floats] | None = None, parts: int = 1,
     merged: Sequence[str] = (),
 ) -> Panel:  # fmt: skip
-    """One query's panel. `vectors`: embeddings (D,) by key, of `parts` parts; `merged`: keys of the
+    """One query's panel. `vectors`: embeddings (D,) by key, of `parts` parts; `merge_results`: keys of the
     images that the query is the mean of."""
 
     def answer(rank: int, key: str, location: str, score: float) -> Answer:

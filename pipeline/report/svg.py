@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.core.arrays import Whole
+from pipeline.core.arrays import Ints
 from pipeline.retrieval.metrics import one_percent, recall_at
 
 WIDTH, HEIGHT = 340, 190
@@ -113,14 +113,14 @@ def training_charts(rows: Sequence[Mapping[str, Any]]) -> list[Chart]:
 
 
 def recall_chart(
-    title: str, note: str, first_Q: Whole, gallery: int, beside_Q: Whole | None, beside_name: str
+    title: str, note: str, first_Q: Ints, gallery: int, beside_Q: Ints | None, beside_name: str
 ) -> Chart:
     """Recall@K over K on a logarithmic axis, with dots at K = 1, 5, 10 and the top 1 %."""
     frame = Frame(0, max(math.log10(gallery), 0.3), 0, 1)
     ks = sorted({min(gallery, round(k)) for k in np.geomspace(1, max(gallery, 1), CURVE_POINTS)})
     named = {k for k in (1, 5, 10, one_percent(gallery)) if k <= gallery}
 
-    def points(first: Whole, among: Iterable[int]) -> list[Point]:
+    def points(first: Ints, among: Iterable[int]) -> list[Point]:
         return [(math.log10(k), recall_at(k, first)) for k in among]
 
     dots = [(x, y, f"R@{10**x:.0f}: {100 * y:.2f} %") for x, y in points(first_Q, sorted(named))]

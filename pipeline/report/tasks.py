@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.core.arrays import Whole
+from pipeline.core.arrays import Ints
 from pipeline.report.inputs import Extras
 from pipeline.report.panels import MOSAIC, distance, is_hit, keys_shown, spread, sureness
 from pipeline.report.svg import Chart, recall_chart
@@ -87,7 +87,7 @@ def _recall_chart(
     )
 
 
-def first_ranks(rows: list[dict[str, Any]]) -> Whole:
+def first_ranks(rows: list[dict[str, Any]]) -> Ints:
     """Rank of each query's best true match (Q,); 0 where it has none."""
     return np.array([row["first_match_rank"] or 0 for row in rows], np.int64)
 

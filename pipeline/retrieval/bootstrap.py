@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.core.arrays import Doubles, Whole, Words
+from pipeline.core.arrays import Doubles, Ints, Strings
 from pipeline.retrieval import metrics
 
 
-def measures_of(first_Q: Whole, ap_Q: Doubles, locations_Q: Words) -> dict[str, Any]:
+def measures_of(first_Q: Ints, ap_Q: Doubles, locations_Q: Strings) -> dict[str, Any]:
     """R@1, R@5 and AP of some queries, the first and the last with 95 % intervals; how many they
     are, of how many places.
     """
@@ -54,7 +54,7 @@ class Difference:
 
 
 def resampled_means(
-    values_QM: Doubles, locations_Q: Words, samples: int = SAMPLES, seed: int = SEED
+    values_QM: Doubles, locations_Q: Strings, samples: int = SAMPLES, seed: int = SEED
 ) -> Doubles:
     """Means (S, M) over queries of locations drawn with replacement, as many as there are.
 
@@ -77,7 +77,7 @@ def resampled_means(
 
 
 def intervals(
-    values_QM: Doubles, locations_Q: Words, samples: int = SAMPLES, seed: int = SEED
+    values_QM: Doubles, locations_Q: Strings, samples: int = SAMPLES, seed: int = SEED
 ) -> Doubles:
     """The 95 % percentile interval of each measure's mean, (2, M): low, high. NaN without queries."""
     if not len(values_QM):
@@ -89,7 +89,7 @@ def intervals(
 def paired(
     run_Q: Doubles,
     baseline_Q: Doubles,
-    locations_Q: Words,
+    locations_Q: Strings,
     samples: int = SAMPLES,
     seed: int = SEED,
 ) -> Difference:

@@ -23,7 +23,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.core.arrays import Doubles, Whole
+from pipeline.core.arrays import Doubles, Ints
 from pipeline.core.errors import InputError
 from pipeline.features.table import Floats
 
@@ -107,7 +107,7 @@ def exact_pairs(one_PD: Floats, other_PD: Floats) -> Floats:
     return doubled.astype(np.float32)
 
 
-def exact_entries(queries_QD: Floats, gallery_BD: Floats, flat_N: Whole) -> Floats:
+def exact_entries(queries_QD: Floats, gallery_BD: Floats, flat_N: Ints) -> Floats:
     """Scores of chosen entries of a block (Q, B), given by ascending flat index."""
     query_N, row_N = np.divmod(flat_N, len(gallery_BD))
     starts = np.flatnonzero(np.diff(query_N, prepend=-1))
@@ -128,9 +128,9 @@ def exact_entries(queries_QD: Floats, gallery_BD: Floats, flat_N: Whole) -> Floa
 
 
 def settle(
-    scores_QB: Floats, owner_P: Whole, score_P: Floats, bounds_P: tuple[Floats, Floats], floor_Q: Floats,
-    exact: Callable[[Whole], Floats],
-) -> tuple[Whole, Floats, Whole]:  # fmt: skip
+    scores_QB: Floats, owner_P: Ints, score_P: Floats, bounds_P: tuple[Floats, Floats], floor_Q: Floats,
+    exact: Callable[[Ints], Floats],
+) -> tuple[Ints, Floats, Ints]:  # fmt: skip
     """A block's part in the ranking: flat indices of its entries in doubt (N,), their exact scores
     (N,), and for each match the entries of its query that score as it does or better (P,).
 
@@ -156,10 +156,10 @@ def settle(
 
 
 def _settle_few(
-    scores_QB: Floats, flat_C: Whole, owner_P: Whole, score_P: Floats, bounds_P: tuple[Floats, Floats], floor_Q: Floats,
-    exact: Callable[[Whole], Floats],
-) -> tuple[Whole, Floats, Whole]:  # fmt: skip
-    """`settle` from the C entries alone that reach their query's lowest bound."""
+    scores_QB: Floats, flat_C: Ints, owner_P: Ints, score_P: Floats, bounds_P: tuple[Floats, Floats], floor_Q: Floats,
+    exact: Callable[[Ints], Floats],
+) -> tuple[Ints, Floats, Ints]:  # fmt: skip
+    """`apply_track` from the C entries alone that reach their query's lowest bound."""
     score_C, query_C = scores_QB.reshape(-1)[flat_C], flat_C // scores_QB.shape[1]
     doubt_C = score_C >= floor_Q[query_C]
     for low_Q1, high_Q1 in zip(
@@ -177,8 +177,8 @@ def _settle_few(
 
 
 def doubtful(
-    scores_QB: Floats, owner_P: Whole, low_P: Floats, high_P: Floats, floor_Q: Floats
-) -> Whole:
+    scores_QB: Floats, owner_P: Ints, low_P: Floats, high_P: Floats, floor_Q: Floats
+) -> Ints:
     """Flat indices, ascending, of the entries within [low, high] of a match of their query or at
     its floor and above.
     """
@@ -212,7 +212,7 @@ def doubtful(
     return np.flatnonzero(doubt_QB)
 
 
-def count_ahead(scores_QB: Floats, owner_P: Whole, score_P: Floats) -> Whole:
+def count_ahead(scores_QB: Floats, owner_P: Ints, score_P: Floats) -> Ints:
     """For each match, the entries of its query that score as it does or better (P,)."""
     if _most(owner_P) < SORT_FROM:
         ahead_MQ = np.zeros((_most(owner_P), len(scores_QB)), np.int64)
@@ -228,7 +228,7 @@ def count_ahead(scores_QB: Floats, owner_P: Whole, score_P: Floats) -> Whole:
     return ahead_P
 
 
-def order_keys(scores: Floats) -> Whole:
+def order_keys(scores: Floats) -> Ints:
     """Integers that order as the scores do, in the upper 32 bits of 64."""
     bits = (scores + np.float32(0)).view(np.int32)  # + 0 makes -0 and 0 one score
     bits ^= (
@@ -237,14 +237,14 @@ def order_keys(scores: Floats) -> Whole:
     return bits.astype(np.int64) << 32
 
 
-def scores_of(keys: Whole) -> Floats:
+def scores_of(keys: Ints) -> Floats:
     """The scores that keys were made from; where there is no key, minus infinity."""
     bits = (keys >> 32).astype(np.int32)
     scores = (bits ^ ((bits >> 31) & 0x7FFFFFFF)).view(np.float32)
     return np.where(keys == NO_KEY, np.float32(-np.inf), scores)
 
 
-def merged(best_QK: Whole, owner_N: Whole, key_N: Whole) -> Whole:
+def merged(best_QK: Ints, owner_N: Ints, key_N: Ints) -> Ints:
     """The K highest keys of each query, ascending, out of the best so far (Q, K) and new ones whose
     owners ascend.
     """
@@ -255,17 +255,17 @@ def merged(best_QK: Whole, owner_N: Whole, key_N: Whole) -> Whole:
     return np.sort(np.concatenate([best_QK, new_QN], axis=1), axis=1)[:, new_QN.shape[1] :]
 
 
-def _most(owner_P: Whole) -> int:
+def _most(owner_P: Ints) -> int:
     return int(np.bincount(owner_P).max(initial=0))
 
 
-def _nth(owner_P: Whole) -> Whole:
+def _nth(owner_P: Ints) -> Ints:
     """Place of each entry among those of its owner, from 0."""
     count = np.bincount(owner_P)
     return np.asarray(np.arange(len(owner_P)) - (np.cumsum(count) - count)[owner_P])
 
 
-def _columns(owner_P: Whole, value_P: Floats, queries: int) -> list[Floats]:
+def _columns(owner_P: Ints, value_P: Floats, queries: int) -> list[Floats]:
     """The first, second, ... value of each query as columns (Q, 1); infinity where it has fewer."""
     columns_MQ1 = np.full((_most(owner_P), queries, 1), np.inf, np.float32)
     columns_MQ1[_nth(owner_P), owner_P, 0] = value_P

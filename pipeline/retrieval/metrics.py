@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core.arrays import Doubles, Whole
+from pipeline.core.arrays import Doubles, Ints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ class Scores:
     "Mean average precision."
 
 
-def first_match_ranks(ranks_P: Whole, owner_P: Whole, queries: int) -> Whole:
+def first_match_ranks(ranks_P: Ints, owner_P: Ints, queries: int) -> Ints:
     """Best rank of a true match, for each query (Q,); 0 where it has none."""
     best_Q = np.full(queries, np.iinfo(np.int64).max, np.int64)
     np.minimum.at(best_Q, owner_P, ranks_P)
@@ -40,14 +40,14 @@ def first_match_ranks(ranks_P: Whole, owner_P: Whole, queries: int) -> Whole:
     return best_Q
 
 
-def hits_at(k: int, first_Q: Whole) -> Doubles:
+def hits_at(k: int, first_Q: Ints) -> Doubles:
     """1 where a query has a true match among the first K, else 0 (Q,). `first_Q` from
     `first_match_ranks`.
     """
     return np.asarray((first_Q > 0) & (first_Q <= k), np.float64)
 
 
-def recall_at(k: int, first_Q: Whole) -> float:
+def recall_at(k: int, first_Q: Ints) -> float:
     """Recall@K: the share of queries with a true match among the first K."""
     return float(np.mean(hits_at(k, first_Q))) if len(first_Q) else 0.0
 
@@ -62,7 +62,7 @@ def one_percent(gallery: int) -> int:
     return round(0.01 * gallery) + 1
 
 
-def average_precisions(ranks_P: Whole, owner_P: Whole, queries: int) -> Doubles:
+def average_precisions(ranks_P: Ints, owner_P: Ints, queries: int) -> Doubles:
     """Average precision of each query (Q,): the area under its precision-recall curve by
     trapezoids.
 
@@ -79,14 +79,14 @@ def average_precisions(ranks_P: Whole, owner_P: Whole, queries: int) -> Doubles:
     return np.asarray(total_Q / np.maximum(count_Q, 1), np.float64)
 
 
-def chance(matches_Q: Whole, gallery: int) -> float:
+def chance(matches_Q: Ints, gallery: int) -> float:
     """R@1 of a ranking drawn by lot: the share of the gallery that is right, averaged over the
     queries.
     """
     return float(np.mean(matches_Q / gallery)) if len(matches_Q) and gallery else 0.0
 
 
-def per_query(first_Q: Whole, ap_Q: Doubles, gallery: int) -> Doubles:
+def per_query(first_Q: Ints, ap_Q: Doubles, gallery: int) -> Doubles:
     """What `summarise` takes the means of: hits at 1, 5, 10 and the top 1 %, and average precision
     (Q, 5).
     """
@@ -95,7 +95,7 @@ def per_query(first_Q: Whole, ap_Q: Doubles, gallery: int) -> Doubles:
     )
 
 
-def summarise(first_Q: Whole, ap_Q: Doubles, gallery: int) -> Scores:
+def summarise(first_Q: Ints, ap_Q: Doubles, gallery: int) -> Scores:
     """The measures of one task from its queries' first ranks and average precisions."""
     return Scores(
         r1=recall_at(1, first_Q),

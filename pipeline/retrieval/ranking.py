@@ -20,8 +20,8 @@ import numpy as np
 import ray
 
 from pipeline.core import cluster
-from pipeline.core.arrays import Doubles, Whole, Words
-from pipeline.core.prefetch import ready
+from pipeline.core.arrays import Doubles, Ints, Strings
+from pipeline.core.prefetch import prefetch
 from pipeline.features.table import Floats
 from pipeline.retrieval import exact_scores, metrics
 from pipeline.retrieval.exact_scores import LAST_ROW, NO_KEY, WRONG, on_grid
@@ -33,8 +33,8 @@ BLOCKS_AHEAD = 1  # read while another is ranked; each takes 34 MB at 2,048 dime
 class Side:
     """The queries or the gallery: names in memory, unit vectors in blocks."""
 
-    keys: Words
-    locations: Words
+    keys: Strings
+    locations: Strings
     blocks: Callable[[int], Iterator[Floats]]
     "Vectors of at most so many rows at a time, float32 (B, D), in the order of `keys`."
     positions: Doubles | None = None
@@ -59,20 +59,20 @@ class Blocks:
 class Ranking:
     """What came of each query, in the queries' order. Rows point into the gallery."""
 
-    matches_Q: Whole
+    matches_Q: Ints
     "How many true matches the gallery holds."
-    first_rank_Q: Whole
+    first_rank_Q: Ints
     "Rank of the best true match, from 1; 0 where there is none."
-    first_row_Q: Whole
+    first_row_Q: Ints
     "Its row; -1 where there is none."
     first_score_Q: Floats
     "Its score; NaN where there is none."
     ap_Q: Doubles
-    top_rows_QK: Whole
+    top_rows_QK: Ints
     top_scores_QK: Floats
 
 
-def side_of_array(keys: Words, locations: Words, vectors_QD: Floats) -> Side:
+def side_of_array(keys: Strings, locations: Strings, vectors_QD: Floats) -> Side:
     """Vectors that are in memory."""
 
     def blocks(rows: int) -> Iterator[Floats]:
@@ -126,8 +126,8 @@ def joined(rankings: Sequence[Ranking]) -> Ranking:
 def _rank_held(
     held_QD: Floats,
     gallery: Side,
-    owner_P: Whole,
-    row_P: Whole,
+    owner_P: Ints,
+    row_P: Ints,
     top: int,
     cut: Blocks,
     advance: Callable[[int], None],
@@ -140,7 +140,7 @@ def _rank_held(
     best_QK = np.full((queries, top), NO_KEY)
     room = np.empty(cut.query_rows * cut.gallery_rows, np.float32)
     begin = 0
-    for block_BD in ready(
+    for block_BD in prefetch(
         _regrouped(gallery.blocks(cut.gallery_rows), cut.gallery_rows), BLOCKS_AHEAD
     ):
         end = begin + len(block_BD)
@@ -172,7 +172,7 @@ def _rank_held(
     return _ranking(best_QK, owner_P, row_P, score_P, ahead_P)
 
 
-def _floors(scores_QB: Floats, best_QK: Whole, bound: float) -> Floats:
+def _floors(scores_QB: Floats, best_QK: Ints, bound: float) -> Floats:
     """For each query what a float32 product must reach to be one of the best K: K of this block, or
     of those before, are surely no worse. Never minus infinity, which marks true matches."""
     top = best_QK.shape[1]
@@ -186,7 +186,7 @@ def _floors(scores_QB: Floats, best_QK: Whole, bound: float) -> Floats:
 
 
 def _scores_of_pairs(
-    held_QD: Floats, gallery: Side, owner_P: Whole, row_P: Whole, cut: Blocks
+    held_QD: Floats, gallery: Side, owner_P: Ints, row_P: Ints, cut: Blocks
 ) -> Floats:
     """Scores of the true matches alone."""
     by_row = np.argsort(row_P, kind="stable")
@@ -202,9 +202,7 @@ def _scores_of_pairs(
     return score_P
 
 
-def _ranking(
-    best_QK: Whole, owner_P: Whole, row_P: Whole, score_P: Floats, ahead_P: Whole
-) -> Ranking:
+def _ranking(best_QK: Ints, owner_P: Ints, row_P: Ints, score_P: Floats, ahead_P: Ints) -> Ranking:
     """`ahead_P`: wrong rows ahead of each match; to these come the matches of the same query that
     rank before it.
     """
@@ -273,7 +271,7 @@ def rank_spread(
     parts = [(begin, min(begin + rows, count)) for begin in range(0, count, rows)]
     sides = ray.put((queries, gallery))
     found: dict[tuple[int, int], Ranking] = {}
-    for part, ranking in cluster.bounded(
+    for part, ranking in cluster.bounded_map(
         lambda part: _rank_part.remote(sides, part, top, cut), parts, workers
     ):
         found[part] = ranking

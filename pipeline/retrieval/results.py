@@ -46,7 +46,7 @@ def read_inputs(folder: str) -> dict[str, Any] | None:
 def is_whole(folder: str, inputs: Mapping[str, Any]) -> bool:
     """Whether every list and the queries' rows of a finished evaluation are what was written."""
     lists = inputs.get(FILES, {}).items()
-    return parquet.is_whole(storage.join(folder, RESULTS)) and all(
+    return parquet.parquet_intact(storage.join(folder, RESULTS)) and all(
         (data := _bytes(folder, name)) and _hash(data) == said for name, said in lists
     )
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core.arrays import Whole, Words
+from pipeline.core.arrays import Ints, Strings
 from pipeline.features.table import Floats
 from pipeline.retrieval.exact_scores import on_grid
 from pipeline.retrieval.ranking import Side, side_of_array
@@ -21,12 +21,12 @@ BLOCK_ROWS = 4_096  # 32 MB at 2,048 dimensions
 class Chosen:
     """Rows of a side with their vectors."""
 
-    keys_N: Words
-    locations_N: Words
+    keys_N: Strings
+    locations_N: Strings
     vectors_ND: Floats
 
 
-def taken(side: Side, rows_N: Whole) -> Chosen:
+def taken(side: Side, rows_N: Ints) -> Chosen:
     """These rows, in the order asked for."""
     return Chosen(
         keys_N=side.keys[rows_N],
@@ -35,7 +35,7 @@ def taken(side: Side, rows_N: Whole) -> Chosen:
     )
 
 
-def evenly(total: int, most: int) -> Whole:
+def evenly(total: int, most: int) -> Ints:
     """At most `most` of the numbers below `total`, evenly spaced from the first to the last,
     ascending.
     """
@@ -44,7 +44,7 @@ def evenly(total: int, most: int) -> Whole:
     return np.round(np.linspace(0, total - 1, most)).astype(np.int64)
 
 
-def vectors_of(side: Side, rows_N: Whole) -> Floats:
+def vectors_of(side: Side, rows_N: Ints) -> Floats:
     """Vectors (N, D) of these rows, in the order asked for; the side is read once, no more than a
     block of it in memory.
     """
@@ -119,7 +119,7 @@ def mean_by_views(side: Side, views: int) -> Side:
     return mean_by_group(side, group_Q, keys_G, locations_G)
 
 
-def mean_by_group(side: Side, group_Q: Whole, keys_G: Words, locations_G: Words) -> Side:
+def mean_by_group(side: Side, group_Q: Ints, keys_G: Strings, locations_G: Strings) -> Side:
     """The mean at unit length of each group's vectors; rows of group -1 are left out."""
     total_GD, begin = np.zeros((len(keys_G), 0)), 0
     for block_BD in side.blocks(MEAN_ROWS):

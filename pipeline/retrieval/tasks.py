@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 
-from pipeline.core.arrays import Doubles, Whole, Words
+from pipeline.core.arrays import Doubles, Ints, Strings
 from pipeline.core.errors import InputError
 from pipeline.core.geo import haversine_m
 from pipeline.core.records import Split, View
@@ -111,7 +111,7 @@ def side_of(table: FeatureTable) -> Side:
     return Side(keys=labels.keys, locations=labels.locations, blocks=table.blocks, positions=places)
 
 
-def only_locations(side: Side, locations: Words) -> Side:
+def only_locations(side: Side, locations: Strings) -> Side:
     """The rows that show one of these locations: the gallery of the protocol `queried-only`."""
     keep = np.isin(side.locations, locations)
 
@@ -219,7 +219,7 @@ def _result_rows(
     places_5Q = [*asked_Q2.T, *answer_Q2.T, haversine_m(asked_Q2, answer_Q2)]
     ends = pa.array(np.arange(count + 1) * kept, pa.int32())
 
-    def lists(values_QK: Whole | Words | Floats, kind: pa.DataType) -> pa.ListArray:
+    def lists(values_QK: Ints | Strings | Floats, kind: pa.DataType) -> pa.ListArray:
         return pa.ListArray.from_arrays(ends, pa.array(values_QK.ravel().tolist(), kind))
 
     columns = [

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.core.arrays import Doubles, Whole, Words
+from pipeline.core.arrays import Doubles, Ints, Strings
 from pipeline.features.table import Floats
 from pipeline.retrieval.subsets import Chosen, evenly
 
@@ -37,8 +37,8 @@ class Projection:
 
 
 def choose(
-    query_locations: Words, gallery_locations: Words, most: int = MOST_ROWS
-) -> tuple[Whole, Whole]:
+    query_locations: Strings, gallery_locations: Strings, most: int = MOST_ROWS
+) -> tuple[Ints, Ints]:
     """Rows of either side: as many of each common place as `most` allows, of at most `most` places,
     evenly spread.
     """

@@ -8,13 +8,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from pipeline.core.geo import Near
+from pipeline.core.geo import Circle
 from pipeline.core.records import Rejection
 from pipeline.features.table import Floats
-from pipeline.index.filters import Where
-from pipeline.locate.locate import Answer, locate
+from pipeline.index.filters import Filter
+from pipeline.locate.locate import Answer, locate_embeddings
 from pipeline.service.live_index import LiveIndex
-from pipeline.service.question import Question
+from pipeline.service.question import LocateRequest
 
 Outcome = Answer | Rejection
 
@@ -29,7 +29,7 @@ class Encoder(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Status:
+class ServiceStatus:
     """What is ready to answer."""
 
     fingerprint: str
@@ -44,7 +44,7 @@ class Status:
     "Why the newest index at the path is not in use; None where it is."
 
 
-class Answerer:
+class Predictor:
     """The network and the index, loaded."""
 
     def __init__(self, index: str, encoder_for: Callable[[dict[str, Any]], Encoder]) -> None:
@@ -54,7 +54,7 @@ class Answerer:
         self.live = LiveIndex(index)
         self._encoder = encoder_for(self.live.current.index.facts)
 
-    def answer(self, questions: Sequence[Question]) -> list[Outcome]:
+    def answer(self, questions: Sequence[LocateRequest]) -> list[Outcome]:
         """One outcome per question, in order. The whole batch asks one index, and the network once."""
         opened = self.live.current
         embeddings_QD, rejected = self._encoder.encode([question.photo for question in questions])
@@ -62,15 +62,15 @@ class Answerer:
             number: why for number, why in enumerate(rejected) if why is not None
         }
         alike: dict[
-            tuple[Near | None, int], list[tuple[int, int]]
+            tuple[Circle | None, int], list[tuple[int, int]]
         ] = {}  # question and row of those of one search
         for row, number in enumerate(number for number, why in enumerate(rejected) if why is None):
             alike.setdefault((questions[number].near, questions[number].top), []).append(
                 (number, row)
             )
         for (near, top), members in alike.items():
-            where = None if near is None else Where(near=near)
-            answers = locate(
+            where = None if near is None else Filter(near=near)
+            answers = locate_embeddings(
                 opened.index,
                 embeddings_QD[[row for _, row in members]],
                 top,
@@ -82,9 +82,9 @@ class Answerer:
             }
         return [outcomes[number] for number in range(len(questions))]
 
-    def status(self) -> Status:
+    def status(self) -> ServiceStatus:
         opened = self.live.current
-        return Status(
+        return ServiceStatus(
             fingerprint=opened.index.told.fingerprint,
             rows=len(opened.index),
             factory=opened.index.told.factory,

@@ -17,23 +17,23 @@ from aiohttp import web
 from pipeline.core.progress import console
 from pipeline.core.records import Rejection
 from pipeline.service.answerer import Outcome
-from pipeline.service.batcher import Alone, Batcher, Gone
+from pipeline.service.batcher import Batcher, PoisonedItem, ReplicaLost
 from pipeline.service.engine import Engine, NotReady
-from pipeline.service.metrics import CONTENT_TYPE, Metrics
-from pipeline.service.pages import HEADERS, PATHS, pages
-from pipeline.service.question import Question, Refusal, question_of, refusal_of
-from pipeline.service.settings import LOOPBACK, ServiceSettings
-from pipeline.service.uploads import read_upload, refuse_by_head
+from pipeline.service.metrics import CONTENT_TYPE, ServiceMetrics
+from pipeline.service.pages import PAGE_PATHS, SECURITY_HEADERS, page_routes
+from pipeline.service.question import LocateRequest, RequestError, parse_request, undecodable_photo
+from pipeline.service.settings import LOOPBACK_HOSTS, ServiceSettings
+from pipeline.service.uploads import check_headers, read_upload
 
-OPEN = {*PATHS, "/health"}
+PUBLIC_PATHS = {*PAGE_PATHS, "/health"}
 """Paths that need no token: the pages, which say nothing of the index, and what a load balancer
 asks."""
-KEPT_S = 30
+KEEPALIVE_S = 30
 "Seconds that a connection may be idle between two requests."
-LINGERING_S = 5
+LINGER_S = 5
 """Seconds that the rest of a refused upload is read and dropped: a client cut off while it sends
 sees a broken connection in place of the sentence."""
-GRACE_S = 5
+SHUTDOWN_GRACE_S = 5
 "Seconds that requests in flight have to end when the service is told to stop."
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -42,19 +42,26 @@ class Service:
     """The application and what it keeps: the queue, the counters, the token."""
 
     def __init__(
-        self, settings: ServiceSettings, engine: Engine, token: str | None = None, abreast: int = 1
+        self,
+        settings: ServiceSettings,
+        engine: Engine,
+        token: str | None = None,
+        concurrency: int = 1,
     ) -> None:
-        """`abreast` is how many batches the engine computes at a time."""
+        """`concurrency` is how many batches the engine computes at a time."""
         self._settings, self._engine, self._token = settings, engine, token
-        self.metrics = Metrics(lambda: self._batcher.waiting)
-        self._batcher: Batcher[Question, Outcome] = Batcher(
-            engine.answer, largest=settings.batch, abreast=abreast, on_batch=self.metrics.batch
+        self.metrics = ServiceMetrics(lambda: self._batcher.waiting)
+        self._batcher: Batcher[LocateRequest, Outcome] = Batcher(
+            engine.answer,
+            largest=settings.batch,
+            concurrency=concurrency,
+            on_batch=self.metrics.batch,
         )
-        self._places = settings.waiting + settings.batch * abreast
+        self._places = settings.waiting + settings.batch * concurrency
         self._taken = 0
         self.app = web.Application(middlewares=[self._outermost])
         self.app.add_routes([
-            *pages(settings), web.get("/health", self._health), web.get("/metrics", self._metrics)
+            *page_routes(settings), web.get("/health", self._health), web.get("/metrics", self._metrics)
         ])  # fmt: skip
         self.app.router.add_post("/locate", self._locate, expect_handler=self._expect)
 
@@ -69,9 +76,9 @@ class Service:
             access_log=None,
             logger=quiet,
             handler_cancellation=True,  # whoever has gone away leaves the queue
-            keepalive_timeout=KEPT_S,
-            lingering_time=LINGERING_S,
-            shutdown_timeout=GRACE_S,
+            keepalive_timeout=KEEPALIVE_S,
+            lingering_time=LINGER_S,
+            shutdown_timeout=SHUTDOWN_GRACE_S,
         )
 
     @web.middleware
@@ -81,8 +88,8 @@ class Service:
         try:
             self._admit(request)
             response = await handler(request)
-        except Refusal as refusal:
-            response = _refused(refusal)
+        except RequestError as refusal:
+            response = _error_response(refusal)
         except web.HTTPException as error:
             if error.status < 400:
                 raise
@@ -90,20 +97,24 @@ class Service:
                 f"; expected {error.headers['Allow']}" if "Allow" in error.headers else "; see /api"
             )
             sentence = f"{request.method} {request.path[:80]}: {error.reason.lower()}{allowed}"
-            response = _refused(Refusal(error.status, sentence))
+            response = _error_response(RequestError(error.status, sentence))
             response.headers.extend(
                 {name: error.headers[name] for name in ("Allow",) if name in error.headers}
             )
         except web.RequestPayloadError:
-            response = _refused(
-                Refusal(400, "the body ends or breaks off before its end; send the photo again")
+            response = _error_response(
+                RequestError(
+                    400, "the body ends or breaks off before its end; send the photo again"
+                )
             )
         except Exception:
             console.print(traceback.format_exc(), style="red")
-            response = _refused(
-                Refusal(500, "the service failed over this request; it has noted why; send another")
+            response = _error_response(
+                RequestError(
+                    500, "the service failed over this request; it has noted why; send another"
+                )
             )
-        for name, value in HEADERS.items():
+        for name, value in SECURITY_HEADERS.items():
             response.headers.setdefault(name, value)
         path = "other" if request.match_info.route.resource is None else request.path
         self.metrics.request(path, response.status, time.monotonic() - began)
@@ -114,18 +125,21 @@ class Service:
         # A page whose name was made to lead to this machine is not another site's in its browser's
         # eyes.
         host = request.host.rsplit(":", 1)[0].strip("[]")
-        if self._token is None and host not in LOOPBACK:
-            raise Refusal(
+        if self._token is None and host not in LOOPBACK_HOSTS:
+            raise RequestError(
                 403,
                 f"the host is {host[:60]!r}, expected localhost; ask by that name, or start it with --token-file",
             )
-        if request.headers.get("Sec-Fetch-Site") == "cross-site" and request.path not in OPEN:
-            raise Refusal(
+        if (
+            request.headers.get("Sec-Fetch-Site") == "cross-site"
+            and request.path not in PUBLIC_PATHS
+        ):
+            raise RequestError(
                 403, "another site's page asks, expected the service's own; open the service itself"
             )
-        if request.path not in OPEN and not self._trusted(request):
+        if request.path not in PUBLIC_PATHS and not self._trusted(request):
             found = "another token" if "Authorization" in request.headers else "no token"
-            raise Refusal(
+            raise RequestError(
                 401,
                 f"found {found}, expected the header Authorization: Bearer with the service's token",
             )
@@ -144,7 +158,7 @@ class Service:
         try:
             self._admit(request)
             self._refuse_early(request)
-        except Refusal:
+        except RequestError:
             return  # the handler says why
         if request.transport is not None:
             request.transport.write(b"HTTP/1.1 100 Continue\r\n\r\n")
@@ -153,13 +167,13 @@ class Service:
         """Raise Refusal for what can be refused before the body is read; so what waits is bounded
         in number and in bytes.
         """
-        if self._taken >= self._places or self._batcher.queue_s > self._settings.timeout_s:
-            raise Refusal(
+        if self._taken >= self._places or self._batcher.expected_queue_s > self._settings.timeout_s:
+            raise RequestError(
                 503,
                 f"{self._taken} photos are before it; send this one again later",
-                self._batcher.wait_s,
+                self._batcher.retry_after_estimate_s,
             )
-        refuse_by_head(request, self._settings.most_bytes)
+        check_headers(request, self._settings.max_bytes)
 
     async def _locate(self, request: web.Request) -> web.Response:
         began = time.monotonic()
@@ -168,30 +182,30 @@ class Service:
         try:
             settings = self._settings
             photo, fields = await read_upload(
-                request, settings.most_bytes, settings.upload_timeout_s
+                request, settings.max_bytes, settings.upload_timeout_s
             )
-            question = await asyncio.to_thread(question_of, photo, fields, settings.most_pixels)
+            question = await asyncio.to_thread(parse_request, photo, fields, settings.max_pixels)
             outcome = await self._ask(question)
         finally:
             self._taken -= 1
         if isinstance(outcome, Rejection):
-            raise refusal_of(outcome.reason, outcome.found)
+            raise undecodable_photo(outcome.reason, outcome.found)
         seconds = round(time.monotonic() - began, 4)
         return web.json_response(dataclasses.asdict(outcome) | {"seconds": seconds})
 
-    async def _ask(self, question: Question) -> Outcome:
+    async def _ask(self, question: LocateRequest) -> Outcome:
         try:
             async with asyncio.timeout(self._settings.timeout_s):
                 return await self._batcher.ask(question)
         except TimeoutError:
-            raise Refusal(
+            raise RequestError(
                 504,
                 f"there was no answer within {self._settings.timeout_s:g} s; send the photo again",
             ) from None
         except NotReady as error:
-            raise Refusal(503, f"not ready: {error}; send the photo again later", 5) from None
-        except Alone:
-            raise Refusal(
+            raise RequestError(503, f"not ready: {error}; send the photo again later", 5) from None
+        except PoisonedItem:
+            raise RequestError(
                 422,
                 "computing stopped twice over this photo; save it as a plain JPEG and send that",
             ) from None
@@ -200,7 +214,7 @@ class Service:
         try:
             async with asyncio.timeout(2):
                 status = await self._engine.status()
-        except (NotReady, Gone, TimeoutError) as error:
+        except (NotReady, ReplicaLost, TimeoutError) as error:
             why = str(error) or "no answer from the replicas"
             body = {"ready": False} | ({"why": why} if self._trusted(request) else {})
             return web.json_response(body, status=503, headers={"Retry-After": "5"})
@@ -213,7 +227,7 @@ class Service:
         return web.Response(body=self.metrics.text(), headers={"Content-Type": CONTENT_TYPE})
 
 
-def _refused(refusal: Refusal) -> web.Response:
+def _error_response(refusal: RequestError) -> web.Response:
     response = web.json_response({"error": refusal.sentence}, status=refusal.status)
     if refusal.status == 401:
         response.headers["WWW-Authenticate"] = "Bearer"

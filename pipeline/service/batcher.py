@@ -16,21 +16,21 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-class Gone(Exception):
+class ReplicaLost(Exception):
     """Whoever computed a batch is gone, and the batch with it; another will take its place."""
 
 
-class Alone(Exception):
+class PoisonedItem(Exception):
     """An item that was in the hands of two who are gone: of a batch first, then alone. It is not
     tried again.
     """
 
 
 class Batcher(Generic[Item, Result]):
-    """Asks `work` for the results of up to `largest` items at once, with `abreast` batches at work
+    """Asks `watch_replicas` for the results of up to `largest` items at once, with `concurrency` batches at work
     at a time.
 
-    `work` gives one result per item, in order. A batch that raises Gone is tried again item by item, so that one that kills
+    `watch_replicas` gives one result per item, in order. A batch that raises Gone is tried again item by item, so that one that kills
     is told from those beside it.
     """
 
@@ -39,11 +39,16 @@ class Batcher(Generic[Item, Result]):
         work: Callable[[Sequence[Item]], Awaitable[Sequence[Result]]],
         *,
         largest: int,
-        abreast: int = 1,
+        concurrency: int = 1,
         on_batch: Callable[[int], None] = lambda size: None,
     ) -> None:
         """`on_batch` is called with the size of each batch that begins."""
-        self._work, self._largest, self._abreast, self._on_batch = work, largest, abreast, on_batch
+        self._work, self._largest, self._abreast, self._on_batch = (
+            work,
+            largest,
+            concurrency,
+            on_batch,
+        )
         self._waiting: dict[asyncio.Future[Result], Item] = {}  # in the order of their coming
         self._at_work: set[asyncio.Task[None]] = set()
         self._seconds = 1.0  # of the last batch; until there was one, a guess
@@ -54,19 +59,19 @@ class Batcher(Generic[Item, Result]):
         return len(self._waiting)
 
     @property
-    def queue_s(self) -> float:
+    def expected_queue_s(self) -> float:
         """Seconds until a batch takes whoever comes now, about: none where nobody waits."""
         return len(self._waiting) / (self._largest * self._abreast) * self._seconds
 
     @property
-    def wait_s(self) -> int:
+    def retry_after_estimate_s(self) -> int:
         """Whole seconds after which those who wait now will be answered, about; 1 to 60."""
-        return min(60, max(1, math.ceil(self.queue_s + self._seconds)))
+        return min(60, max(1, math.ceil(self.expected_queue_s + self._seconds)))
 
     async def ask(self, item: Item) -> Result:
         """The result of one item. Cancelled, it leaves the queue.
 
-        Raises what `work` raises, and Alone.
+        Raises what `watch_replicas` raises, and Alone.
         """
         future: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
         self._waiting[future] = item
@@ -95,15 +100,15 @@ class Batcher(Generic[Item, Result]):
         began = time.monotonic()
         try:
             await self._settle(batch)
-        except Gone:
+        except ReplicaLost:
             for future, item in batch.items():
                 if future.done():  # whoever asked has gone away
                     continue
                 try:
                     await self._settle({future: item})
-                except Gone as error:
+                except ReplicaLost as error:
                     if not future.done():
-                        future.set_exception(Alone(str(error)))
+                        future.set_exception(PoisonedItem(str(error)))
         finally:
             self._seconds = time.monotonic() - began
 
@@ -111,7 +116,7 @@ class Batcher(Generic[Item, Result]):
         """Give every future its result, or the failure of the batch. Raises Gone alone."""
         try:
             settled = list(zip(batch, await self._work(list(batch.values())), strict=True))
-        except Gone:
+        except ReplicaLost:
             raise
         except Exception as error:
             for future in batch:

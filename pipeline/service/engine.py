@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Protocol
 
-from pipeline.service.answerer import Outcome, Status
-from pipeline.service.question import Question
+from pipeline.service.answerer import Outcome, ServiceStatus
+from pipeline.service.question import LocateRequest
 
 
 class NotReady(Exception):
@@ -14,8 +14,8 @@ class NotReady(Exception):
 class Engine(Protocol):
     """Whoever computes."""
 
-    async def answer(self, questions: Sequence[Question]) -> Sequence[Outcome]:
+    async def answer(self, questions: Sequence[LocateRequest]) -> Sequence[Outcome]:
         """One outcome per question, in order. Raises NotReady, and Gone where the batch is lost."""
 
-    async def status(self) -> Status:
+    async def status(self) -> ServiceStatus:
         """Raises NotReady or Gone."""

@@ -13,41 +13,41 @@ import numpy as np
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.index.metadata import FACTS
+from pipeline.index.metadata import METADATA_FILE
 from pipeline.index.searcher import Index
 from pipeline.locate import confidence
-from pipeline.locate.confidence import Confidence, find_confidence
-from pipeline.locate.gallery_map import gallery_map
+from pipeline.locate.confidence import Calibration, find_calibration
+from pipeline.locate.gallery_map import read_gallery_map
 
-LOOK_EVERY_S = 2.0
+POLL_INTERVAL_S = 2.0
 "Between two looks at what is at the path."
 RETRY_S = 10.0
 """After which a refused index is tried again though its index.json is the same: whoever copies a
 folder file by file may copy that one first."""
 
 
-Said = tuple[bytes | None, ...]
+FileContents = tuple[bytes | None, ...]
 """What the files hold by which an index is known, index.json and calibration.json; None for one
 that is not there."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Opened:
+class OpenedIndex:
     """What answers."""
 
     index: Index
-    confidence: Confidence | None
+    confidence: Calibration | None
     "None where the index was not calibrated."
     spacing_m: float | None
     "Without a calibration, how far apart candidates may lie that agree: the gallery's own spacing."
 
 
-def open_whole(path: str) -> Opened:
-    """Raises InputError when there is no index at `path`, or a calibration that is another's."""
+def open_verified(path: str) -> OpenedIndex:
+    """Raises InputError when there is no index at `draw_path`, or a calibration that is another's."""
     index = Index(path, whole=True)  # a damaged list is met by few searches, and late
-    calibration = find_confidence(path, index.facts)
-    spacing_m = None if calibration else gallery_map(index).spacing_m
-    return Opened(index=index, confidence=calibration, spacing_m=spacing_m)
+    calibration = find_calibration(path, index.facts)
+    spacing_m = None if calibration else read_gallery_map(index).spacing_m
+    return OpenedIndex(index=index, confidence=calibration, spacing_m=spacing_m)
 
 
 class LiveIndex:
@@ -56,17 +56,20 @@ class LiveIndex:
     """
 
     def __init__(self, path: str) -> None:
-        """Raises InputError when there is no index at `path` that can be used."""
+        """Raises InputError when there is no index at `draw_path` that can be used."""
         self._path = path
         self._taken = self._seen = (
             self._said()
         )  # before it is opened: a change meanwhile is found by the next look
-        self.current = open_whole(path)
+        self.current = open_verified(path)
         self.refused: str | None = None
         self._refused_at = 0.0
 
-    def _said(self) -> Said:
-        return tuple(_read(storage.join(self._path, name)) for name in (FACTS, confidence.FILE))
+    def _said(self) -> FileContents:
+        return tuple(
+            _read(storage.join(self._path, name))
+            for name in (METADATA_FILE, confidence.CALIBRATION_FILE)
+        )
 
     def look(self) -> None:
         """Take over what is new at the path. Whatever is wrong with it, the old index stays;
@@ -81,8 +84,8 @@ class LiveIndex:
             self._seen, self.refused = said, None
             return
         try:
-            fresh = open_whole(self._path)
-            prove(fresh.index, self.current.index)
+            fresh = open_verified(self._path)
+            validate_index(fresh.index, self.current.index)
         except (
             Exception
         ) as error:  # FAISS, Arrow, JSON and file systems each raise their own over broken files
@@ -93,14 +96,14 @@ class LiveIndex:
         self.current, self.refused = fresh, None
         self._taken = self._seen = said
 
-    def _refuse(self, said: Said, error: Exception) -> None:
+    def _refuse(self, said: FileContents, error: Exception) -> None:
         why = str(error).strip().split("\n")[0] or type(error).__name__
         self._seen, self._refused_at = said, time.monotonic()
         self.refused = f"the new index is refused and the old one goes on answering: {why}"
 
     def follow(self, stop: threading.Event) -> None:
         """Look every LOOK_EVERY_S seconds until `stop` is set: for a thread of its own."""
-        while not stop.wait(LOOK_EVERY_S):
+        while not stop.wait(POLL_INTERVAL_S):
             self.look()
 
 
@@ -111,7 +114,7 @@ def _read(path: str) -> bytes | None:
         return None
 
 
-def prove(fresh: Index, old: Index) -> None:
+def validate_index(fresh: Index, old: Index) -> None:
     """Raises InputError where an index cannot stand in for the old one, and whatever a trial search
     raises.
     """

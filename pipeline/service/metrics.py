@@ -11,12 +11,12 @@ from prometheus_client import (
     generate_latest,
 )
 
-SECONDS = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
-SIZES = (1, 2, 4, 8, 16, 32, 64)
+LATENCY_BUCKETS_S = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
+BATCH_BUCKETS = (1, 2, 4, 8, 16, 32, 64)
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 
 
-class Metrics:
+class ServiceMetrics:
     """Counters of one service; another in the same process has its own."""
 
     def __init__(self, waiting: Callable[[], int]) -> None:
@@ -32,11 +32,14 @@ class Metrics:
             "pvda_request_seconds",
             "From a request's head to its answer.",
             ["path"],
-            buckets=SECONDS,
+            buckets=LATENCY_BUCKETS_S,
             registry=self._registry,
         )
         self._batches = Histogram(
-            "pvda_batch_photos", "Photos computed at once.", buckets=SIZES, registry=self._registry
+            "pvda_batch_photos",
+            "Photos computed at once.",
+            buckets=BATCH_BUCKETS,
+            registry=self._registry,
         )
         queue = Gauge(
             "pvda_waiting_photos", "Photos that wait for a batch.", registry=self._registry
@@ -44,7 +47,7 @@ class Metrics:
         queue.set_function(waiting)
 
     def request(self, path: str, status: int, seconds: float) -> None:
-        """One request was answered. `path` is one of the service's, or `other`."""
+        """One request was answered. `draw_path` is one of the service's, or `other`."""
         self._requests.labels(path, str(status)).inc()
         self._seconds.labels(path).observe(seconds)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 
-from pipeline.service.question import MOST_TOP, TOP
+from pipeline.service.question import DEFAULT_TOP, MAX_TOP
 from pipeline.service.settings import ServiceSettings
 
 NUMBER, TEXT = {"type": "number"}, {"type": "string"}
@@ -27,7 +27,7 @@ REASONS = {
 }
 
 
-def describe(settings: ServiceSettings) -> dict[str, Any]:
+def openapi_document(settings: ServiceSettings) -> dict[str, Any]:
     """The OpenAPI document of a service with these settings."""
     fields = {
         "lat": {
@@ -45,8 +45,8 @@ def describe(settings: ServiceSettings) -> dict[str, Any]:
         "top": {
             "type": "integer",
             "minimum": 1,
-            "maximum": MOST_TOP,
-            "default": TOP,
+            "maximum": MAX_TOP,
+            "default": DEFAULT_TOP,
             "description": "Candidates in the answer.",
         },
     }
@@ -185,10 +185,12 @@ def _schemas() -> dict[str, Any]:
     }
 
 
-def reference(settings: ServiceSettings) -> str:
+def reference_page(settings: ServiceSettings) -> str:
     """The same as a page."""
     template = (Path(__file__).parent / "web" / "api.html").read_text()
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    return environment.from_string(template).render(api=describe(settings), port=settings.port)
+    return environment.from_string(template).render(
+        api=openapi_document(settings), port=settings.port
+    )

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from aiohttp import web
 
-from pipeline.service.openapi import describe, reference
+from pipeline.service.openapi import openapi_document, reference_page
 from pipeline.service.settings import ServiceSettings
 
-WEB = Path(__file__).parent / "web"
-HEADERS = {
+WEB_FOLDER = Path(__file__).parent / "web"
+SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
@@ -21,19 +21,19 @@ HEADERS = {
     "Server": "pvda",  # and no versions
 }
 "Of every answer."
-PATHS = ("/", "/page.js", "/style.css", "/api", "/openapi.json")
+PAGE_PATHS = ("/", "/page.js", "/style.css", "/api", "/openapi.json")
 
 
-def pages(settings: ServiceSettings) -> list[web.RouteDef]:
+def page_routes(settings: ServiceSettings) -> list[web.RouteDef]:
     """The routes of PATHS, in their order."""
     shown = (
-        ((WEB / "index.html").read_text(), "text/html"),
-        ((WEB / "page.js").read_text(), "text/javascript"),
-        ((WEB / "style.css").read_text(), "text/css"),
-        (reference(settings), "text/html"),
-        (json.dumps(describe(settings)), "application/json"),
+        ((WEB_FOLDER / "index.html").read_text(), "text/html"),
+        ((WEB_FOLDER / "page.js").read_text(), "text/javascript"),
+        ((WEB_FOLDER / "style.css").read_text(), "text/css"),
+        (reference_page(settings), "text/html"),
+        (json.dumps(openapi_document(settings)), "application/json"),
     )
-    return [_page(path, text, kind) for path, (text, kind) in zip(PATHS, shown, strict=True)]
+    return [_page(path, text, kind) for path, (text, kind) in zip(PAGE_PATHS, shown, strict=True)]
 
 
 def _page(path: str, text: str, kind: str) -> web.RouteDef:

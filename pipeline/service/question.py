@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pipeline.core.errors import InputError
-from pipeline.core.geo import Near
+from pipeline.core.geo import Circle
 from pipeline.images.decode import DecodeError
 from pipeline.images.inspect import inspect
 
@@ -17,16 +17,16 @@ JPEG = b"\xff\xd8\xff"
 SIGNATURES = ((JPEG, b""), (b"\x89PNG\r\n\x1a\n", b""), (b"RIFF", b"WEBP"))
 """How a file begins, and what stands in bytes 8 to 12. Formats whose size is known without
 decoding; Pillow knows some 40 more, and the decoder of each would be a stranger's to try."""
-SCAN, MOST_SCANS = b"\xff\xda", 100
+SCAN_MARKER, MAX_SCANS = b"\xff\xda", 100
 """Where a scan of a JPEG begins, and how many are believed: progressive files have about ten.
 Thousands of empty ones in a few kilobytes would each cost a pass over all pixels. A preview within
 a header may hold the same two bytes by chance."""
-TOP, MOST_TOP = 5, 50
+DEFAULT_TOP, MAX_TOP = 5, 50
 "Candidates in an answer: by default, and at most."
 FIELDS = ("lat", "lon", "radius_m", "top")
 
 
-class Refusal(Exception):
+class RequestError(Exception):
     """A request that is not answered; `sentence` says what was found, what was expected and what to
     do.
     """
@@ -37,43 +37,43 @@ class Refusal(Exception):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Question:
+class LocateRequest:
     """Where was this photo taken?"""
 
     photo: bytes
     "A JPEG, PNG or WebP file, whole."
-    near: Near | None = None
+    near: Circle | None = None
     "Only places within this circle are candidates."
-    top: int = TOP
+    top: int = DEFAULT_TOP
     "Candidates in the answer."
 
 
-def question_of(photo: bytes, fields: Mapping[str, str], most_pixels: int) -> Question:
+def parse_request(photo: bytes, fields: Mapping[str, str], max_pixels: int) -> LocateRequest:
     """An upload judged by its structure: no pixel is decoded but those of a CMYK JPEG, whose size
     is known by then.
 
     Raises Refusal.
     """
-    asked = Question(photo=photo, near=_near(fields), top=_top(fields))
-    _judge(photo, most_pixels)
+    asked = LocateRequest(photo=photo, near=_near(fields), top=_top(fields))
+    _check_photo(photo, max_pixels)
     return asked
 
 
-def _near(fields: Mapping[str, str]) -> Near | None:
+def _near(fields: Mapping[str, str]) -> Circle | None:
     given = {
         name: fields[name] for name in ("lat", "lon", "radius_m") if fields.get(name, "").strip()
     }
     if not given:
         return None
     if len(given) < 3:
-        raise Refusal(
+        raise RequestError(
             400,
             f"found only {' and '.join(given)}, expected all of lat, lon and radius_m or none; give the others too",
         )
     try:
-        return Near(**{name: _number(name, text) for name, text in given.items()})
+        return Circle(**{name: _number(name, text) for name, text in given.items()})
     except InputError as error:
-        raise Refusal(400, str(error)) from None
+        raise RequestError(400, str(error)) from None
 
 
 def _number(name: str, text: str) -> float:
@@ -82,42 +82,46 @@ def _number(name: str, text: str) -> float:
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise Refusal(400, f"{name} is {text[:40]!r}, expected a number such as 47.5")
+        raise RequestError(400, f"{name} is {text[:40]!r}, expected a number such as 47.5")
     return number
 
 
 def _top(fields: Mapping[str, str]) -> int:
     text = fields.get("top", "").strip()
     if not text:
-        return TOP
-    if not (text.isascii() and text.isdigit() and len(text) < 4 and 1 <= int(text) <= MOST_TOP):
-        raise Refusal(400, f"top is {text[:40]!r}, expected a whole number from 1 to {MOST_TOP}")
+        return DEFAULT_TOP
+    if not (text.isascii() and text.isdigit() and len(text) < 4 and 1 <= int(text) <= MAX_TOP):
+        raise RequestError(
+            400, f"top is {text[:40]!r}, expected a whole number from 1 to {MAX_TOP}"
+        )
     return int(text)
 
 
-def _judge(photo: bytes, most_pixels: int) -> None:
+def _check_photo(photo: bytes, max_pixels: int) -> None:
     if not photo:
-        raise Refusal(400, "the photo is empty, expected the bytes of a JPEG, PNG or WebP file")
+        raise RequestError(
+            400, "the photo is empty, expected the bytes of a JPEG, PNG or WebP file"
+        )
     if not any(photo.startswith(begin) and photo.startswith(then, 8) for begin, then in SIGNATURES):
-        raise Refusal(
+        raise RequestError(
             415,
             f"the photo begins with {photo[:8]!r}, expected a JPEG, PNG or WebP file; save it as one of these",
         )
-    if photo.startswith(JPEG) and (scans := photo.count(SCAN)) > MOST_SCANS:
-        raise Refusal(
+    if photo.startswith(JPEG) and (scans := photo.count(SCAN_MARKER)) > MAX_SCANS:
+        raise RequestError(
             422,
-            f"the photo has {scans} scans, expected at most {MOST_SCANS}; save it as a plain JPEG",
+            f"the photo has {scans} scans, expected at most {MAX_SCANS}; save it as a plain JPEG",
         )
     try:
-        inspect(photo, most_pixels)
+        inspect(photo, max_pixels)
     except DecodeError as error:
-        raise refusal_of(error.reason, error.found) from None
+        raise undecodable_photo(error.reason, error.found) from None
 
 
-def refusal_of(reason: str, found: str) -> Refusal:
+def undecodable_photo(reason: str, found: str) -> RequestError:
     """What is said of a photo that cannot be decoded."""
     status = 413 if reason == "too many pixels" else 422
-    return Refusal(
+    return RequestError(
         status,
         f"the photo cannot be used: {reason}, {found}; send it whole, or a smaller copy of it",
     )

@@ -20,15 +20,15 @@ from ray.serve.exceptions import DeploymentUnavailableError
 from pipeline.core import cluster
 from pipeline.core.cluster import Placement
 from pipeline.core.errors import InputError
-from pipeline.service.answerer import Answerer, Outcome, Status
-from pipeline.service.batcher import Gone
+from pipeline.service.answerer import Outcome, Predictor, ServiceStatus
+from pipeline.service.batcher import ReplicaLost
 from pipeline.service.engine import NotReady
 from pipeline.service.live_index import RETRY_S
-from pipeline.service.question import Question
+from pipeline.service.question import LocateRequest
 
-STUCK_S = 120.0
+BATCH_TIMEOUT_S = 120.0
 "A batch that takes longer will not end: its replica is replaced."
-CALLS = 16
+MAX_ONGOING_REQUESTS = 16
 "That a replica takes at once: its batch, and whoever asks for its status meanwhile."
 
 
@@ -37,11 +37,11 @@ class Replica:
     thread.
     """
 
-    def __init__(self, make: Callable[[], Answerer]) -> None:
+    def __init__(self, make: Callable[[], Predictor]) -> None:
         self._make = make
         self._thread = ThreadPoolExecutor(1)
         self._began: float | None = None
-        self._answerer: Answerer | None = None
+        self._answerer: Predictor | None = None
         self._unusable = ""
         self._load()
         threading.Thread(target=self._follow, daemon=True).start()
@@ -62,22 +62,22 @@ class Replica:
             self._load()
         self._answerer.live.follow(threading.Event())
 
-    async def answer(self, questions: Sequence[Question]) -> list[Outcome]:
+    async def answer(self, questions: Sequence[LocateRequest]) -> list[Outcome]:
         return await asyncio.get_running_loop().run_in_executor(
             self._thread, self._answer, questions
         )
 
-    def _answer(self, questions: Sequence[Question]) -> list[Outcome]:
+    def _answer(self, questions: Sequence[LocateRequest]) -> list[Outcome]:
         self._began = time.monotonic()
         try:
             return self._ready().answer(questions)
         finally:
             self._began = None
 
-    async def status(self) -> Status:
+    async def status(self) -> ServiceStatus:
         return self._ready().status()
 
-    def _ready(self) -> Answerer:
+    def _ready(self) -> Predictor:
         if self._answerer is None:
             raise NotReady(self._unusable)
         return self._answerer
@@ -85,14 +85,14 @@ class Replica:
     def check_health(self) -> None:
         """Called by Serve every few seconds; a replica that raises here a few times is replaced."""
         began = self._began
-        if began is not None and time.monotonic() > began + STUCK_S:
-            raise TimeoutError(f"a batch has taken {STUCK_S:.0f} s")
+        if began is not None and time.monotonic() > began + BATCH_TIMEOUT_S:
+            raise TimeoutError(f"a batch has taken {BATCH_TIMEOUT_S:.0f} s")
 
 
 class Replicas:
     """The replicas of one service, from the process that asks them."""
 
-    def __init__(self, name: str, placement: Placement, make: Callable[[], Answerer]) -> None:
+    def __init__(self, name: str, placement: Placement, make: Callable[[], Predictor]) -> None:
         """Nothing is started yet. `name` is no other application's on this cluster; `make` is
         called on each replica.
         """
@@ -100,7 +100,7 @@ class Replicas:
         self._handle: Any = None
         self._started = False
 
-    def start(self) -> Status:
+    def start(self) -> ServiceStatus:
         """Start all replicas and wait until they have loaded.
 
         Raises InputError when the network or the index cannot be used.
@@ -111,7 +111,7 @@ class Replicas:
         )  # it warns at length of what is told here in a sentence
         deployment: serve.Deployment = serve.deployment(
             num_replicas=self._placement.workers,
-            max_ongoing_requests=CALLS,
+            max_ongoing_requests=MAX_ONGOING_REQUESTS,
             ray_actor_options={"num_cpus": self._placement.cpus, "num_gpus": self._placement.gpus},
             # who asks while a replica is dead waits for so long besides the loading
             health_check_period_s=1,
@@ -122,20 +122,20 @@ class Replicas:
         serve.start(proxy_location="Disabled")
         handle = serve.run(deployment.bind(self._make), name=self._name, route_prefix=None)
         try:
-            status: Status = handle.status.remote().result(timeout_s=60)
+            status: ServiceStatus = handle.status.remote().result(timeout_s=60)
         except NotReady as error:
             raise InputError(str(error)) from None
         self._handle = handle
         return status
 
-    async def answer(self, questions: Sequence[Question]) -> list[Outcome]:
+    async def answer(self, questions: Sequence[LocateRequest]) -> list[Outcome]:
         """Raises NotReady, and Gone where the replica that was asked has died."""
         answered: list[Outcome] = await self._ask("answer", list(questions))
         return answered
 
-    async def status(self) -> Status:
+    async def status(self) -> ServiceStatus:
         """Raises NotReady, and Gone likewise."""
-        found: Status = await self._ask("status")
+        found: ServiceStatus = await self._ask("status")
         return found
 
     async def _ask(self, method: str, *arguments: Any) -> Any:
@@ -144,7 +144,7 @@ class Replicas:
         try:
             return await getattr(self._handle, method).remote(*arguments)
         except ray.exceptions.RayActorError as error:
-            raise Gone(str(error).split("\n")[0]) from None
+            raise ReplicaLost(str(error).split("\n")[0]) from None
         except DeploymentUnavailableError:
             raise NotReady("no replica can load the network and the index") from None
 

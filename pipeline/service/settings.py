@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 
-LOOPBACK = {"127.0.0.1", "::1", "localhost"}
-SHORTEST_TOKEN = 16
+LOOPBACK_HOSTS = {"127.0.0.1", "::1", "localhost"}
+MIN_TOKEN_CHARS = 16
 "Characters: fewer can be guessed by asking."
 
 
@@ -47,18 +47,18 @@ class ServiceSettings:
                 raise InputError(f"--{name} is {count}, expected at least 1")
         if not 0 <= self.port < 65_536:
             raise InputError(f"--port is {self.port}, expected 0 to 65535")
-        if self.token_file is None and self.host not in LOOPBACK:
+        if self.token_file is None and self.host not in LOOPBACK_HOSTS:
             raise InputError(
                 f"--host is {self.host}, where others can reach the service, and there is no token; give --token-file, or "
                 "keep --host 127.0.0.1"
             )
 
     @property
-    def most_bytes(self) -> int:
+    def max_bytes(self) -> int:
         return int(self.max_megabytes * 1e6)
 
     @property
-    def most_pixels(self) -> int:
+    def max_pixels(self) -> int:
         return int(self.max_megapixels * 1e6)
 
     def token(self) -> str | None:
@@ -79,13 +79,13 @@ class ServiceSettings:
             .strip()
         )
         if (
-            len(token) < SHORTEST_TOKEN
+            len(token) < MIN_TOKEN_CHARS
             or not token.isascii()
             or not token.isprintable()
             or " " in token
         ):
             raise InputError(
                 f"the first line of {self.token_file} has {len(token)} characters, expected a token of at least "
-                f"{SHORTEST_TOKEN}, ASCII without blanks; `openssl rand -hex 16` makes one"
+                f"{MIN_TOKEN_CHARS}, ASCII without blanks; `openssl rand -hex 16` makes one"
             )
         return token

@@ -12,18 +12,18 @@ from aiohttp import MultipartReader, web
 from aiohttp.http_exceptions import HttpProcessingError
 from aiohttp.multipart import BodyPartReader
 
-from pipeline.service.question import FIELDS, Refusal
+from pipeline.service.question import FIELDS, RequestError
 
-PHOTO = "photo"
-MOST_PARTS = 16
-LONGEST_FIELD = 256
+PHOTO_FIELD = "photo"
+MAX_PARTS = 16
+MAX_FIELD_BYTES = 256
 "Bytes of lat, lon, radius_m or top, and of whatever else a form sends along."
-FORM_ROOM = 65_536
+FORM_OVERHEAD_BYTES = 65_536
 "Bytes of a form beyond those of its photo: boundaries, headers, fields."
 
 
 async def read_upload(
-    request: web.Request, most_bytes: int, most_seconds: float
+    request: web.Request, max_bytes: int, most_seconds: float
 ) -> tuple[bytes, dict[str, str]]:
     """The photo and what of FIELDS is given; fields of the form stand before those of the query.
 
@@ -33,76 +33,76 @@ async def read_upload(
     try:
         async with asyncio.timeout(most_seconds):
             if request.content_type == "multipart/form-data":
-                photo, given = await _form(request, most_bytes)
+                photo, given = await _form(request, max_bytes)
                 return photo, fields | given
-            return await _bounded(request.content, most_bytes), fields
+            return await _bounded(request.content, max_bytes), fields
     except TimeoutError:
-        raise Refusal(
+        raise RequestError(
             408,
             f"the photo was not there after {most_seconds:.0f} s; send it again, or a smaller one",
         ) from None
 
 
-def refuse_by_head(request: web.BaseRequest, most_bytes: int) -> None:
+def check_headers(request: web.BaseRequest, max_bytes: int) -> None:
     """Raise Refusal where the headers alone say that the body will not be taken."""
     kind = request.content_type
     if not (
         kind in ("multipart/form-data", "application/octet-stream") or kind.startswith("image/")
     ):
-        raise Refusal(
+        raise RequestError(
             415,
             f"the content type is {kind[:60]}, expected image/jpeg, image/png, image/webp, application/octet-stream or "
-            f"multipart/form-data with the photo in the field {PHOTO}; say which it is",
+            f"multipart/form-data with the photo in the field {PHOTO_FIELD}; say which it is",
         )
     if request.headers.get("Content-Encoding", "identity") != "identity":
-        raise Refusal(
+        raise RequestError(
             415,
             "the body is compressed, expected the photo as it is; send it without Content-Encoding",
         )
-    room = FORM_ROOM if kind == "multipart/form-data" else 0
-    if (said := request.content_length) is not None and said > most_bytes + room:
-        raise too_large(most_bytes)
+    room = FORM_OVERHEAD_BYTES if kind == "multipart/form-data" else 0
+    if (said := request.content_length) is not None and said > max_bytes + room:
+        raise photo_too_large(max_bytes)
 
 
-def too_large(most_bytes: int) -> Refusal:
-    return Refusal(
-        413, f"the photo is larger than {most_bytes / 1e6:g} MB; send a smaller copy of it"
+def photo_too_large(max_bytes: int) -> RequestError:
+    return RequestError(
+        413, f"the photo is larger than {max_bytes / 1e6:g} MB; send a smaller copy of it"
     )
 
 
-async def _bounded(stream: Any, most_bytes: int) -> bytes:
+async def _bounded(stream: Any, max_bytes: int) -> bytes:
     """All of a stream, never more than the limit and one chunk of it in memory."""
     body = bytearray()
     async for chunk in stream.iter_chunked(65_536):
         body += chunk
-        if len(body) > most_bytes:
-            raise too_large(most_bytes)
+        if len(body) > max_bytes:
+            raise photo_too_large(max_bytes)
     return bytes(body)
 
 
-async def _form(request: web.Request, most_bytes: int) -> tuple[bytes, dict[str, str]]:
+async def _form(request: web.Request, max_bytes: int) -> tuple[bytes, dict[str, str]]:
     photo: bytes | None = None
     fields = {}
     try:
         reader: MultipartReader = await request.multipart()
-        for _ in range(MOST_PARTS):
+        for _ in range(MAX_PARTS):
             part = await reader.next()
             if part is None:
                 break
             if not isinstance(part, BodyPartReader):
-                raise Refusal(
+                raise RequestError(
                     400,
                     "the form holds another form, expected fields only; send the photo by itself",
                 )
-            data = await _part(part, most_bytes if part.name == PHOTO else LONGEST_FIELD)
-            if part.name == PHOTO:
+            data = await _part(part, max_bytes if part.name == PHOTO_FIELD else MAX_FIELD_BYTES)
+            if part.name == PHOTO_FIELD:
                 photo = data
             elif part.name in FIELDS:
                 fields[part.name] = data.decode("utf-8", "replace")
         else:
-            raise Refusal(
+            raise RequestError(
                 400,
-                f"the form has more than {MOST_PARTS - 1} fields; send the photo and {', '.join(FIELDS)}",
+                f"the form has more than {MAX_PARTS - 1} fields; send the photo and {', '.join(FIELDS)}",
             )
     except (
         ValueError,
@@ -111,21 +111,25 @@ async def _form(request: web.Request, most_bytes: int) -> tuple[bytes, dict[str,
         HttpProcessingError,
     ) as error:  # aiohttp's, over damaged forms
         why = " ".join(str(error).split())[:120]
-        raise Refusal(400, f"the form cannot be read: {why}; send it as a browser does") from None
+        raise RequestError(
+            400, f"the form cannot be read: {why}; send it as a browser does"
+        ) from None
     if photo is None:
-        raise Refusal(400, f"the form has no field {PHOTO}, expected the photo there; see /api")
+        raise RequestError(
+            400, f"the form has no field {PHOTO_FIELD}, expected the photo there; see /api"
+        )
     return photo, fields
 
 
-async def _part(part: BodyPartReader, most_bytes: int) -> bytes:
+async def _part(part: BodyPartReader, max_bytes: int) -> bytes:
     body = bytearray()
     while chunk := await part.read_chunk(65_536):
         body += chunk
-        if len(body) > most_bytes:
-            if part.name == PHOTO:
-                raise too_large(most_bytes)
-            raise Refusal(
+        if len(body) > max_bytes:
+            if part.name == PHOTO_FIELD:
+                raise photo_too_large(max_bytes)
+            raise RequestError(
                 400,
-                f"the form's field {str(part.name)[:40]} is longer than {most_bytes} bytes; leave it out",
+                f"the form's field {str(part.name)[:40]} is longer than {max_bytes} bytes; leave it out",
             )
     return bytes(body)

@@ -13,7 +13,7 @@ from typing import IO, Any, cast
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.progress import console, progress
-from pipeline.core.records import Split, View, as_text, is_place, make_key
+from pipeline.core.records import Split, View, escape_non_utf8, is_position, make_key
 from pipeline.shards.manifest import MANIFEST, Manifest, Shard, read_manifest
 from pipeline.shards.tar_reader import IMAGES, HashedStream, read_members
 
@@ -34,7 +34,9 @@ def open_manifest(shards: str, split: Split | None = None, view: View | None = N
     """
     if storage.exists(storage.join(shards, MANIFEST)):
         return read_manifest(shards)
-    tars = [name.removesuffix(".tar") for name in storage.names(shards) if name.endswith(".tar")]
+    tars = [
+        name.removesuffix(".tar") for name in storage.list_names(shards) if name.endswith(".tar")
+    ]
     if not tars:
         return read_manifest(shards)  # which says what is missing
     if split is None or view is None:
@@ -93,7 +95,7 @@ def facts_of(
 
     The location is the JSON's first field of LOCATIONS, else the label, else the key's folder, else
     the key: then every image is a place of its own. A position comes from plain numbers, at the top
-    or in `geotag`.
+    or in `tile_geotag`.
     """
     folder, _, _ = key.rpartition("/")
     named = next(
@@ -107,7 +109,7 @@ def facts_of(
     location = (
         named or (label or b"").decode(errors="replace").strip() or folder.rpartition("/")[2] or key
     )
-    location = as_text(location)  # JSON and names of files may hold half a character
+    location = escape_non_utf8(location)  # JSON and names of files may hold half a character
     return {
         "key": make_key(split, view, location, key),
         "location": location,
@@ -121,7 +123,7 @@ def facts_of(
 
 def _position(said: Mapping[str, Any]) -> dict[str, float] | None:
     lat, lon = (next(_numbers(said, names), math.nan) for names in (LATITUDES, LONGITUDES))
-    return {"lat": float(lat), "lon": float(lon)} if is_place(lat, lon) else None
+    return {"lat": float(lat), "lon": float(lon)} if is_position(lat, lon) else None
 
 
 def _numbers(said: Mapping[str, Any], names: tuple[str, ...]) -> Iterator[float]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from pipeline.core import json_files, storage
 from pipeline.core.errors import InputError
-from pipeline.core.json_files import as_told, is_file_name
+from pipeline.core.json_files import from_json, is_file_name
 from pipeline.core.records import Split, View, excerpt
 
 SCHEMA_VERSION = 1
@@ -73,7 +73,7 @@ def read_manifest(shards: str) -> Manifest:
             raise InputError(
                 f"{path} has schema version {said['schema_version']}, expected {SCHEMA_VERSION}; pack again"
             )
-        manifest = as_told(Manifest, said)
+        manifest = from_json(Manifest, said)
         for shard in (
             manifest.shards
         ):  # its name becomes that of files, of the set and of what is made of it

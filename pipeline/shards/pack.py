@@ -15,10 +15,10 @@ from typing import Any
 import ray
 
 from pipeline.core import cluster, json_files, rejections, storage
-from pipeline.core.errors import InputError, Unfinished
-from pipeline.core.lock import one_at_a_time
+from pipeline.core.errors import Incomplete, InputError
+from pipeline.core.lock import locks_output
 from pipeline.core.progress import console, progress
-from pipeline.core.records import ImageRecord, Rejection, Split, as_text, is_text
+from pipeline.core.records import ImageRecord, Rejection, Split, escape_non_utf8, is_utf8
 from pipeline.shards.duplicates import COLUMNS, find_duplicates
 from pipeline.shards.extend import new_records, next_numbers
 from pipeline.shards.manifest import (
@@ -77,7 +77,7 @@ class PackingSettings:
             raise InputError(f"--workers is {self.workers}, expected 0 (this process) or more")
 
 
-class TooManyRejected(Unfinished):
+class TooManyRejected(Incomplete):
     """More images were refused than `max_bad_fraction` allows."""
 
 
@@ -93,7 +93,7 @@ class Haul:
     "Images that the set held already."
 
 
-@one_at_a_time(lambda source, settings: settings.out)
+@locks_output(lambda source, settings: settings.out)
 def pack(source: Source, settings: PackingSettings) -> Manifest:
     """Pack a source's imagery; a finished set is left as it is, an unfinished one is gone on with.
 
@@ -134,7 +134,7 @@ def pack(source: Source, settings: PackingSettings) -> Manifest:
         packed |= pack_plans(again, source, settings, said, haul, doubles)
     haul.rejected += [rejection for done in packed.values() for rejection in done.rejected]
     judge(settings, haul.rejected, haul.found)
-    refusals = rejections.write(out, haul.rejected, keep=before is not None)
+    refusals = rejections.write_rejections(out, haul.rejected, keep=before is not None)
     full = {name: done for name, done in packed.items() if done.shard.samples}
     clear(out, old.union(full))
     manifest = compose(before, said, full, haul, refusals)
@@ -180,10 +180,10 @@ def finished(
     if (
         settings.extend
         or manifest.added
-        or (not damaged and rejections.is_whole(out, manifest.rejected))
+        or (not damaged and rejections.rejections_intact(out, manifest.rejected))
     ):
         return manifest, damaged
-    wrong = f"{len(damaged)} shards are" if damaged else f"{rejections.FILE} is"
+    wrong = f"{len(damaged)} shards are" if damaged else f"{rejections.REJECTED_FILE} is"
     console.print(f"{out}: {wrong} missing or damaged; what is not whole is packed again")
     return None, []
 
@@ -194,8 +194,8 @@ def gather(source: Source, root: str) -> Haul:
     rejected: list[Rejection] = []
     for found in source.scan(root):
         name = found.path if isinstance(found, Rejection) else f"{found.name}{found.location}"
-        if not is_text(name):
-            told = as_text(found.path)
+        if not is_utf8(name):
+            told = escape_non_utf8(found.path)
             rejected.append(
                 Rejection(path=told, reason="name is not UTF-8", found=told.rsplit("/", 1)[-1])
             )
@@ -210,7 +210,7 @@ def clear(out: str, wanted: frozenset[str]) -> None:
     """Take away our other tars, known by their record parts: empty ones, and those that other
     settings left.
     """
-    for name in storage.names(storage.join(out, FOLDER)):
+    for name in storage.list_names(storage.join(out, FOLDER)):
         stem = name.removesuffix(".parquet")
         if stem not in wanted:
             tar = storage.join(out, f"{stem}.tar")
@@ -289,7 +289,8 @@ def write_all(arguments: Iterable[tuple[Any, ...]], workers: int | None) -> Iter
     task = ray.remote(num_cpus=1)(write_shard)
     window = workers or 2 * cluster.cpus()
     yield from (
-        done for _, done in cluster.bounded(lambda given: task.remote(*given), arguments, window)
+        done
+        for _, done in cluster.bounded_map(lambda given: task.remote(*given), arguments, window)
     )
 
 
@@ -300,10 +301,10 @@ def judge(settings: PackingSettings, refused: Sequence[Rejection], found: int) -
     bad = [one for one in refused if not (settings.extend and one.reason == "duplicate")]
     if len(bad) <= settings.max_bad_fraction * found:
         return
-    rejections.write(settings.out, refused, keep=settings.extend)
+    rejections.write_rejections(settings.out, refused, keep=settings.extend)
     raise TooManyRejected(
-        f"{len(bad)} of {found} images were refused, more than {settings.max_bad_fraction:.2%}: {rejections.commonest(bad)}; see "
-        f"{storage.join(settings.out, rejections.FILE)}, mend them or raise --max-bad-fraction"
+        f"{len(bad)} of {found} images were refused, more than {settings.max_bad_fraction:.2%}: {rejections.most_common_reasons(bad)}; see "
+        f"{storage.join(settings.out, rejections.REJECTED_FILE)}, mend them or raise --max-bad-fraction"
     )
 
 
@@ -343,7 +344,9 @@ def sum_up(
     )
     refused = f"{len(haul.rejected)} refused"
     if haul.rejected:
-        refused += f" ({rejections.commonest(haul.rejected)}; see {rejections.FILE})"
+        refused += (
+            f" ({rejections.most_common_reasons(haul.rejected)}; see {rejections.REJECTED_FILE})"
+        )
     known = f"; {haul.known} were there already" if settings.extend else ""
     console.print(
         f"{settings.out}: {len(packed)} {'new ' if settings.extend else ''}shards, {images} images, {size / 1e6:.1f} MB, "

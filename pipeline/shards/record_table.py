@@ -16,14 +16,14 @@ import pyarrow.compute as pc
 from pipeline.core import parquet, storage
 from pipeline.core import parquet as parquet_files
 from pipeline.core.errors import InputError
-from pipeline.core.json_files import as_told
+from pipeline.core.json_files import from_json
 from pipeline.core.records import ImageRecord, Rejection
 from pipeline.shards.manifest import Manifest, Shard, mending
 
 
 def whole_part(out: str, name: str) -> bool:
     """Whether every byte of a record part is what was written."""
-    return parquet.is_whole(storage.join(out, FOLDER, f"{name}.parquet"))
+    return parquet.parquet_intact(storage.join(out, FOLDER, f"{name}.parquet"))
 
 
 FOLDER = "records"
@@ -66,10 +66,10 @@ def write_part(out: str, packed: Packed, rows: list[dict[str, Any]]) -> None:
 def read_packed(out: str, name: str) -> Packed | None:
     """What became of a tar; None where its part is missing or cannot be read."""
     try:
-        with parquet_files.opened(_path(out, name)) as parquet:
+        with parquet_files.open_parquet(_path(out, name)) as parquet:
             said = json.loads(parquet.schema_arrow.metadata[FOOTER])
-        return as_told(Packed, said)
-    except (*parquet_files.DAMAGE, KeyError, TypeError, RecursionError):
+        return from_json(Packed, said)
+    except (*parquet_files.DAMAGE_ERRORS, KeyError, TypeError, RecursionError):
         return None
 
 
@@ -81,7 +81,7 @@ def read_part(out: str, name: str, columns: list[str] | None = None) -> pa.Table
     path = _path(out, name)
     try:
         return parquet_files.read_table(path, columns)
-    except parquet_files.DAMAGE as error:
+    except parquet_files.DAMAGE_ERRORS as error:
         raise InputError(
             f"{path} cannot be read ({error}), expected the record table that packing wrote beside the tars; {mending(out)}"
         ) from None
@@ -125,7 +125,7 @@ def export(shards: str, manifest: Manifest, file: str) -> tuple[int, int]:
     if not file.lower().endswith((".geojson", ".json")):
         raise InputError(f"--export is {file}, expected a name that ends in .parquet or .geojson")
     written = without = 0
-    with storage.atomic(file) as stream:
+    with storage.atomic_write(file) as stream:
         stream.write(b'{"type": "FeatureCollection", "features": [')
         for shard in manifest.shards:
             for feature in _features(read_part(shards, shard.name)):

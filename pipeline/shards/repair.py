@@ -27,7 +27,7 @@ def damaged_shards(out: str, manifest: Manifest) -> list[Shard]:
     verification.
     """
     wrong = noted_damaged(out).union(missing_tars(out, manifest.shards))
-    parts = set(storage.names(storage.join(out, FOLDER)))
+    parts = set(storage.list_names(storage.join(out, FOLDER)))
     return [
         shard
         for shard in manifest.shards
@@ -81,7 +81,7 @@ def _plans(
     held = {record.key: record for record in records}
     keys = {shard.name: _keys(out, shard) for shard in manifest.shards}
     known = {key for each in keys.values() for key in each or ()}
-    refused = rejections.paths(out)
+    refused = rejections.rejected_paths(out)
     lost = sorted(
         (key for key, record in held.items() if key not in known and record.name not in refused),
         key=lambda key: hashlib.sha256(key.encode()).hexdigest(),
@@ -119,5 +119,5 @@ def _write(source: Source, out: str, shard: Shard, plan: ShardPlan) -> bool:
     if packed.shard != shard:
         return False
     for name in (f"{shard.name}.tar", f"{FOLDER}/{shard.name}.parquet"):
-        storage.copy(storage.join(scratch, name), storage.join(out, name))
+        storage.link_or_copy(storage.join(scratch, name), storage.join(out, name))
     return True

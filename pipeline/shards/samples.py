@@ -10,7 +10,7 @@ from typing import IO, Any, cast
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.core.records import KEY, Split, View, excerpt, is_place, is_text
+from pipeline.core.records import KEY_PATTERN, Split, View, excerpt, is_position, is_utf8
 from pipeline.shards.external import facts_of
 from pipeline.shards.manifest import mending, read_manifest
 from pipeline.shards.tar_reader import IMAGES, SAID, HashedStream, read_members, read_tar
@@ -96,15 +96,17 @@ def _faults(key: str, said: dict[str, Any]) -> Iterator[str]:
     """What of the JSON of a shard of ours cannot be as packing wrote it: whoever reads on may rely
     on the rest.
     """
-    if not KEY.fullmatch(key) or said["key"] != key:
+    if not KEY_PATTERN.fullmatch(key) or said["key"] != key:
         yield f"the key {excerpt(said['key'])}, expected that of its file"
     for name, allowed in (("view", View), ("split", Split)):
         if said[name] not in list(allowed):
             yield f"the {name} {excerpt(said[name])}, expected one of {', '.join(allowed)}"
-    if not isinstance(said["location"], str) or not is_text(said["location"]):
+    if not isinstance(said["location"], str) or not is_utf8(said["location"]):
         yield f"the location {excerpt(said['location'])}, expected text"
     tag = said["geotag"]
-    if tag is not None and not (isinstance(tag, dict) and is_place(tag.get("lat"), tag.get("lon"))):
+    if tag is not None and not (
+        isinstance(tag, dict) and is_position(tag.get("lat"), tag.get("lon"))
+    ):
         yield f"the geotag {excerpt(tag)}, expected null or a latitude and a longitude in degrees"
 
 

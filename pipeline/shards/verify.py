@@ -21,7 +21,7 @@ from pipeline.shards.tar_reader import IMAGES, SAID, HashedStream, read_members
 
 
 def refuse_damaged(shards: str, workers: int | None = None) -> None:
-    """Look at every byte of a set. Raises InputError where one is not what was packed, as `verify`
+    """Look at every byte of a set. Raises InputError where one is not what was packed, as `verify_table`
     does besides.
     """
     _, wrong = verify(shards, workers)
@@ -57,7 +57,7 @@ def _check_all(
         return
     cluster.connect()
     task = ray.remote(num_cpus=1)(check_shard)
-    yield from cluster.bounded(
+    yield from cluster.bounded_map(
         lambda shard: task.remote(root, shard), shards, workers or 2 * cluster.cpus()
     )
 

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from typing import IO, Any, Literal
 
 from pipeline.core import storage
-from pipeline.core.prefetch import ahead
+from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import ImageRecord, Rejection
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.inspect import inspect
@@ -82,10 +82,10 @@ def write_shard(
             return Rejection(path=record.name, reason=error.reason, found=error.found)
 
     rejected, rows = [], []
-    with storage.atomic(storage.join(out, f"{plan.name}.tar")) as stream:
+    with storage.atomic_write(storage.join(out, f"{plan.name}.tar")) as stream:
         tar = TarStream(stream)
         near = not plan.records or storage.is_local(plan.records[0].path)
-        found = ahead(prepare, plan.records, READERS if near else REMOTE_READERS, READ_AHEAD)
+        found = prefetch_map(prepare, plan.records, READERS if near else REMOTE_READERS, READ_AHEAD)
         for record, member in zip(plan.records, found, strict=True):
             if isinstance(member, Rejection):
                 rejected.append(member)

@@ -89,7 +89,7 @@ class Day:
         return np.clip(np.stack(rows) + 0.5, 0, 255).astype(np.uint8)
 
 
-def draw_day(rng: np.random.Generator) -> Day:
+def sample_day(rng: np.random.Generator) -> Day:
     """A day at random in a temperate, northern place: the sun stands in the southern half of the
     sky.
     """
@@ -125,9 +125,9 @@ class LitMap:
     """Metres: what lies lower at this pixel is in shadow."""
 
 
-def light(world: World, day: Day) -> LitMap:
+def light_world(world: World, day: Day) -> LitMap:
     """Dress the world for the season, light it and cast its shadows."""
-    colour_HW3 = _dress(world, day.season)
+    colour_HW3 = _apply_season(world, day.season)
     if world.light_is_baked and not world.height_HW.any():
         shadow_top_HW = np.zeros_like(world.height_HW)
     else:
@@ -137,8 +137,8 @@ def light(world: World, day: Day) -> LitMap:
     if not world.light_is_baked:
         depth_HW = shadow_top_HW - world.height_HW
         open_HW = 1 - np.clip(depth_HW / np.float32(0.5), 0, 1)
-        direct_HW = open_HW * _slope_light(world, day)
-        sky_HW = 1 - np.float32(0.45) * _hemmed_in(world)
+        direct_HW = open_HW * _slope_shading(world, day)
+        sky_HW = 1 - np.float32(0.45) * _sky_occlusion(world)
         sky_3, sun_3 = day.sky_light(), day.sun_light()
         for c in range(3):
             colour_HW3[..., c] *= sky_3[c] * sky_HW + sun_3[c] * direct_HW
@@ -150,7 +150,7 @@ def light(world: World, day: Day) -> LitMap:
     )
 
 
-def _dress(world: World, season: Season) -> FloatMap:
+def _apply_season(world: World, season: Season) -> FloatMap:
     """Colours with grass and leaves as the season has them."""
     colour_HW3 = world.texture_HW3.astype(np.float32)
     if season == "summer":
@@ -168,7 +168,7 @@ def _dress(world: World, season: Season) -> FloatMap:
     return colour_HW3
 
 
-def _slope_light(world: World, day: Day) -> FloatMap:
+def _slope_shading(world: World, day: Day) -> FloatMap:
     """Sunlight on roofs and crowns by their slope, 1 on flat ground. Walls are no slopes and count
     as flat.
     """
@@ -185,7 +185,7 @@ def _slope_light(world: World, day: Day) -> FloatMap:
     return lit_HW
 
 
-def _hemmed_in(world: World) -> FloatMap:
+def _sky_occlusion(world: World) -> FloatMap:
     """How much of the sky the surroundings hide, 0 to 1, from the mean height around."""
     radius = max(1, round(3.5 / world.metres_per_pixel))
     around_HW = _box_mean(_box_mean(world.height_HW, radius).T, radius).T

@@ -14,7 +14,13 @@ from typing import Any, Literal
 
 from pipeline.core import json_files, storage
 from pipeline.core.errors import InputError
-from pipeline.simulation.location import Order, Photographs, geotag, offset, photograph
+from pipeline.simulation.location import (
+    LocationImages,
+    LocationSpec,
+    geotag,
+    offset_latlon,
+    render_location,
+)
 
 Role = Literal["train", "test", "distractor"]
 LAYOUT: dict[Role, tuple[str, ...]] = {
@@ -26,44 +32,44 @@ LAYOUT: dict[Role, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
+class LocationJob:
     """One location to be made by one task."""
 
     root: str
     role: Role
-    order: Order
+    order: LocationSpec
 
     @property
     def name(self) -> str:
         return f"{self.order.location:04d}"
 
 
-def make_location(job: Job) -> dict[str, float]:
+def write_location(job: LocationJob) -> dict[str, float]:
     """Take and place all pictures of a location, then its part file; seconds spent by step.
 
     Whatever an earlier, broken attempt left of the location is replaced.
     """
-    taken = photograph(job.order)
+    taken = render_location(job.order)
     first, *others = LAYOUT[job.role]
     names = {
         "satellite": {f"{job.name}.jpg": taken.satellite},
         "drone": {f"image-{i:02d}.jpeg": data for i, data in enumerate(taken.drone, 1)},
     }
     for view, files in names.items():
-        folder = _fresh(Path(job.root), first.format(view=view), job.name)
+        folder = _create_hidden_folder(Path(job.root), first.format(view=view), job.name)
         for name, data in files.items():
             (folder / name).write_bytes(data)
-        home = _settle(folder)
+        home = _publish_folder(folder)
         for other in others:
-            folder = _fresh(Path(job.root), other.format(view=view), job.name)
+            folder = _create_hidden_folder(Path(job.root), other.format(view=view), job.name)
             for name in files:
-                _share(home / name, folder / name)
-            _settle(folder)
-    json_files.write_checksummed(str(part(job)), {"poses": _pose_rows(job, taken)})
+                _link_or_copy(home / name, folder / name)
+            _publish_folder(folder)
+    json_files.write_checksummed(str(part_path(job)), {"poses": _pose_rows(job, taken)})
     return taken.seconds
 
 
-def _fresh(root: Path, below: str, name: str) -> Path:
+def _create_hidden_folder(root: Path, below: str, name: str) -> Path:
     """An empty folder beside the one that it will become: hidden, so that readers pass it over."""
     folder = root / below / f".{name}"
     if folder.exists():
@@ -72,7 +78,7 @@ def _fresh(root: Path, below: str, name: str) -> Path:
     return folder
 
 
-def _settle(folder: Path) -> Path:
+def _publish_folder(folder: Path) -> Path:
     """Give the folder its name: all its pictures appear at once."""
     home = folder.with_name(folder.name[1:])
     if home.exists():
@@ -80,25 +86,25 @@ def _settle(folder: Path) -> Path:
     return folder.rename(home)
 
 
-def _share(file: Path, link: Path) -> None:
+def _link_or_copy(file: Path, link: Path) -> None:
     try:
         os.link(file, link)
     except OSError:  # a file system without hard links
         shutil.copyfile(file, link)
 
 
-def part(job: Job) -> Path:
+def part_path(job: LocationJob) -> Path:
     """The file that says that a location is complete."""
     return Path(job.root) / ".parts" / f"{job.name}.json"
 
 
-def _pose_rows(job: Job, taken: Photographs) -> list[dict[str, Any]]:
+def _pose_rows(job: LocationJob, taken: LocationImages) -> list[dict[str, Any]]:
     """Rows of `poses.csv`: each picture under each of its paths."""
     lat, lon = geotag(job.order.location)
     rows = []
     for folder in LAYOUT[job.role]:
         for i, pose in enumerate(taken.poses, 1):
-            camera_lat, camera_lon = offset(lat, lon, pose.x_m, pose.y_m)
+            camera_lat, camera_lon = offset_latlon(lat, lon, pose.x_m, pose.y_m)
             rows.append(
                 {
                     "path": f"{folder.format(view='drone')}/{job.name}/image-{i:02d}.jpeg",
@@ -124,7 +130,7 @@ def _read_poses(path: Path) -> list[dict[str, Any]]:
     return poses
 
 
-def write_tables(root: Path, jobs: list[Job]) -> None:
+def write_tables(root: Path, jobs: list[LocationJob]) -> None:
     """Write `locations.csv` and `poses.csv`, once all locations are there.
 
     Raises InputError where a location's part is not what was written.
@@ -134,7 +140,7 @@ def write_tables(root: Path, jobs: list[Job]) -> None:
     for job in ordered:
         lat, lon = geotag(job.order.location)
         places.append({"location": job.name, "lat": f"{lat:.7f}", "lon": f"{lon:.7f}"})
-    poses = [row for job in ordered for row in _read_poses(part(job))]
+    poses = [row for job in ordered for row in _read_poses(part_path(job))]
     for name, rows in (
         ("locations.csv", places),
         ("poses.csv", sorted(poses, key=lambda row: str(row["path"]))),

@@ -12,17 +12,17 @@ from math import cos, pi, radians, sin, sqrt
 import numpy as np
 import simplejpeg
 
-from pipeline.simulation.appearance import draw_day
+from pipeline.simulation.appearance import sample_day
 from pipeline.simulation.flight import FlightPlan, Pose
-from pipeline.simulation.render import nadir, perspective
-from pipeline.simulation.scene import prepare
+from pipeline.simulation.render import render_nadir, render_perspective
+from pipeline.simulation.scene import prepare_scene
 from pipeline.simulation.texture import FLIGHT_OVER_TEXTURE, textured_world
-from pipeline.simulation.town.town import town
+from pipeline.simulation.town.town import make_town
 from pipeline.simulation.world import ByteMap
 
 JPEG_QUALITY = 90
 """Pictures of cameras and map services are compressed about as much."""
-SATELLITE_HALF = 1.7
+SATELLITE_HALF_SIDE_RADII = 1.7
 """Half the side of the satellite picture, target radii: between the first UAV frame's 2.1 and the
 last one's 1.2.
 """
@@ -36,7 +36,7 @@ METRES_PER_DEGREE = 111_320.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Order:
+class LocationSpec:
     """What to photograph."""
 
     seed: int
@@ -53,7 +53,7 @@ class Order:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Photographs:
+class LocationImages:
     """What came of it."""
 
     satellite: bytes
@@ -63,7 +63,7 @@ class Photographs:
     "How long it took, by step."
 
 
-def photograph(order: Order) -> Photographs:
+def render_location(order: LocationSpec) -> LocationImages:
     """Make the world, let the satellite pass on one day and the UAV fly on another.
 
     Raises InputError for a texture that cannot be read.
@@ -72,7 +72,7 @@ def photograph(order: Order) -> Photographs:
     streams = np.random.default_rng([order.seed, order.location]).spawn(5)
     for_world, for_satellite, for_satellite_day, for_flight, for_flight_day = streams
     if order.texture is None:
-        world = town(for_world, frame_pixels=order.size)
+        world = make_town(for_world, frame_pixels=order.size)
         plan = FlightPlan(views=order.views)
     else:
         world = textured_world(
@@ -81,10 +81,10 @@ def photograph(order: Order) -> Photographs:
         plan = replace(FLIGHT_OVER_TEXTURE, views=order.views)
     made = time.perf_counter()
     radius = world.target_radius_m
-    above = nadir(
-        prepare(world, draw_day(for_satellite_day)),
+    above = render_nadir(
+        prepare_scene(world, sample_day(for_satellite_day)),
         size=order.size,
-        half_m=SATELLITE_HALF * radius * float(for_satellite.uniform(0.95, 1.08)),
+        half_m=SATELLITE_HALF_SIDE_RADII * radius * float(for_satellite.uniform(0.95, 1.08)),
         shift_m=(
             float(for_satellite.normal(0, 0.05)) * radius,
             float(for_satellite.normal(0, 0.05)) * radius,
@@ -92,21 +92,21 @@ def photograph(order: Order) -> Photographs:
         turn_deg=float(for_satellite.uniform(-5, 5)),
         rng=for_satellite,
     )
-    scene = prepare(world, draw_day(for_flight_day))
+    scene = prepare_scene(world, sample_day(for_flight_day))
     first_heading = float(for_flight.uniform(0, 360))
     poses = plan.poses(radius_m=radius, first_heading_deg=first_heading)
-    frames = [perspective(scene, pose, size=order.size, rng=for_flight) for pose in poses]
+    frames = [render_perspective(scene, pose, size=order.size, rng=for_flight) for pose in poses]
     rendered = time.perf_counter()
-    satellite, drone = encode(above), [encode(frame) for frame in frames]
+    satellite, drone = encode_jpeg(above), [encode_jpeg(frame) for frame in frames]
     seconds = {
         "world": made - begin,
         "render": rendered - made,
         "encode": time.perf_counter() - rendered,
     }
-    return Photographs(satellite=satellite, drone=drone, poses=poses, seconds=seconds)
+    return LocationImages(satellite=satellite, drone=drone, poses=poses, seconds=seconds)
 
 
-def encode(frame_SS3: ByteMap) -> bytes:
+def encode_jpeg(frame_SS3: ByteMap) -> bytes:
     """The frame as JPEG."""
     jpeg: bytes = simplejpeg.encode_jpeg(
         frame_SS3, quality=JPEG_QUALITY, colorspace="RGB", colorsubsampling="420"
@@ -120,9 +120,9 @@ def geotag(location: int) -> tuple[float, float]:
     """
     away = SPACING_M * sqrt(location / pi)
     turn = location * pi * (3 - sqrt(5))
-    return offset(CENTRE_LAT, CENTRE_LON, away * sin(turn), away * cos(turn))
+    return offset_latlon(CENTRE_LAT, CENTRE_LON, away * sin(turn), away * cos(turn))
 
 
-def offset(lat: float, lon: float, east_m: float, north_m: float) -> tuple[float, float]:
+def offset_latlon(lat: float, lon: float, east_m: float, north_m: float) -> tuple[float, float]:
     """The point so far east and north of another; exact enough over a few kilometres."""
     return lat + north_m / METRES_PER_DEGREE, lon + east_m / (METRES_PER_DEGREE * cos(radians(lat)))

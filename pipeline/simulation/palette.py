@@ -32,7 +32,7 @@ PAVING: tuple[Colour, ...] = (
     (170, 142, 122),
 )
 EARTH: tuple[Colour, ...] = ((156, 134, 106), (168, 150, 124), (136, 116, 92))
-WATER: tuple[Colour, ...] = ((52, 72, 76), (62, 82, 74), (44, 60, 74))
+WATER_COLOURS: tuple[Colour, ...] = ((52, 72, 76), (62, 82, 74), (44, 60, 74))
 FLAT_ROOFS: tuple[Colour, ...] = (
     (196, 196, 194),
     (226, 226, 222),
@@ -94,7 +94,9 @@ WALLS: tuple[Colour, ...] = (
 GLASS: tuple[Colour, ...] = ((58, 70, 82), (72, 90, 100), (46, 54, 60), (92, 112, 122))
 
 
-def pick(rng: np.random.Generator, colours: tuple[Colour, ...], *, spread: float = 7.0) -> Colour:
+def pick_colour(
+    rng: np.random.Generator, colours: tuple[Colour, ...], *, spread: float = 7.0
+) -> Colour:
     """One of the colours, a little lighter or darker and a little off in hue, as paint and weather
     make it.
     """
@@ -104,7 +106,7 @@ def pick(rng: np.random.Generator, colours: tuple[Colour, ...], *, spread: float
     return (r + light + float(hue[0]), g + light + float(hue[1]), b + light + float(hue[2]))
 
 
-def shade(colour: Colour, factor: float) -> Colour:
+def scale_brightness(colour: Colour, factor: float) -> Colour:
     """The colour, lighter (factor above 1) or darker."""
     return (
         min(250.0, colour[0] * factor),
@@ -113,11 +115,11 @@ def shade(colour: Colour, factor: float) -> Colour:
     )
 
 
-def facade(rng: np.random.Generator, *, kind: str) -> Facade:
+def random_facade(rng: np.random.Generator, *, kind: str) -> Facade:
     """A facade of a kind: "house", "hall" (few windows), or "block" (punched, ribbon or curtain
     windows).
     """
-    wall, glass = pick(rng, WALLS), pick(rng, GLASS)
+    wall, glass = pick_colour(rng, WALLS), pick_colour(rng, GLASS)
     if kind == "house":
         return Facade(wall=wall, glass=glass, storey_m=2.9, bay_m=float(rng.uniform(2.6, 4.2)),
                       window_wide=0.38, window_high=0.42)  # fmt: skip
@@ -139,7 +141,7 @@ def facade(rng: np.random.Generator, *, kind: str) -> Facade:
         return Facade(wall=wall, glass=glass, storey_m=storey, window_wide=1.0,
                       window_high=float(rng.uniform(0.35, 0.55)))  # fmt: skip
     return Facade(
-        wall=shade(wall, 0.8),
+        wall=scale_brightness(wall, 0.8),
         glass=glass,
         storey_m=storey,
         bay_m=float(rng.uniform(1.6, 3.0)),

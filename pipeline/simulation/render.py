@@ -15,27 +15,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulation.flight import Pose
-from pipeline.simulation.scene import COARSE, Scene
+from pipeline.simulation.scene import COARSE_CELL_PX, Scene
 from pipeline.simulation.walls import wall_colours
 from pipeline.simulation.world import ByteMap, FloatMap
 
 RAYS_PER_PIXEL = 2
 """Rays along each side of a pixel: 4 in all, averaged."""
-BEAM = 4
+BUNDLE_SIDE = 4
 """Rays along a side of the bundle that starts together; its footprint has to stay within a coarse
 cell.
 """
-RAYS_AT_ONCE = 65_536
+BAND_RAYS = 65_536
 """Rays of a band: a dozen arrays of them fit a core's cache."""
-BEAM_STEP = 3.0
+BUNDLE_STEP_PX = 3.0
 """Map pixels that a bundle goes between two looks at the coarse map."""
-WALL_M = 0.35
+WALL_DEPTH_M = 0.35
 """A ray that meets the surface this far below its top has met a wall."""
 
 Indices = NDArray[np.int32]
 
 
-def nadir(scene: Scene, *, size: int, half_m: float, shift_m: tuple[float, float] = (0.0, 0.0), turn_deg: float = 0.0,
+def render_nadir(scene: Scene, *, size: int, half_m: float, shift_m: tuple[float, float] = (0.0, 0.0), turn_deg: float = 0.0,
           rng: np.random.Generator | None = None) -> ByteMap:  # fmt: skip
     """A square of side 2 * half_m metres around `shift_m` seen from straight above, (S, S, 3);
     north is up.
@@ -50,11 +50,11 @@ def nadir(scene: Scene, *, size: int, half_m: float, shift_m: tuple[float, float
     c, s = np.float32(cos(radians(turn_deg))), np.float32(sin(radians(turn_deg)))
     cols = c * axis[None, :] + s * axis[:, None] + np.float32(scene.origin + shift_m[0] / mpp)
     rows = c * axis[:, None] - s * axis[None, :] + np.float32(scene.origin - shift_m[1] / mpp)
-    cells = _cells(rows, cols, scene.packed_HW.shape[1])
-    return _develop(scene, scene.packed_HW.take(cells, mode="clip"), rng)
+    cells = _flat_indices(rows, cols, scene.packed_HW.shape[1])
+    return _apply_sensor(scene, scene.packed_HW.take(cells, mode="clip"), rng)
 
 
-def perspective(
+def render_perspective(
     scene: Scene, pose: Pose, *, size: int, rng: np.random.Generator | None = None
 ) -> ByteMap:
     """The frame (S, S, 3) that a pinhole camera at `pose` takes. With `rng`, the sensor adds its
@@ -63,28 +63,30 @@ def perspective(
     n = size * RAYS_PER_PIXEL
     # Bands of rows, whole bundles high, whose arrays stay in the processor's cache: half the time
     # of one go.
-    band = max(BEAM, RAYS_AT_ONCE // n // BEAM * BEAM)
+    band = max(BUNDLE_SIDE, BAND_RAYS // n // BUNDLE_SIDE * BUNDLE_SIDE)
     seen_NN = np.empty((n, n), np.uint32)
     for first in range(0, n, band):
         rows = slice(first, min(n, first + band))
-        seen_NN[rows] = _look(scene, _rays(scene, pose, n, rows))
-    return _develop(scene, seen_NN, rng)
+        seen_NN[rows] = _trace_band(scene, _rays(scene, pose, n, rows))
+    return _apply_sensor(scene, seen_NN, rng)
 
 
-def _look(scene: Scene, rays: tuple[FloatMap, FloatMap, FloatMap, FloatMap]) -> NDArray[np.uint32]:
+def _trace_band(
+    scene: Scene, rays: tuple[FloatMap, FloatMap, FloatMap, FloatMap]
+) -> NDArray[np.uint32]:
     """Packed colours that the rays of a band meet."""
     col_a, col_b, row_a, row_b = rays
     fall = 1 / np.sqrt(col_b * col_b + row_b * row_b)  # metres down per map pixel along
-    z = _beam_start(scene, col_a, col_b, row_a, row_b, fall)
+    z = _bundle_start(scene, col_a, col_b, row_a, row_b, fall)
     flat = [a.ravel() for a in (col_a, col_b, row_a, row_b, fall)]
-    above, below = _descend(scene, z.ravel(), *flat)
+    above, below = _march(scene, z.ravel(), *flat)
     width = scene.height_HW.shape[1]
-    cells = _cells(flat[2] + flat[3] * below, flat[0] + flat[1] * below, width)
+    cells = _flat_indices(flat[2] + flat[3] * below, flat[0] + flat[1] * below, width)
     seen = scene.packed_HW.take(cells, mode="clip")
-    walls = np.nonzero(scene.height_HW.take(cells, mode="clip") - below > WALL_M)[0]
+    walls = np.nonzero(scene.height_HW.take(cells, mode="clip") - below > WALL_DEPTH_M)[0]
     if walls.size:
         z_walls, hit = above[walls], cells[walls]
-        before = _cells(
+        before = _flat_indices(
             flat[2][walls] + flat[3][walls] * z_walls,
             flat[0][walls] + flat[1][walls] * z_walls,
             width,
@@ -131,24 +133,24 @@ def _rays(
     return col_a, col_b, row_a, row_b
 
 
-def _beam_start(
+def _bundle_start(
     scene: Scene, col_a: FloatMap, col_b: FloatMap, row_a: FloatMap, row_b: FloatMap, fall: FloatMap
 ) -> FloatMap:
     """Heights at which the rays start: low, yet above anything that any ray of the bundle can meet."""
     top = np.float32(scene.height_HW.max() + 0.01)
     spread = _footprint(col_a, row_a)
-    bundle = BEAM if spread * BEAM / 2 + BEAM_STEP <= COARSE else 1
-    if bundle == 1 and spread + BEAM_STEP > COARSE:
+    bundle = BUNDLE_SIDE if spread * BUNDLE_SIDE / 2 + BUNDLE_STEP_PX <= COARSE_CELL_PX else 1
+    if bundle == 1 and spread + BUNDLE_STEP_PX > COARSE_CELL_PX:
         return np.full_like(col_a, top)
     middle = slice(bundle // 2, None, bundle)
     ca, cb, ra, rb = (
-        m[middle, middle] * np.float32(1 / COARSE) for m in (col_a, col_b, row_a, row_b)
+        m[middle, middle] * np.float32(1 / COARSE_CELL_PX) for m in (col_a, col_b, row_a, row_b)
     )
-    step = fall[middle, middle] * np.float32(BEAM_STEP)
+    step = fall[middle, middle] * np.float32(BUNDLE_STEP_PX)
     z = np.full_like(ca, top)
     width = scene.coarse_hw.shape[1]
     while True:
-        highest = scene.coarse_hw.take(_cells(ra + rb * z, ca + cb * z, width), mode="clip")
+        highest = scene.coarse_hw.take(_flat_indices(ra + rb * z, ca + cb * z, width), mode="clip")
         lower = z - step
         free = highest < lower
         if not free.any():
@@ -170,7 +172,7 @@ def _footprint(col_a: FloatMap, row_a: FloatMap) -> float:
     )
 
 
-def _descend(
+def _march(
     scene: Scene,
     z: FloatMap,
     col_a: FloatMap,
@@ -190,7 +192,8 @@ def _descend(
             # A ray that has met something does not move, and meets it again: no mask is needed.
             lower = now - step
             free = (
-                height_HW.take(_cells(ra + rb * lower, ca + cb * lower, width), mode="clip") < lower
+                height_HW.take(_flat_indices(ra + rb * lower, ca + cb * lower, width), mode="clip")
+                < lower
             )
             now = np.where(free, lower, now)
         left = np.nonzero(free)[0]
@@ -208,7 +211,7 @@ def _descend(
         middle = (above + below) * np.float32(0.5)
         hit = (
             height_HW.take(
-                _cells(row_a + row_b * middle, col_a + col_b * middle, width), mode="clip"
+                _flat_indices(row_a + row_b * middle, col_a + col_b * middle, width), mode="clip"
             )
             >= middle
         )
@@ -217,7 +220,7 @@ def _descend(
     return above, below
 
 
-def _cells(rows: FloatMap, cols: FloatMap, width: int) -> Indices:
+def _flat_indices(rows: FloatMap, cols: FloatMap, width: int) -> Indices:
     """Flat indices of map positions; positions beyond the padding end up on some other pixel, which
     nobody minds.
     """
@@ -227,7 +230,7 @@ def _cells(rows: FloatMap, cols: FloatMap, width: int) -> Indices:
     return cells
 
 
-def _develop(
+def _apply_sensor(
     scene: Scene, packed_NN: NDArray[np.uint32], rng: np.random.Generator | None
 ) -> ByteMap:
     """Average the rays of each pixel, add the sensor's noise and apply its curve: (S, S, 3)."""

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulation.appearance import Day, light
+from pipeline.simulation.appearance import Day, light_world
 from pipeline.simulation.walls import FacadeTable
 from pipeline.simulation.world import ByteMap, FloatMap, World
 
@@ -19,7 +19,7 @@ Number = TypeVar("Number", bound=np.generic)
 
 REACH_IN_RADII = 4.5
 """How far from the middle a frame of the default flight can see, in target radii."""
-COARSE = 8
+COARSE_CELL_PX = 8
 """Map pixels along a side of a cell of the coarse map."""
 
 
@@ -44,15 +44,16 @@ class Scene:
     curve_3V: ByteMap
 
 
-def prepare(world: World, day: Day) -> Scene:
+def prepare_scene(world: World, day: Day) -> Scene:
     """Light the world and lay it out; done once per day, used for every frame of it."""
-    lit = light(world, day)
+    lit = light_world(world, day)
     side = world.height_HW.shape[0]
     pad = max(
-        2 * COARSE, ceil(REACH_IN_RADII * world.target_radius_m / world.metres_per_pixel - side / 2)
+        2 * COARSE_CELL_PX,
+        ceil(REACH_IN_RADII * world.target_radius_m / world.metres_per_pixel - side / 2),
     )
     # The coarse map needs whole cells.
-    extra = -(side + 2 * pad) % COARSE
+    extra = -(side + 2 * pad) % COARSE_CELL_PX
     widths = ((pad, pad + extra), (pad, pad + extra))
 
     def padded(map_HW: NDArray[Number]) -> NDArray[Number]:
@@ -81,8 +82,8 @@ def prepare(world: World, day: Day) -> Scene:
 
 def _coarse_maxima(height_HW: FloatMap) -> FloatMap:
     """Per cell the highest point of it and of its eight neighbours."""
-    h, w = height_HW.shape[0] // COARSE, height_HW.shape[1] // COARSE
-    cells = height_HW.reshape(h, COARSE, w, COARSE).max(axis=(1, 3))
+    h, w = height_HW.shape[0] // COARSE_CELL_PX, height_HW.shape[1] // COARSE_CELL_PX
+    cells = height_HW.reshape(h, COARSE_CELL_PX, w, COARSE_CELL_PX).max(axis=(1, 3))
     edged = np.pad(cells, 1, mode="edge")
     rows = np.maximum(np.maximum(edged[:-2], edged[1:-1]), edged[2:])
     maxima: FloatMap = np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])

@@ -25,30 +25,32 @@ def cast_shadows(
     step_cols, step_rows = east / reach, -north / reach
     drop = metres_per_pixel * up / reach
     longest = float(height_HW.max()) / drop
-    top_HW = _shifted(height_HW, step_rows, step_cols) - np.float32(drop)
+    top_HW = _shift_subpixel(height_HW, step_rows, step_cols) - np.float32(drop)
     steps = 1
     while steps < longest:
-        further = _shifted(top_HW, steps * step_rows, steps * step_cols) - np.float32(steps * drop)
+        further = _shift_subpixel(top_HW, steps * step_rows, steps * step_cols) - np.float32(
+            steps * drop
+        )
         np.maximum(top_HW, further, out=top_HW)
         steps *= 2
     reached: FloatMap = np.maximum(top_HW, 0)
     return reached
 
 
-def _shifted(map_HW: FloatMap, rows: float, cols: float) -> FloatMap:
+def _shift_subpixel(map_HW: FloatMap, rows: float, cols: float) -> FloatMap:
     """The map as seen from `rows` down and `cols` right; one of the two is whole, the other is
     blended. 0 beyond.
     """
     low_r, low_c = int(np.floor(rows + 1e-6)), int(np.floor(cols + 1e-6))
     part_r, part_c = rows - low_r, cols - low_c
-    out = _moved(map_HW, low_r, low_c)
+    out = _shift_pixels(map_HW, low_r, low_c)
     blend, next_r, next_c = (part_r, 1, 0) if part_r > part_c else (part_c, 0, 1)
     if blend > 1e-4:
-        out += np.float32(blend) * (_moved(map_HW, low_r + next_r, low_c + next_c) - out)
+        out += np.float32(blend) * (_shift_pixels(map_HW, low_r + next_r, low_c + next_c) - out)
     return out
 
 
-def _moved(map_HW: FloatMap, rows: int, cols: int) -> FloatMap:
+def _shift_pixels(map_HW: FloatMap, rows: int, cols: int) -> FloatMap:
     out = np.zeros_like(map_HW)
     h, w = map_HW.shape
     if abs(rows) < h and abs(cols) < w:

@@ -24,10 +24,10 @@ import ray
 
 from pipeline.core import cluster, json_files, storage
 from pipeline.core.errors import InputError
-from pipeline.core.lock import one_at_a_time
+from pipeline.core.lock import locks_output
 from pipeline.core.progress import console, progress
-from pipeline.simulation.layout import Job, Role, make_location, part, write_tables
-from pipeline.simulation.location import Order
+from pipeline.simulation.layout import LocationJob, Role, part_path, write_location, write_tables
+from pipeline.simulation.location import LocationSpec
 from pipeline.simulation.texture import usable_textures
 
 MOST_LOCATIONS, MOST_VIEWS = 1_000_000, 10_000
@@ -89,7 +89,7 @@ class SimulationSettings:
             )
 
 
-@one_at_a_time(lambda settings: settings.out)
+@locks_output(lambda settings: settings.out)
 def simulate(settings: SimulationSettings) -> Path:
     """Make the data set, or what is missing of it; its folder.
 
@@ -99,27 +99,27 @@ def simulate(settings: SimulationSettings) -> Path:
         raise InputError(
             f"--out is {settings.out}; expected a local or mounted folder; make it there and copy it"
         )
-    root = Path(storage.locate(settings.out)[1]).absolute()
+    root = Path(storage.resolve(settings.out)[1]).absolute()
     # Tasks may run in another working directory, so they are given whole paths.
     textures, passed_over = (
         usable_textures(storage.absolute(settings.textures)) if settings.textures else ([], 0)
     )
-    described = _describe(settings, textures)
+    described = _settings_metadata(settings, textures)
     if _is_complete(root, described):
         shutil.rmtree(
             root / ".parts", ignore_errors=True
         )  # of a run that was killed between its last two steps
         console.print(f"{root} is complete already; nothing to do")
         return root
-    jobs = plan(settings, str(root), textures)
+    jobs = plan_jobs(settings, str(root), textures)
     if passed_over:
         console.print(
             f"{settings.textures}: {passed_over} files are no usable images and were passed over"
         )
     (root / ".parts").mkdir(parents=True, exist_ok=True)
     json_files.write_checksummed(str(root / ".parts" / "settings.json"), described)
-    todo = [job for job in jobs if not part(job).exists()]
-    spent = _make(todo, len(jobs), settings.views + 1)
+    todo = [job for job in jobs if not part_path(job).exists()]
+    spent = _run_jobs(todo, len(jobs), settings.views + 1)
     write_tables(root, jobs)
     json_files.write_checksummed(str(root / "simulation.json"), described)
     shutil.rmtree(root / ".parts")
@@ -128,7 +128,7 @@ def simulate(settings: SimulationSettings) -> Path:
     return root
 
 
-def plan(settings: SimulationSettings, root: str, textures: list[str]) -> list[Job]:
+def plan_jobs(settings: SimulationSettings, root: str, textures: list[str]) -> list[LocationJob]:
     """One job per location. Numbers are dealt out at random, so that they say nothing about the
     role.
     """
@@ -144,10 +144,10 @@ def plan(settings: SimulationSettings, root: str, textures: list[str]) -> list[J
     numbers = rng.permutation(len(roles)) + 1
     dealt = rng.permutation(len(textures)) if textures else None
     return [
-        Job(
+        LocationJob(
             root=root,
             role=role,
-            order=Order(
+            order=LocationSpec(
                 seed=settings.seed,
                 location=int(number),
                 views=settings.views,
@@ -160,23 +160,23 @@ def plan(settings: SimulationSettings, root: str, textures: list[str]) -> list[J
     ]
 
 
-def _make(todo: list[Job], total: int, pictures: int) -> Counter[str]:
+def _run_jobs(todo: list[LocationJob], total: int, pictures: int) -> Counter[str]:
     """Run the jobs over the cluster; seconds spent by step, over all of them."""
     spent: Counter[str] = Counter()
     if not todo:
         return spent
     cluster.connect()
-    task = ray.remote(num_cpus=1)(make_location)
+    task = ray.remote(num_cpus=1)(write_location)
     with progress(len(todo) * pictures, "simulate", "images") as meter:
         if len(todo) < total:
             meter.note(f"{total - len(todo)} of {total} locations are there already")
-        for _, seconds in cluster.bounded(task.remote, todo, window=2 * cluster.cpus()):
+        for _, seconds in cluster.bounded_map(task.remote, todo, window=2 * cluster.cpus()):
             spent.update(seconds)
             meter.advance(pictures)
     return spent
 
 
-def _describe(settings: SimulationSettings, textures: list[str]) -> dict[str, Any]:
+def _settings_metadata(settings: SimulationSettings, textures: list[str]) -> dict[str, Any]:
     """What the data set depends on; where it lies, and where its textures lie, is no part of it."""
     described = {
         name: value for name, value in asdict(settings).items() if name not in ("out", "textures")

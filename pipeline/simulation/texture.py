@@ -14,17 +14,17 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from pipeline.core.errors import InputError
-from pipeline.images.decode import FORMATS
+from pipeline.images.decode import PILLOW_FORMATS
 from pipeline.simulation.flight import FlightPlan
 from pipeline.simulation.town.town import TEXELS_PER_RADIUS
 from pipeline.simulation.world import FloatMap, World
 
-IMAGE_NAMES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
-UNREADABLE = (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError)
+TEXTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
+DECODE_ERRORS = (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError)
 """What Pillow raises for files that are no pictures, or broken, or absurdly large ones."""
-LEAST_PIXELS = 64
+MIN_SIDE_PX = 64
 """Shorter sides hold too little to fly over."""
-RADIUS_PART = 0.21
+RADIUS_FRACTION = 0.21
 """Target radius as a part of the picture's side: the satellite view stays on it, and most of the
 first UAV frame.
 """
@@ -50,25 +50,25 @@ def usable_textures(folder: str) -> tuple[list[str], int]:
     usable = [str(path) for path in files if _is_usable(path)]
     if not usable:
         raise InputError(
-            f"{folder} holds {len(files)} files and none is an image of at least {LEAST_PIXELS} pixels a side; "
-            f"expected overhead images ({', '.join(IMAGE_NAMES)}); check --textures"
+            f"{folder} holds {len(files)} files and none is an image of at least {MIN_SIDE_PX} pixels a side; "
+            f"expected overhead images ({', '.join(TEXTURE_SUFFIXES)}); check --textures"
         )
     return usable, len(files) - len(usable)
 
 
 def _is_usable(path: Path) -> bool:
-    if not path.name.lower().endswith(IMAGE_NAMES):
+    if not path.name.lower().endswith(TEXTURE_SUFFIXES):
         return False
     try:
-        with Image.open(path, formats=FORMATS) as image:
+        with Image.open(path, formats=PILLOW_FORMATS) as image:
             least = min(image.size)
             # A truncated file shows only when it is decoded; a JPEG at an eighth of its size shows
             # it as well.
-            image.draft("RGB", (LEAST_PIXELS, LEAST_PIXELS))
+            image.draft("RGB", (MIN_SIDE_PX, MIN_SIDE_PX))
             image.load()
-    except UNREADABLE:
+    except DECODE_ERRORS:
         return False
-    return least >= LEAST_PIXELS
+    return least >= MIN_SIDE_PX
 
 
 def textured_world(path: str, *, metres_per_pixel: float, frame_pixels: int = 256) -> World:
@@ -77,24 +77,24 @@ def textured_world(path: str, *, metres_per_pixel: float, frame_pixels: int = 25
     `metres_per_pixel` is the picture's own. Raises InputError for a picture or height map that cannot be read.
     """
     try:
-        with Image.open(path, formats=FORMATS) as image:
+        with Image.open(path, formats=PILLOW_FORMATS) as image:
             picture = image.convert("RGB")
-    except UNREADABLE as error:
+    except DECODE_ERRORS as error:
         raise InputError(
             f"{path} cannot be decoded ({error}); expected an image; take it out of --textures"
         ) from None
     square = min(picture.size)
     left, top = (picture.width - square) // 2, (picture.height - square) // 2
     extent_m = square * metres_per_pixel
-    side = round(TEXELS_PER_RADIUS / RADIUS_PART * frame_pixels / 256)
+    side = round(TEXELS_PER_RADIUS / RADIUS_FRACTION * frame_pixels / 256)
     box = (left, top, left + square, top + square)
     texture_HW3 = np.asarray(picture.resize((side, side), Image.Resampling.BICUBIC, box=box))
-    grass_HW, trees_HW = _plants(texture_HW3.astype(np.float32))
+    grass_HW, trees_HW = _vegetation(texture_HW3.astype(np.float32))
     return World(
         texture_HW3=texture_HW3,
-        height_HW=_heights(path, picture.size, box, side),
+        height_HW=_read_heights(path, picture.size, box, side),
         metres_per_pixel=extent_m / side,
-        target_radius_m=RADIUS_PART * extent_m,
+        target_radius_m=RADIUS_FRACTION * extent_m,
         grass_HW=(grass_HW * 255).astype(np.uint8),
         trees_HW=(trees_HW * 255).astype(np.uint8),
         facade_HW=np.zeros((side, side), np.uint8),
@@ -104,7 +104,7 @@ def textured_world(path: str, *, metres_per_pixel: float, frame_pixels: int = 25
     )
 
 
-def _heights(
+def _read_heights(
     path: str, size: tuple[int, int], box: tuple[int, int, int, int], side: int
 ) -> FloatMap:
     """Heights (H, W) from the array beside the picture, metres; flat without one."""
@@ -128,7 +128,7 @@ def _heights(
     return np.asarray(whole.resize((side, side), Image.Resampling.NEAREST, box=cut), np.float32)
 
 
-def _plants(colour_HW3: FloatMap) -> tuple[FloatMap, FloatMap]:
+def _vegetation(colour_HW3: FloatMap) -> tuple[FloatMap, FloatMap]:
     """(grass, trees), each (H, W) from 0 to 1: green is plants, and trees are darker than grass."""
     red, green, blue = (colour_HW3[..., c] for c in range(3))
     total = red + green + blue + 1

@@ -18,20 +18,26 @@ from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import GeoTag, ImageRecord, Rejection, View
 from pipeline.sources.base import Source
-from pipeline.sources.folders import PlacedImage, SplitFolder, checked, images_by_split
-from pipeline.sources.text_tables import Unreadable, number, place, read_lines, unreadable_tag
+from pipeline.sources.folders import LocatedImage, SplitFolder, images_by_split, require_images
+from pipeline.sources.text_tables import (
+    Unreadable,
+    parse_number,
+    parse_position,
+    read_lines,
+    unreadable_tag_row,
+)
 
 LAYOUT = (
     "DenseUAV's root, which holds train/{drone,satellite}/<location>/ and "
     "test/{query,gallery}_{drone,satellite}/<location>/"
 )
 TABLES = ("Dense_GPS_train.txt", "Dense_GPS_test.txt", "Dense_GPS_ALL.txt")
-VALUE = r"[NSEW]?[-+\d.]\S*"
-LINE = re.compile(
-    rf"(?P<path>\S.*\.(?:jpe?g|png|tiff?))\s+(?P<first>{VALUE})\s+(?P<second>{VALUE})\s+(?P<height>\S+)",
+VALUE_PATTERN = r"[NSEW]?[-+\d.]\S*"
+LINE_PATTERN = re.compile(
+    rf"(?P<path>\S.*\.(?:jpe?g|png|tiff?))\s+(?P<first>{VALUE_PATTERN})\s+(?P<second>{VALUE_PATTERN})\s+(?P<height>\S+)",
     re.IGNORECASE,
 )
-HEIGHT = re.compile(r"H(\d+)", re.IGNORECASE)
+HEIGHT_PATTERN = re.compile(r"H(\d+)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +45,7 @@ class DenseUAV(Source):
     """DenseUAV, official layout."""
 
     def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
-        return checked(self._scan(root), root, LAYOUT)
+        return require_images(self._scan(root), root, LAYOUT)
 
     def _scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
         tags, rejected = read_geotags(root)
@@ -49,12 +55,12 @@ class DenseUAV(Source):
         )
 
 
-def _tag(image: PlacedImage, folder: SplitFolder, tags: dict[str, GeoTag]) -> GeoTag | None:
+def _tag(image: LocatedImage, folder: SplitFolder, tags: dict[str, GeoTag]) -> GeoTag | None:
     own = tags.get(f"{folder.phase}/{folder.folder}/{image.location}/{image.name}")
     tag = own or tags.get(f"{folder.phase}/{image.location}") or tags.get(image.location)
     if tag is None:
         return None
-    nominal = HEIGHT.match(image.name)
+    nominal = HEIGHT_PATTERN.match(image.name)
     if (
         folder.view != View.DRONE
     ):  # the tables give the drone's height with the satellite image's name
@@ -79,7 +85,7 @@ def read_geotags(root: str) -> tuple[dict[str, GeoTag], list[Rejection]]:
             try:
                 named, tag = parse_line(line)
             except Unreadable as error:
-                refused.append(unreadable_tag(path, line_number, line, error))
+                refused.append(unreadable_tag_row(path, line_number, line, error))
                 continue
             read += 1
             parts = named.replace("\\", "/").split("/")[-4:]
@@ -103,7 +109,7 @@ def parse_line(line: str) -> tuple[str, GeoTag]:
 
     Raises Unreadable.
     """
-    match = LINE.fullmatch(line.strip())
+    match = LINE_PATTERN.fullmatch(line.strip())
     if match is None:
         raise Unreadable("expected path, longitude, latitude and height")
     named = {
@@ -118,8 +124,8 @@ def parse_line(line: str) -> tuple[str, GeoTag]:
         raise Unreadable(
             "expected one latitude with N or S and one longitude with E or W, or no letters"
         )
-    north, east = place(lat.lstrip("NSns"), lon.lstrip("EWew"))
-    altitude = number(match["height"])
+    north, east = parse_position(lat.lstrip("NSns"), lon.lstrip("EWew"))
+    altitude = parse_number(match["height"])
     return match["path"], GeoTag(
         lat=-north if lat[0] in "Ss" else north,
         lon=-east if lon[0] in "Ww" else east,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View
-from pipeline.images.inspect import is_image
+from pipeline.images.inspect import is_image_name
 from pipeline.sources.base import not_an_image
 
 
@@ -25,7 +25,7 @@ class SplitFolder:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlacedImage:
+class LocatedImage:
     """An image in its location's folder."""
 
     path: str
@@ -53,7 +53,7 @@ def split_folders(
     ]
 
 
-def images_by_location(folder: str) -> Iterator[PlacedImage | Rejection]:
+def images_by_location(folder: str) -> Iterator[LocatedImage | Rejection]:
     """All images at `<folder>/<location>/<image>`, ordered by path; an absent folder has none."""
     if not storage.is_folder(folder):
         return
@@ -62,14 +62,14 @@ def images_by_location(folder: str) -> Iterator[PlacedImage | Rejection]:
         whole = storage.join(folder, path)
         if not location or "/" in location:
             yield wrong_folder(whole, f"{path} is not <location>/<image>")
-        elif not is_image(name):
+        elif not is_image_name(name):
             yield not_an_image(whole)
         else:
-            yield PlacedImage(path=whole, name=name, location=location, bytes=size)
+            yield LocatedImage(path=whole, name=name, location=location, bytes=size)
 
 
 def images_by_split(
-    root: str, views: Iterable[View], tag: Callable[[SplitFolder, PlacedImage], GeoTag | None]
+    root: str, views: Iterable[View], tag: Callable[[SplitFolder, LocatedImage], GeoTag | None]
 ) -> Iterator[ImageRecord | Rejection]:
     """All images of a data set whose folders are named as University-1652's, with the geotag that
     `tag` knows of each.
@@ -90,7 +90,7 @@ def wrong_folder(path: str, found: str) -> Rejection:
     return Rejection(path=path, reason="wrong folder", found=found)
 
 
-def checked(
+def require_images(
     found: Iterable[ImageRecord | Rejection], root: str, layout: str
 ) -> Iterator[ImageRecord | Rejection]:
     """What a scan found, passed on. `layout` says in words what was expected at `root`.

@@ -24,20 +24,20 @@ from pipeline.images.decode import DecodeError
 from pipeline.images.inspect import MAX_PIXELS
 from pipeline.sources.base import Source
 from pipeline.sources.maps.colours import Colours
-from pipeline.sources.maps.georeference import Georeference, named_crs
+from pipeline.sources.maps.georeference import Georeference, parse_crs
 from pipeline.sources.maps.mosaic import (
     Encoding,
-    colours,
-    encoded,
-    first_cause,
+    colours_for,
+    encode_window,
     nodata_share,
-    opened,
+    open_mosaic,
+    root_cause,
 )
-from pipeline.sources.maps.tiles import Tile, count_tiles, plan_tiles, window_of
+from pipeline.sources.maps.tiles import Tile, count_tiles, parse_window, plan_tiles
 
-TILE_PIXELS = 512  # where no size is asked for
-SMALLEST_M = 1e-6  # below it pixels are no places: all lie on one point, or on one line
-MOST_TILES = 2_000_000
+DEFAULT_TILE_PIXELS = 512  # where no size is asked for
+MIN_PIXEL_M = 1e-6  # below it pixels are no places: all lie on one point, or on one line
+MAX_TILES = 2_000_000
 """Of one mosaic: with their records they take a few gigabytes. A header alone may say sides of four
 thousand million pixels."""
 
@@ -100,14 +100,14 @@ class GeoTiff(Source):
             raise InputError(
                 f"--stretch is {self.stretch[0]} {self.stretch[1]}, expected two numbers, the smaller one first"
             )
-        if self.crs is not None and named_crs(self.crs) is None:
+        if self.crs is not None and parse_crs(self.crs) is None:
             raise InputError(
                 f"--crs is {self.crs!r}, which names no coordinate system; expected one such as EPSG:32633"
             )
 
     def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
         names: dict[str, str] = {}
-        for path, name in mosaics(root):
+        for path, name in find_mosaics(root):
             first = names.setdefault(name, path)
             if first != path:
                 yield Rejection(
@@ -118,20 +118,20 @@ class GeoTiff(Source):
                 continue
             try:
                 yield from self._tiles(path, name)
-            except _Refused as refused:
+            except _MosaicRejected as refused:
                 yield Rejection(path=path, reason=refused.reason, found=refused.found)
             except RasterioError as error:
-                yield Rejection(path=path, reason="damaged image", found=first_cause(error))
+                yield Rejection(path=path, reason="damaged image", found=root_cause(error))
 
     def read(self, record: ImageRecord) -> bytes:
         """The tile, encoded; the same bytes each time. Raises DecodeError."""
-        window = window_of(record.part)
+        window = parse_window(record.part)
         size = (window.width, window.height)
         if (
             self.output_pixels is not None
         ):  # the same scale for the smaller tile of a smaller mosaic
             size = self._output_size(record.path, size, self.output_pixels)
-        return encoded(
+        return encode_window(
             record.path, window, self.encoding, size, Resampling[self.resampling], self.stretch
         )
 
@@ -140,14 +140,14 @@ class GeoTiff(Source):
 
     def _tiles(self, path: str, name: str) -> Iterator[ImageRecord]:
         """The tiles of one mosaic. Raises _Refused, RasterioError."""
-        dataset = opened(path)
+        dataset = open_mosaic(path)
         if dataset.dtypes[0].startswith("complex"):  # GDAL has some that NumPy has no name for
-            raise _Refused(
+            raise _MosaicRejected(
                 "not a picture", f"{dataset.dtypes[0]} values; expected integers or floats"
             )
         place = self._georeference(dataset)
         planned = self._plan((dataset.width, dataset.height), self._tile_size(dataset, place))
-        shown = colours(path, self.stretch)
+        shown = colours_for(path, self.stretch)
         kept = self._without_nodata(path, planned, shown)
         tags = place.geotags(tile.window for tile in kept)
         placed = [(tile, tag) for tile, tag in zip(kept, tags, strict=True) if tag is not None]
@@ -179,14 +179,14 @@ class GeoTiff(Source):
         """
         said = f"{size[0]} x {size[1]} pixels in tiles of {tile[0]} x {tile[1]}"
         if min(tile[0], size[0]) * min(tile[1], size[1]) > MAX_PIXELS:
-            raise _Refused(
+            raise _MosaicRejected(
                 "absurd dimensions",
                 f"{said}, expected tiles of at most {MAX_PIXELS} pixels: cut smaller ones",
             )
-        if (count := count_tiles(size, tile, self.overlap)) > MOST_TILES:
-            raise _Refused(
+        if (count := count_tiles(size, tile, self.overlap)) > MAX_TILES:
+            raise _MosaicRejected(
                 "too many tiles",
-                f"{said} make {count}, expected at most {MOST_TILES}: cut larger ones, or the mosaic",
+                f"{said} make {count}, expected at most {MAX_TILES}: cut larger ones, or the mosaic",
             )
         return plan_tiles(size, tile, self.overlap)
 
@@ -195,18 +195,20 @@ class GeoTiff(Source):
         with_gcps = f"{len(dataset.gcps[0])} ground control points alone" if dataset.gcps[0] else ""
         if dataset.transform.is_identity:
             found = f"{with_gcps or 'no transform'}; expected pixels with coordinates: warp it with gdalwarp"
-            raise _Refused("no coordinates", found)
-        crs = dataset.crs or (self.crs and named_crs(self.crs))
+            raise _MosaicRejected("no coordinates", found)
+        crs = dataset.crs or (self.crs and parse_crs(self.crs))
         if not crs:
-            raise _Refused(
+            raise _MosaicRejected(
                 "no coordinates", "no coordinate system; expected one: name it with --crs EPSG:..."
             )
         place = Georeference(crs=crs, affine=dataset.transform)
         ground = place.ground_pixel((dataset.width / 2, dataset.height / 2))
         if not np.isfinite(ground).all():
-            raise _Refused("no coordinates", f"its centre lies nowhere on Earth by {place.name}")
-        if not min(ground) > SMALLEST_M:
-            raise _Refused(
+            raise _MosaicRejected(
+                "no coordinates", f"its centre lies nowhere on Earth by {place.name}"
+            )
+        if not min(ground) > MIN_PIXEL_M:
+            raise _MosaicRejected(
                 "no coordinates",
                 f"pixels of {ground[0]:g} x {ground[1]:g} m by {place.name}, expected larger ones",
             )
@@ -215,7 +217,7 @@ class GeoTiff(Source):
     def _tile_size(self, dataset: Any, place: Georeference) -> tuple[int, int]:
         """(width, height) of a whole tile in the mosaic's pixels."""
         if self.tile_m is None:
-            return (self.tile_pixels or TILE_PIXELS,) * 2
+            return (self.tile_pixels or DEFAULT_TILE_PIXELS,) * 2
         across, down = place.ground_pixel((dataset.width / 2, dataset.height / 2))
         return max(1, round(self.tile_m / across)), max(1, round(self.tile_m / down))
 
@@ -224,11 +226,11 @@ class GeoTiff(Source):
         Raises DecodeError.
         """
         try:
-            dataset = opened(path)
+            dataset = open_mosaic(path)
             whole = self._tile_size(dataset, self._georeference(dataset))
         except RasterioError as error:
-            raise DecodeError("damaged image", first_cause(error)) from None
-        except _Refused as refused:  # another file than the one that was scanned
+            raise DecodeError("damaged image", root_cause(error)) from None
+        except _MosaicRejected as refused:  # another file than the one that was scanned
             raise DecodeError(refused.reason, refused.found) from None
         width, height = (side_out * part / side for part, side in zip(size, whole, strict=True))
         return max(1, round(width)), max(1, round(height))
@@ -252,7 +254,7 @@ class GeoTiff(Source):
         return kept
 
 
-class _Refused(Exception):
+class _MosaicRejected(Exception):
     """A mosaic that cannot be cut; `reason` and `found` as in a Rejection."""
 
     def __init__(self, reason: str, found: str) -> None:
@@ -260,7 +262,7 @@ class _Refused(Exception):
         self.reason, self.found = reason, found
 
 
-def mosaics(root: str) -> Iterator[tuple[str, str]]:
+def find_mosaics(root: str) -> Iterator[tuple[str, str]]:
     """(path, name) of the GeoTIFF at `root` or of all below it; a name is the path from there
     without its ending, joined by hyphens.
 

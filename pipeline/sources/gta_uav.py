@@ -17,15 +17,15 @@ from typing import Any, Literal
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.core.records import LONGEST_EXCERPT, ImageRecord, Rejection, Split, View
-from pipeline.images.inspect import is_image
+from pipeline.core.records import MAX_EXCERPT_LENGTH, ImageRecord, Rejection, Split, View
+from pipeline.images.inspect import is_image_name
 from pipeline.sources.base import Source, not_an_image
-from pipeline.sources.folders import checked, wrong_folder
-from pipeline.sources.text_tables import Unreadable, number
+from pipeline.sources.folders import require_images, wrong_folder
+from pipeline.sources.text_tables import Unreadable, parse_number
 
 LAYOUT = "GTA-UAV's root, which holds drone/images/, satellite/ and <area>-area-drone2sate-{train,test}.json"
 DRONE, SATELLITE = "drone/images", "satellite"
-LISTS = {Split.TRAIN: "train", Split.QUERY: "test"}
+LIST_SUFFIXES = {Split.TRAIN: "train", Split.QUERY: "test"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,12 +39,13 @@ class GtaUav(Source):
     that do so in part. An image that has none is left out, as in the authors' evaluation."""
 
     def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
-        return checked(self._scan(root), root, LAYOUT)
+        return require_images(self._scan(root), root, LAYOUT)
 
     def _scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
         files = storage.walk(root)
         lists = {
-            split: f"{self.division}-drone2sate-{phase}.json" for split, phase in LISTS.items()
+            split: f"{self.division}-drone2sate-{phase}.json"
+            for split, phase in LIST_SUFFIXES.items()
         }
         if not any(name in files for name in lists.values()):
             there = (
@@ -54,7 +55,7 @@ class GtaUav(Source):
             raise InputError(
                 f"{root} holds {there}, expected {' or '.join(lists.values())}; check --root and --division"
             )
-        yield from _strays(root, files)
+        yield from _misplaced_files(root, files)
         for split, name in lists.items():
             if name not in files:
                 continue
@@ -81,7 +82,7 @@ class GtaUav(Source):
                 tiles = (
                     path
                     for path in files
-                    if path.rpartition("/")[0] == SATELLITE and is_image(path)
+                    if path.rpartition("/")[0] == SATELLITE and is_image_name(path)
                 )
                 yield from (
                     _record(root, tile, files, Split.GALLERY, View.SATELLITE, tile)
@@ -133,24 +134,24 @@ def best_pair(entry: Any, pairs: str) -> tuple[str, str | None]:
             raise Unreadable(f"{name!r} has {len(tiles)} tiles and {len(weights)} weights")
         if not (isinstance(tiles, list) and all(isinstance(tile, str) for tile in tiles)):
             raise Unreadable(f"{name!r} has tiles that are no names")
-        weighed = [number(str(weight)) for weight in weights]
+        weighed = [parse_number(str(weight)) for weight in weights]
     except Unreadable:
         raise
     except (AttributeError, KeyError, TypeError) as error:
         raise Unreadable(
-            f"{str(entry)[:LONGEST_EXCERPT]}: {type(error).__name__} {error}"
+            f"{str(entry)[:MAX_EXCERPT_LENGTH]}: {type(error).__name__} {error}"
         ) from None
     drone = f"{folder.strip('/')}/{name}"
     return drone, f"{SATELLITE}/{tiles[weighed.index(max(weighed))]}" if tiles else None
 
 
-def _strays(root: str, files: Iterable[str]) -> Iterator[Rejection]:
+def _misplaced_files(root: str, files: Iterable[str]) -> Iterator[Rejection]:
     """What lies among the images and is none, or lies deeper than they do."""
     for path in files:
         top = next((top for top in (DRONE, SATELLITE) if path.startswith(f"{top}/")), None)
         if top and path.rpartition("/")[0] != top:
             yield wrong_folder(storage.join(root, path), f"{path} is not {top}/<image>")
-        elif top and not is_image(path):
+        elif top and not is_image_name(path):
             yield not_an_image(storage.join(root, path))
 
 

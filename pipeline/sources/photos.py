@@ -13,17 +13,17 @@ from typing import Literal
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.core.prefetch import ahead
+from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View
 from pipeline.images.camera_tags import CameraTags, read_tags
-from pipeline.images.image_blocks import UnreadableTag, find_blocks
-from pipeline.images.inspect import is_image
+from pipeline.images.image_blocks import UnreadableTag, find_metadata
+from pipeline.images.inspect import is_image_name
 from pipeline.sources.base import Source, not_an_image
 
-HEAD = 256 << 10
+HEAD_BYTES = 256 << 10
 """Bytes that are read of a file: the first two or three segments of 64 kB hold EXIF and XMP in all
 cameras seen."""
-THREADS, WINDOW = 16, 256
+THREADS, PREFETCH = 16, 256
 """Files whose beginnings are read at once, as scanning waits for disks and networks; and how far
 ahead of the consumer."""
 COMPANIONS = (
@@ -45,8 +45,8 @@ COMPANIONS = (
 )
 """Endings of what cameras write beside photos: raw copies, films, flight logs. Left out without a
 word."""
-EARTH_M = 6_371_008.8  # mean radius, IUGG
-SHALLOWEST_DEG = (
+EARTH_RADIUS_M = 6_371_008.8  # mean radius, IUGG
+MAX_PITCH_DEG = (
     -20.0
 )  # above this the axis arrives 2.7 heights away and more, where a degree of pitch moves it by far
 
@@ -76,7 +76,7 @@ class Photos(Source):
         if not storage.is_folder(root):
             raise InputError(f"no folder {root}; expected a folder of photos; check --root")
         files = storage.walk(root)
-        if not any(map(is_image, files)):
+        if not any(map(is_image_name, files)):
             others = Counter(path.rpartition(".")[2] for path in files).most_common(3)
             said = ", ".join(f"{count} .{ending}" for ending, count in others) or "nothing at all"
             raise InputError(
@@ -85,11 +85,11 @@ class Photos(Source):
         photos = [
             (path, size) for path, size in files.items() if not path.lower().endswith(COMPANIONS)
         ]
-        yield from ahead(lambda photo: self._judge(root, *photo), photos, THREADS, WINDOW)
+        yield from prefetch_map(lambda photo: self._judge(root, *photo), photos, THREADS, PREFETCH)
 
     def _judge(self, root: str, path: str, size: int) -> ImageRecord | Rejection:
         whole = storage.join(root, path)
-        if not is_image(path):
+        if not is_image_name(path):
             return not_an_image(whole)
         try:
             tags = CameraTags() if self.geotags == "ignored" else read_photo(whole, size)
@@ -105,7 +105,7 @@ class Photos(Source):
         return ImageRecord(
             path=whole, split=self.split, view=self.view, bytes=size, taken_at=tags.taken_at,
             location=(folder or name) if self.location == "folder" else path.rpartition(".")[0],
-            geotag=geotag_of(tags, self.project),
+            geotag=geotag_of_photo(tags, self.project),
         )  # fmt: skip
 
 
@@ -117,13 +117,13 @@ def read_photo(path: str, size: int) -> CameraTags:
     """
     if not size:
         return CameraTags()  # packing refuses it; object stores refuse a range of nothing
-    blocks = find_blocks(storage.read_head(path, HEAD), whole=size <= HEAD)
-    if blocks.cut and size > HEAD:
-        blocks = find_blocks(storage.read_bytes(path), whole=True)
+    blocks = find_metadata(storage.read_head(path, HEAD_BYTES), whole=size <= HEAD_BYTES)
+    if blocks.cut and size > HEAD_BYTES:
+        blocks = find_metadata(storage.read_bytes(path), whole=True)
     return read_tags(blocks)
 
 
-def geotag_of(tags: CameraTags, project: bool) -> GeoTag | None:
+def geotag_of_photo(tags: CameraTags, project: bool) -> GeoTag | None:
     """The geotag of a photo; None without a position.
 
     Its height is the one above take-off; an altitude above the sea is none above the ground, and is
@@ -135,12 +135,12 @@ def geotag_of(tags: CameraTags, project: bool) -> GeoTag | None:
     height, heading, pitch = tags.height_m, tags.heading_deg, tags.pitch_deg
     if project and height is not None and height > 0 and heading is not None and pitch is not None:
         lat, lon = (
-            aimed_at(lat, lon, height, heading, pitch) if pitch <= SHALLOWEST_DEG else (lat, lon)
+            aim_point(lat, lon, height, heading, pitch) if pitch <= MAX_PITCH_DEG else (lat, lon)
         )
     return GeoTag(lat=lat, lon=lon, altitude_m=height, heading_deg=heading, pitch_deg=pitch)
 
 
-def aimed_at(
+def aim_point(
     lat: float, lon: float, height_m: float, heading_deg: float, pitch_deg: float
 ) -> tuple[float, float]:
     """Latitude and longitude at which the optical axis meets the ground: height / tan(-pitch)
@@ -150,7 +150,7 @@ def aimed_at(
     where the height is measured from; the way along it is a great circle on a sphere, which is
     within 0.6% of the distance.
     """
-    way = height_m / math.tan(math.radians(-pitch_deg)) / EARTH_M
+    way = height_m / math.tan(math.radians(-pitch_deg)) / EARTH_RADIUS_M
     bearing, north = math.radians(heading_deg), math.radians(lat)
     sine = math.sin(north) * math.cos(way) + math.cos(north) * math.sin(way) * math.cos(bearing)
     east = math.atan2(

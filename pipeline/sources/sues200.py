@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import ImageRecord, Rejection, Split, View
-from pipeline.images.inspect import is_image
+from pipeline.images.inspect import is_image_name
 from pipeline.sources.base import Source, not_an_image
 from pipeline.sources.folders import (
-    PlacedImage,
-    checked,
+    LocatedImage,
     images_by_location,
+    require_images,
     split_folders,
     wrong_folder,
 )
@@ -170,7 +170,7 @@ class Sues200(Source):
             )
 
     def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
-        return checked(self._scan(root), root, LAYOUT)
+        return require_images(self._scan(root), root, LAYOUT)
 
     def _scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
         if any(storage.is_folder(storage.join(root, phase)) for phase in ("Training", "Testing")):
@@ -199,16 +199,16 @@ class Sues200(Source):
                 yield item
             else:
                 image, height = item
-                for split in _splits(image.location):
+                for split in _splits_of(image.location):
                     yield _record(image, split, View.DRONE, height)
         for found in images_by_location(storage.join(root, "satellite-view")):
             if isinstance(found, Rejection):
                 yield found
             else:
-                for split in _splits(found.location):
+                for split in _splits_of(found.location):
                     yield _record(found, split, View.SATELLITE)
 
-    def _drone_images(self, folder: str) -> Iterator[tuple[PlacedImage, int] | Rejection]:
+    def _drone_images(self, folder: str) -> Iterator[tuple[LocatedImage, int] | Rejection]:
         """Images at `<folder>/<location>/<height>/<image>`, with their height."""
         if not storage.is_folder(folder):
             return
@@ -218,20 +218,22 @@ class Sues200(Source):
                 yield wrong_folder(whole, f"{path} is not <location>/<height>/<image>")
             elif int(parts[1]) not in self.heights:
                 continue
-            elif not is_image(parts[2]):
+            elif not is_image_name(parts[2]):
                 yield not_an_image(whole)
             else:
                 yield (
-                    PlacedImage(path=whole, name=parts[2], location=parts[0], bytes=size),
+                    LocatedImage(path=whole, name=parts[2], location=parts[0], bytes=size),
                     int(parts[1]),
                 )
 
 
-def _splits(location: str) -> tuple[Split, ...]:
+def _splits_of(location: str) -> tuple[Split, ...]:
     return (Split.TRAIN if location in TRAIN_LOCATIONS else Split.QUERY), Split.GALLERY
 
 
-def _record(image: PlacedImage, split: Split, view: View, height: int | None = None) -> ImageRecord:
+def _record(
+    image: LocatedImage, split: Split, view: View, height: int | None = None
+) -> ImageRecord:
     variant = "" if height is None else str(height)
     return ImageRecord(
         path=image.path,

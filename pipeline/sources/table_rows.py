@@ -16,11 +16,11 @@ import pyarrow.parquet as pq
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.sources.maps.geojson_shapes import shape_of
+from pipeline.sources.maps.geojson_shapes import parse_geometry
 
-REQUIRED = "path"
+REQUIRED_COLUMN = "path"
 COLUMNS = (
-    REQUIRED,
+    REQUIRED_COLUMN,
     "view",
     "split",
     "location",
@@ -33,25 +33,31 @@ COLUMNS = (
 )
 ALIASES = {"latitude": "lat", "longitude": "lon", "lng": "lon"}
 NUMBERS = ("lat", "lon", "altitude_m", "heading_deg", "pitch_deg")
-SHAPE = "shape"
+SHAPE_COLUMN = "shape"
 "Under this name a GeoJSON row holds its geometry, a Shape."
-BROKEN = "broken"
+BROKEN_COLUMN = "broken"
 "Under this name a row that cannot be one holds a countable reason, and what was found."
-LONGEST_CELL = 4096
+MAX_CELL_LENGTH = 4096
 "Characters: the longest path that a file system opens."
 DELIMITERS = ",;\t"
-BATCH = 10_000  # rows of Parquet at once
+BATCH_ROWS = 10_000  # rows of Parquet at once
 
 Row = dict[str, Any]
 
 
-def read_rows(path: str) -> Iterator[tuple[int, Row]]:
+def read_table_rows(path: str) -> Iterator[tuple[int, Row]]:
     """The rows of a table. Row 1 is the first below a CSV's header.
 
     Columns besides ours are left out; names are matched without regard to case. Raises InputError
     where the file is no table of images.
     """
-    readers = {"csv": _csv, "tsv": _csv, "parquet": _parquet, "geojson": _geojson, "json": _geojson}
+    readers = {
+        "csv": _csv_rows,
+        "tsv": _csv_rows,
+        "parquet": _parquet_rows,
+        "geojson": _geojson_rows,
+        "json": _geojson_rows,
+    }
     kinds = f".{', .'.join(readers)}"
     if storage.is_folder(path):
         raise InputError(
@@ -64,23 +70,23 @@ def read_rows(path: str) -> Iterator[tuple[int, Row]]:
         raise InputError(
             f"{path} is no table by its name, expected {kinds}; write the table as one of these"
         )
-    return enumerate(map(_bounded, readers[ending](path)), 1)
+    return enumerate(map(_check_cell_lengths, readers[ending](path)), 1)
 
 
-def _bounded(row: Row) -> Row:
+def _check_cell_lengths(row: Row) -> Row:
     """The row without cells longer than any value of ours: what is held and told of a hostile one
     stays small.
     """
     for name, value in row.items():
-        if isinstance(value, str | bytes) and len(value) > LONGEST_CELL:
+        if isinstance(value, str | bytes) and len(value) > MAX_CELL_LENGTH:
             return row | {
-                name: value[:LONGEST_CELL],
-                BROKEN: ("cell too long", f"{name} of {len(value)} characters"),
+                name: value[:MAX_CELL_LENGTH],
+                BROKEN_COLUMN: ("cell too long", f"{name} of {len(value)} characters"),
             }
     return row
 
 
-def _columns(path: str, found: Iterable[str]) -> dict[str, str]:
+def _map_columns(path: str, found: Iterable[str]) -> dict[str, str]:
     """The file's names of our columns -> our names."""
     names = list(found)
     ours: dict[str, str] = {}
@@ -97,18 +103,18 @@ def _columns(path: str, found: Iterable[str]) -> dict[str, str]:
     half = {"lat", "lon"} & set(ours.values())
     missing = [
         name
-        for name in (REQUIRED, *({"lat", "lon"} if len(half) == 1 else ()))
+        for name in (REQUIRED_COLUMN, *({"lat", "lon"} if len(half) == 1 else ()))
         if name not in ours.values()
     ]
     if missing:
         raise InputError(
-            f"{path} has no column {missing[0]} but {', '.join(names) or 'none'}; expected {REQUIRED} and any of "
+            f"{path} has no column {missing[0]} but {', '.join(names) or 'none'}; expected {REQUIRED_COLUMN} and any of "
             f"{', '.join(COLUMNS[1:])}; add it or rename one"
         )
     return ours
 
 
-def _csv(path: str) -> Iterator[Row]:
+def _csv_rows(path: str) -> Iterator[Row]:
     """Every cell as text: a location called 0001 stays so."""
     with (
         storage.open_read(path) as stream,
@@ -121,7 +127,7 @@ def _csv(path: str) -> Iterator[Row]:
             )  # the first of them in a table of one column
             lines = csv.reader(text, delimiter=delimiter)
             names = next(csv.reader([header], delimiter=delimiter), [])
-            ours = _columns(path, names)
+            ours = _map_columns(path, names)
             for cells in lines:
                 if not cells:
                     continue  # an empty line
@@ -131,7 +137,7 @@ def _csv(path: str) -> Iterator[Row]:
                     if name in ours
                 }
                 if len(cells) != len(names):  # an unquoted comma in a name shifts all that follows
-                    row[BROKEN] = (
+                    row[BROKEN_COLUMN] = (
                         "wrong number of cells",
                         f"{len(cells)} cells below {len(names)} columns",
                     )
@@ -149,11 +155,11 @@ def _csv(path: str) -> Iterator[Row]:
             ) from None
 
 
-def _parquet(path: str) -> Iterator[Row]:
+def _parquet_rows(path: str) -> Iterator[Row]:
     with storage.open_read(path) as stream:
         try:
             schema = pq.read_schema(stream)
-            ours = _columns(path, schema.names)
+            ours = _map_columns(path, schema.names)
             for name in ours:
                 if not _is_plain(schema.field(name).type):
                     kind = str(schema.field(name).type)[:80]
@@ -163,7 +169,7 @@ def _parquet(path: str) -> Iterator[Row]:
             # As dictionaries: a text that stands there once, and is named by ten thousand rows, is
             # held once.
             table = pq.ParquetFile(stream, read_dictionary=list(ours))
-            for batch in table.iter_batches(BATCH, columns=list(ours)):
+            for batch in table.iter_batches(BATCH_ROWS, columns=list(ours)):
                 columns = {ours[name]: _values(batch.column(name)) for name in batch.schema.names}
                 for cells in zip(*columns.values(), strict=True):
                     yield dict(zip(columns, cells, strict=True))
@@ -203,7 +209,7 @@ def _is_plain(kind: Any) -> bool:
     return any(test(kind) for test in tests)
 
 
-def _geojson(path: str) -> Iterator[Row]:
+def _geojson_rows(path: str) -> Iterator[Row]:
     """Features' properties and, under SHAPE, what their geometries say; a geometry goes before
     properties lat and lon.
     """
@@ -233,8 +239,8 @@ def _geojson(path: str) -> Iterator[Row]:
         for feature in features
     ]
     names = dict.fromkeys(name for properties in told for name in properties)
-    ours = _columns(path, names) if features else {}
+    ours = _map_columns(path, names) if features else {}
     for feature, properties in zip(features, told, strict=True):
         row = {ours[name]: value for name, value in properties.items() if name in ours}
-        shape = shape_of(feature.get("geometry"))
-        yield row | ({} if shape is None else {SHAPE: shape})
+        shape = parse_geometry(feature.get("geometry"))
+        yield row | ({} if shape is None else {SHAPE_COLUMN: shape})

@@ -1,7 +1,7 @@
 """Text tables that say where images were taken -> their rows and checked numbers.
 
 In: a CSV or text file on any storage. Out: rows with their line numbers, and coordinates that are
-on the earth. What cannot be read in one line is that line's fault alone: `unreadable_tag` tells it,
+on the earth. What cannot be read in one line is that line's fault alone: `unreadable_tag_row` tells it,
 and the image goes on without a tag.
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.core.records import LONGEST_EXCERPT, Rejection
+from pipeline.core.records import MAX_EXCERPT_LENGTH, Rejection
 
 NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 "In one way only: what could be matched in two takes the square of a long cell's length to refuse."
@@ -23,7 +23,7 @@ class Unreadable(ValueError):
     """A value that is not what it should be; the message says what was found and what was expected."""
 
 
-def number(text: str) -> float:
+def parse_number(text: str) -> float:
     """Raises Unreadable for whatever is no finite number, such as nan and inf."""
     value = float(text) if NUMBER.fullmatch(text.strip()) else math.nan
     if not math.isfinite(value):
@@ -31,14 +31,14 @@ def number(text: str) -> float:
     return value
 
 
-def optional_number(text: str) -> float | None:
+def parse_optional_number(text: str) -> float | None:
     """None for an empty cell. Raises Unreadable."""
-    return number(text) if text.strip() else None
+    return parse_number(text) if text.strip() else None
 
 
-def place(lat: str, lon: str) -> tuple[float, float]:
+def parse_position(lat: str, lon: str) -> tuple[float, float]:
     """Latitude and longitude, degrees. Raises Unreadable."""
-    north, east = number(lat), number(lon)
+    north, east = parse_number(lat), parse_number(lon)
     if abs(north) > 90:
         raise Unreadable(f"latitude {north:g} is not between -90 and 90")
     if abs(east) > 180:
@@ -66,7 +66,7 @@ def read_rows(path: str, columns: Iterable[str]) -> Iterator[tuple[int, dict[str
         header = [name.strip() for name in next(reader, [])]
         missing = [name for name in columns if name not in header]
         if missing:
-            found = ", ".join(header)[:LONGEST_EXCERPT] or "nothing"
+            found = ", ".join(header)[:MAX_EXCERPT_LENGTH] or "nothing"
             raise InputError(
                 f"{path} has no column {', '.join(missing)}, its first line holds {found}; mend it or take it away"
             )
@@ -82,8 +82,8 @@ def read_rows(path: str, columns: Iterable[str]) -> Iterator[tuple[int, dict[str
         ) from None
 
 
-def unreadable_tag(path: str, line: int, text: str, why: object) -> Rejection:
+def unreadable_tag_row(path: str, line: int, text: str, why: object) -> Rejection:
     """A line of a table that gives no geotag."""
     return Rejection(
-        path=path, reason="unreadable tag", found=f"line {line}: {text[:LONGEST_EXCERPT]}: {why}"
+        path=path, reason="unreadable tag", found=f"line {line}: {text[:MAX_EXCERPT_LENGTH]}: {why}"
     )

@@ -12,9 +12,15 @@ from dataclasses import dataclass
 from pipeline.core import storage
 from pipeline.core.records import GeoTag, ImageRecord, Rejection, View
 from pipeline.sources.base import Source
-from pipeline.sources.folders import PlacedImage, SplitFolder, checked, images_by_split
+from pipeline.sources.folders import LocatedImage, SplitFolder, images_by_split, require_images
 from pipeline.sources.kml import read_kmls
-from pipeline.sources.text_tables import Unreadable, number, place, read_rows, unreadable_tag
+from pipeline.sources.text_tables import (
+    Unreadable,
+    parse_number,
+    parse_position,
+    read_rows,
+    unreadable_tag_row,
+)
 
 LAYOUT = (
     "University-1652's root, which holds train/{satellite,drone}/<location>/ and "
@@ -35,7 +41,7 @@ class University1652(Source):
     no geotags from there."""
 
     def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
-        return checked(self._scan(root), root, LAYOUT)
+        return require_images(self._scan(root), root, LAYOUT)
 
     def _scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
         tags, rejected = read_geotags(root)
@@ -45,7 +51,7 @@ class University1652(Source):
             yield from rejected
             tags |= places
 
-        def tag(folder: SplitFolder, image: PlacedImage) -> GeoTag | None:
+        def tag(folder: SplitFolder, image: LocatedImage) -> GeoTag | None:
             own = tags.get(f"{folder.phase}/{folder.folder}/{image.location}/{image.name}")
             return own or tags.get(image.location)
 
@@ -70,10 +76,10 @@ def read_geotags(root: str) -> tuple[dict[str, GeoTag], list[Rejection]]:
         for line, row in read_rows(path, columns):
             try:
                 if "path" not in columns:
-                    lat, lon = place(row["lat"], row["lon"])
+                    lat, lon = parse_position(row["lat"], row["lon"])
                     tags[row["location"]] = GeoTag(lat=lat, lon=lon)
                 elif row["location"] in tags:
-                    altitude, heading, pitch = (number(row[name]) for name in POSE)
+                    altitude, heading, pitch = (parse_number(row[name]) for name in POSE)
                     where = tags[row["location"]]
                     tags[row["path"]] = GeoTag(
                         lat=where.lat,
@@ -85,5 +91,5 @@ def read_geotags(root: str) -> tuple[dict[str, GeoTag], list[Rejection]]:
                 else:
                     raise Unreadable(f"location {row['location']!r} has no line in locations.csv")
             except Unreadable as error:
-                rejected.append(unreadable_tag(path, line, ",".join(row.values()), error))
+                rejected.append(unreadable_tag_row(path, line, ",".join(row.values()), error))
     return tags, rejected

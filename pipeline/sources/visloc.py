@@ -18,17 +18,17 @@ import numpy as np
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View
-from pipeline.images.inspect import is_image
+from pipeline.images.inspect import is_image_name
 from pipeline.sources.base import Source, not_an_image
-from pipeline.sources.folders import checked, wrong_folder
-from pipeline.sources.maps.mosaic import Encoding, encoded
-from pipeline.sources.maps.tiles import window_of
+from pipeline.sources.folders import require_images, wrong_folder
+from pipeline.sources.maps.mosaic import Encoding, encode_window
+from pipeline.sources.maps.tiles import parse_window
 from pipeline.sources.text_tables import (
     Unreadable,
-    optional_number,
-    place,
+    parse_optional_number,
+    parse_position,
     read_rows,
-    unreadable_tag,
+    unreadable_tag_row,
 )
 from pipeline.sources.visloc_maps import Corners, read_corners, read_maps
 
@@ -60,20 +60,20 @@ class VisLoc(Source):
     def read(self, record: ImageRecord) -> bytes:
         if not record.part:
             return super().read(record)
-        return encoded(record.path, window_of(record.part), self.encoding)
+        return encode_window(record.path, parse_window(record.part), self.encoding)
 
     def ending(self, record: ImageRecord) -> str:
         return self.encoding if record.part else super().ending(record)
 
     def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
-        return checked(self._scan(root), root, LAYOUT)
+        return require_images(self._scan(root), root, LAYOUT)
 
     def _scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
         corners, rejected = read_corners(root)
         yield from rejected
         flights = [
             name
-            for name in storage.names(root)
+            for name in storage.list_names(root)
             if storage.is_folder(storage.join(root, name, "drone"))
         ]
         unknown = sorted(set(self.train_flights) - set(flights))
@@ -102,7 +102,7 @@ class VisLoc(Source):
             for found in maps
             for name, window, tag in found.tiles(self.tile_pixels, self.overlap)
         ]
-        nearest = _Nearest([tile.geotag for tile in tiles if tile.geotag])
+        nearest = _NearestTile([tile.geotag for tile in tiles if tile.geotag])
         taken, rejected = read_photos(storage.join(folder, f"{flight}.csv"))
         yield from rejected
         used = set()
@@ -135,7 +135,7 @@ class VisLoc(Source):
         yield from (tile for tile in tiles if not train or tile.location in used)
 
 
-class _Nearest:
+class _NearestTile:
     """Number of the place that is nearest to another, of equals the first; a flight is small enough
     for a flat earth.
     """
@@ -154,7 +154,7 @@ def _photos(folder: str) -> Iterator[tuple[str, int] | Rejection]:
         whole = storage.join(folder, path)
         if "/" in path:
             yield wrong_folder(whole, f"{path} is not drone/<image>")
-        elif not is_image(path):
+        elif not is_image_name(path):
             yield not_an_image(whole)
         else:
             yield whole, size
@@ -174,23 +174,25 @@ def read_photos(path: str) -> tuple[dict[str, tuple[GeoTag, str | None]], list[R
     rejected = []
     for line, row in read_rows(path, ("filename", "lat", "lon")):
         try:
-            lat, lon = place(row["lat"], row["lon"])
-            height = optional_number(row.get("height", ""))
+            lat, lon = parse_position(row["lat"], row["lon"])
+            height = parse_optional_number(row.get("height", ""))
             # Of the two yaw angles the authors call the first the more reliable one.
-            heading = optional_number(row.get("Phi1", ""))
+            heading = parse_optional_number(row.get("Phi1", ""))
             tag = GeoTag(
                 lat=lat,
                 lon=lon,
                 altitude_m=height,
                 heading_deg=None if heading is None else heading % 360,
             )
-            photos.setdefault(row["filename"].strip().lower(), (tag, _moment(row.get("date", ""))))
+            photos.setdefault(
+                row["filename"].strip().lower(), (tag, _parse_date(row.get("date", "")))
+            )
         except Unreadable as error:
-            rejected.append(unreadable_tag(path, line, ",".join(row.values()), error))
+            rejected.append(unreadable_tag_row(path, line, ",".join(row.values()), error))
     return photos, rejected
 
 
-def _moment(text: str) -> str | None:
+def _parse_date(text: str) -> str | None:
     """ISO 8601, None for an empty cell. Raises Unreadable."""
     try:
         return (

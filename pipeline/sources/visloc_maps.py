@@ -12,14 +12,14 @@ from dataclasses import dataclass
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import GeoTag, Rejection
-from pipeline.sources.maps.mosaic import opened
+from pipeline.sources.maps.mosaic import open_mosaic
 from pipeline.sources.maps.tiles import Window, plan_tiles
-from pipeline.sources.text_tables import Unreadable, place, read_rows, unreadable_tag
+from pipeline.sources.text_tables import Unreadable, parse_position, read_rows, unreadable_tag_row
 
 RANGE_TABLES = ("satellite_coordinates_range.csv", "satellite_ coordinates_range.csv")
 "The second, with a blank, is how the authors' archive spells it."
-CORNERS = ("LT_lat_map", "LT_lon_map", "RB_lat_map", "RB_lon_map")
-PART_OF_MAP = re.compile(r"(?P<whole>.+)_(?P<row>\d+)-(?P<column>\d+)")
+CORNER_COLUMNS = ("LT_lat_map", "LT_lon_map", "RB_lat_map", "RB_lon_map")
+MAP_PART_PATTERN = re.compile(r"(?P<whole>.+)_(?P<row>\d+)-(?P<column>\d+)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,15 +99,15 @@ def read_corners(root: str) -> tuple[dict[str, Corners], list[Rejection]]:
             f"no {RANGE_TABLES[0]} in {root}; expected UAV-VisLoc's root, which holds it; check --root"
         )
     corners, rejected = {}, []
-    for line, row in read_rows(path, ("mapname", *CORNERS)):
+    for line, row in read_rows(path, ("mapname", *CORNER_COLUMNS)):
         try:
-            top, left = place(row["LT_lat_map"], row["LT_lon_map"])
-            bottom, right = place(row["RB_lat_map"], row["RB_lon_map"])
+            top, left = parse_position(row["LT_lat_map"], row["LT_lon_map"])
+            bottom, right = parse_position(row["RB_lat_map"], row["RB_lon_map"])
             corners[map_name(row["mapname"])] = Corners(
                 top=top, left=left, bottom=bottom, right=right
             )
         except Unreadable as error:
-            rejected.append(unreadable_tag(path, line, ",".join(row.values()), error))
+            rejected.append(unreadable_tag_row(path, line, ",".join(row.values()), error))
     return corners, rejected
 
 
@@ -118,11 +118,11 @@ def read_maps(
     maps: list[SatelliteMap] = []
     parts: dict[str, dict[tuple[int, int], tuple[str, int, int]]] = {}
     rejected = []
-    for file in storage.names(folder):
+    for file in storage.list_names(folder):
         if not re.fullmatch(r"satellite.*\.tiff?", file, re.IGNORECASE):
             continue
         path, name = storage.join(folder, file), map_name(file)
-        part = PART_OF_MAP.fullmatch(name)
+        part = MAP_PART_PATTERN.fullmatch(name)
         if name not in corners and not (part and part["whole"] in corners):
             rejected.append(
                 Rejection(
@@ -131,7 +131,7 @@ def read_maps(
             )
             continue
         try:
-            width, height = opened(path).shape[::-1]
+            width, height = open_mosaic(path).shape[::-1]
         except OSError as error:
             rejected.append(Rejection(path=path, reason="unreadable map", found=str(error)))
             continue
@@ -146,7 +146,7 @@ def read_maps(
             parts.setdefault(part["whole"], {})[cell] = (path, width, height)
     for whole, cells in parts.items():
         try:
-            maps += _placed_parts(whole, cells, corners[whole])
+            maps += _place_parts(whole, cells, corners[whole])
         except Unreadable as error:
             rejected += [
                 Rejection(path=path, reason="incomplete map", found=str(error))
@@ -155,7 +155,7 @@ def read_maps(
     return sorted(maps, key=lambda found: found.name), rejected
 
 
-def _placed_parts(
+def _place_parts(
     whole: str, cells: dict[tuple[int, int], tuple[str, int, int]], corners: Corners
 ) -> Iterator[SatelliteMap]:
     """Parts by row and column, from 1, each at its place in the whole. Raises Unreadable where they

@@ -12,12 +12,14 @@ from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.progress import console
 from pipeline.core.records import ImageRecord, Rejection, Split, View
-from pipeline.images.inspect import is_image
+from pipeline.images.inspect import is_image_name
 from pipeline.sources.base import Source, not_an_image
 from pipeline.sources.maps import mbtiles
-from pipeline.sources.maps.web_mercator import DEEPEST, flipped, geotag, is_on_grid
+from pipeline.sources.maps.web_mercator import MAX_ZOOM, flip_row, is_on_grid, tile_geotag
 
-TILE = re.compile(r"(\d{1,2})/(\d{1,10})/(\d{1,10})\.(png|jpe?g|webp)", re.IGNORECASE | re.ASCII)
+TILE_PATH = re.compile(
+    r"(\d{1,2})/(\d{1,10})/(\d{1,10})\.(png|jpe?g|webp)", re.IGNORECASE | re.ASCII
+)
 LAYOUT = "<zoom>/<x>/<y>.png, .jpg or .webp"
 
 
@@ -35,8 +37,8 @@ class Xyz(Source):
     "The part of the data set that the tiles become."
 
     def __post_init__(self) -> None:
-        if self.zoom is not None and not 0 <= self.zoom <= DEEPEST:
-            raise InputError(f"--zoom is {self.zoom}, expected a number from 0 to {DEEPEST}")
+        if self.zoom is not None and not 0 <= self.zoom <= MAX_ZOOM:
+            raise InputError(f"--zoom is {self.zoom}, expected a number from 0 to {MAX_ZOOM}")
 
     def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
         if (
@@ -54,27 +56,27 @@ class Xyz(Source):
     def read(self, record: ImageRecord) -> bytes:
         """The tile's own bytes. Raises OSError."""
         return (
-            mbtiles.tile_bytes(record.path, *_numbers(record.part))
+            mbtiles.read_tile(record.path, *_parse_part(record.part))
             if record.part
             else super().read(record)
         )
 
     def ending(self, record: ImageRecord) -> str:
         return (
-            mbtiles.tile_kind(record.path, *_numbers(record.part))
+            mbtiles.read_tile_format(record.path, *_parse_part(record.part))
             if record.part
             else super().ending(record)
         )
 
     def _scan_file(self, root: str) -> Iterator[ImageRecord | Rejection]:
-        zoom = self._choose(root, mbtiles.zooms(root))
-        for tile in mbtiles.stored(root, zoom):
+        zoom = self._choose(root, mbtiles.list_zooms(root))
+        for tile in mbtiles.list_tiles(root, zoom):
             if isinstance(tile, Rejection):
                 yield tile
                 continue
             part = f"{zoom}-{tile.x}-{tile.y}"
             if not is_on_grid(zoom, tile.x, tile.y):
-                yield _outside(f"{root}#{part}", zoom, tile.x, tile.y)
+                yield _off_grid(f"{root}#{part}", zoom, tile.x, tile.y)
             elif not tile.kind:
                 found = f"a tile that begins with {tile.start!r}"
                 yield Rejection(path=f"{root}#{part}", reason="not an image", found=found)
@@ -83,15 +85,15 @@ class Xyz(Source):
 
     def _scan_folder(self, root: str) -> Iterator[ImageRecord | Rejection]:
         files = storage.walk(root)
-        found = {path: TILE.fullmatch(path) for path in files}
-        there = {int(said[1]) for said in found.values() if said and int(said[1]) <= DEEPEST}
-        if not there and any(path.lower().endswith(mbtiles.VECTOR) for path in files):
+        found = {path: TILE_PATH.fullmatch(path) for path in files}
+        there = {int(said[1]) for said in found.values() if said and int(said[1]) <= MAX_ZOOM}
+        if not there and any(path.lower().endswith(mbtiles.VECTOR_FORMATS) for path in files):
             raise InputError(f"{root} holds vector tiles, which show no pixels; expected {LAYOUT}")
         zoom = self._choose(root, sorted(there))
         for path, size in files.items():
             said, whole = found[path], storage.join(root, path)
-            if not said or int(said[1]) > DEEPEST:
-                if is_image(path):
+            if not said or int(said[1]) > MAX_ZOOM:
+                if is_image_name(path):
                     yield Rejection(
                         path=whole, reason="wrong folder", found=f"{path} is not {LAYOUT}"
                     )
@@ -102,9 +104,9 @@ class Xyz(Source):
             if int(said[1]) != zoom:
                 continue
             if not is_on_grid(zoom, x, y):
-                yield _outside(whole, zoom, x, y)
+                yield _off_grid(whole, zoom, x, y)
             else:
-                yield self._record(whole, "", zoom, x, flipped(zoom, y) if self.tms else y, size)
+                yield self._record(whole, "", zoom, x, flip_row(zoom, y) if self.tms else y, size)
 
     def _choose(self, root: str, there: list[int]) -> int:
         """The zoom to take. Raises InputError where there is no tile of it."""
@@ -133,17 +135,17 @@ class Xyz(Source):
             split=self.split,
             view=self.view,
             location=f"{zoom}-{x}-{y}",
-            geotag=geotag(zoom, x, y),
+            geotag=tile_geotag(zoom, x, y),
             bytes=size,
         )
 
 
-def _numbers(part: str) -> tuple[int, int, int]:
+def _parse_part(part: str) -> tuple[int, int, int]:
     zoom, x, y = map(int, part.split("-"))
     return zoom, x, y
 
 
-def _outside(path: str, zoom: int, x: int, y: int) -> Rejection:
+def _off_grid(path: str, zoom: int, x: int, y: int) -> Rejection:
     return Rejection(
         path=path,
         reason="outside of the map",

@@ -25,7 +25,7 @@ from pipeline.batches.sampler import plan_pass, read_spans, shuffled  # fmt: ski
 from pipeline.batches.training import Batch, Reading, TrainingStream  # fmt: skip
 from pipeline.core import json_files, storage
 from pipeline.core.errors import InputError
-from pipeline.core.prefetch import ahead, ready
+from pipeline.core.prefetch import prefetch, prefetch_map
 from pipeline.core.records import ImageRecord, Split, View
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.transforms import Augmentation
@@ -178,7 +178,7 @@ def test_shuffling_keeps_every_sample_once_and_is_repeatable(buffer: int) -> Non
 def test_work_ahead_keeps_its_order_and_stays_within_its_depth() -> None:
     drawn = count()
     numbers: Iterator[int] = (next(drawn) for _ in range(100))
-    results = ahead(lambda number: number * number, numbers, threads=3, depth=5)
+    results = prefetch_map(lambda number: number * number, numbers, threads=3, depth=5)
     assert [next(results) for _ in range(4)] == [0, 1, 4, 9]
     assert next(drawn) <= 4 + 5
     results.close()  # type: ignore[attr-defined]
@@ -194,7 +194,7 @@ def test_work_ahead_runs_beside_the_consumer_and_hands_on_an_error_at_its_place(
             raise DecodeError("damaged image", "here")
         return number
 
-    results = ahead(work, range(4), threads=1, depth=2)
+    results = prefetch_map(work, range(4), threads=1, depth=2)
     assert next(results) == 0
     assert started.wait(10)
     assert next(results) == 1
@@ -213,14 +213,14 @@ def test_items_are_ready_before_they_are_asked_for_and_no_more_than_so_many() ->
                 raise DecodeError("damaged image", "here")
             yield number
 
-    items = ready(source(), depth=3)
+    items = prefetch(source(), depth=3)
     assert next(items) == 0
     assert third.wait(10)  # while nobody asks
     assert next(made) == 4
     assert [next(items) for _ in range(4)] == [1, 2, 3, 5]
     with pytest.raises(DecodeError, match="here"):
         next(items)
-    assert list(ready(range(5), depth=9)) == list(range(5))
+    assert list(prefetch(range(5), depth=9)) == list(range(5))
 
 
 def test_a_shard_reads_back_as_it_was_packed(shards: str) -> None:

@@ -22,7 +22,7 @@ def test_calls_come_back_with_their_items_and_never_more_than_the_window_is_in_f
         return double.remote(number)
 
     results = {}
-    for item, result in cluster.bounded(submit, range(9), window=3):
+    for item, result in cluster.bounded_map(submit, range(9), window=3):
         results[item] = result
         flying -= 1
     assert results == {number: 2 * number for number in range(9)}
@@ -32,7 +32,7 @@ def test_calls_come_back_with_their_items_and_never_more_than_the_window_is_in_f
 def test_a_call_that_fails_is_raised_here(ray_cluster: None) -> None:
     fail: Any = ray.remote(lambda number: 1 // number)
     with pytest.raises(ZeroDivisionError):
-        list(cluster.bounded(fail.remote, [0], window=1))
+        list(cluster.bounded_map(fail.remote, [0], window=1))
 
 
 def test_a_cluster_that_is_no_more_is_not_waited_for(

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.core.errors import InputError
-from pipeline.core.lock import one_at_a_time, only_one
+from pipeline.core.lock import locks_output, output_lock
 
 ROOT = Path(__file__).parents[2]
 HOLD = """
@@ -45,10 +45,10 @@ def test_a_second_run_is_refused_with_who_holds_it_and_leaves_nothing(tmp_path: 
                 InputError,
                 match=rf"is being written by process {other.pid}, since 2.*wait until it has ended",
             ),
-            only_one(str(out)),
+            output_lock(str(out)),
         ):
             pass
-        with only_one(str(tmp_path / "another")):
+        with output_lock(str(tmp_path / "another")):
             assert not out.exists()
 
 
@@ -56,25 +56,25 @@ def test_a_run_that_was_killed_holds_nothing(tmp_path: Path) -> None:
     with held(tmp_path) as other:
         os.kill(other.pid, signal.SIGKILL)
         other.wait()
-        with only_one(str(tmp_path)):
+        with output_lock(str(tmp_path)):
             pass
 
 
 def test_one_folder_by_two_names_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "out")
     monkeypatch.chdir(tmp_path)
-    with only_one("out"):
+    with output_lock("out"):
         for name in (f"{tmp_path}/out/", f"file://{tmp_path}/out", f"{tmp_path}/link"):
-            with pytest.raises(InputError, match="one run at a time"), only_one(name):
+            with pytest.raises(InputError, match="one run at a time"), output_lock(name):
                 pass
-    with only_one(f"{tmp_path}/link"):
+    with output_lock(f"{tmp_path}/link"):
         pass
 
 
 def test_a_stage_holds_its_output_while_it_runs_and_then_no_more(tmp_path: Path) -> None:
-    @one_at_a_time(lambda number, out: out)
+    @locks_output(lambda number, out: out)
     def stage(number: int, out: str) -> int:
-        with pytest.raises(InputError, match="one run at a time"), only_one(out):
+        with pytest.raises(InputError, match="one run at a time"), output_lock(out):
             pass
         if number < 0:
             raise ValueError
@@ -87,5 +87,5 @@ def test_a_stage_holds_its_output_while_it_runs_and_then_no_more(tmp_path: Path)
 
 
 def test_object_stores_have_no_locks() -> None:
-    with only_one("memory://out"), only_one("memory://out"):
+    with output_lock("memory://out"), output_lock("memory://out"):
         pass

@@ -22,7 +22,7 @@ def test_what_is_written_is_read_back_and_listed(folder: str) -> None:
     storage.write_json(path, {"é": [1, 2]})
     assert storage.exists(path)
     assert storage.read_json(path) == {"é": [1, 2]}
-    assert storage.names(storage.join(folder, "deep")) == ["a.json"]
+    assert storage.list_names(storage.join(folder, "deep")) == ["a.json"]
     assert list(storage.walk(folder)) == ["deep/a.json"]
     assert storage.is_folder(folder)
 
@@ -32,18 +32,18 @@ def test_a_write_that_fails_leaves_what_was_there(folder: str) -> None:
     storage.write_bytes(path, b"good")
 
     def half() -> None:
-        with storage.atomic(path) as stream:
+        with storage.atomic_write(path) as stream:
             stream.write(b"ba")
             raise RuntimeError("half way")
 
     with pytest.raises(RuntimeError, match="half way"):
         half()
     assert storage.read_bytes(path) == b"good"
-    assert storage.names(folder) == ["a.bin"]
+    assert storage.list_names(folder) == ["a.bin"]
 
 
 def test_an_absent_folder_has_no_names(tmp_path: Path) -> None:
-    assert storage.names(str(tmp_path / "nowhere")) == []
+    assert storage.list_names(str(tmp_path / "nowhere")) == []
 
 
 def test_paths_are_made_absolute_and_uris_left_alone(
@@ -63,7 +63,7 @@ def test_what_killed_writers_left_is_swept_away_and_nothing_else(tmp_path: Path)
         ".a.parquet.0123abcx",
     ):
         (tmp_path / name).touch()
-    storage.sweep(str(tmp_path), ["a.parquet"])
+    storage.remove_temporaries(str(tmp_path), ["a.parquet"])
     left = sorted(path.name for path in tmp_path.iterdir())
     assert left == [".a.parquet", ".a.parquet.0123abcx", ".b.parquet.0123abcd", "a.parquet"]
-    storage.sweep(str(tmp_path / "nowhere"), ["a.parquet"])
+    storage.remove_temporaries(str(tmp_path / "nowhere"), ["a.parquet"])

@@ -44,9 +44,9 @@ def run(
         "r5": 1.0,
         "r10": 1.0,
         "r1p": r1,
-        "ap": sum(row["ap"] for row in rows) / len(rows),
+        "ap": sum(float(row["ap"] or 0) for row in rows) / len(rows),
         "fingerprint": "f",
-    }  # type: ignore[misc]
+    }
     return Findings(
         name=name, metrics=[metrics], results=pa.Table.from_pylist(rows, RESULTS_SCHEMA)
     )

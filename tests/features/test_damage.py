@@ -21,18 +21,25 @@ from pipeline.core.records import Rejection, Split, View
 from pipeline.features.part import (
     PartFooter,
     PartRows,
-    list_rejected,
     read_header,
     read_rejected,
     verify_part,
     write_part,
+    write_rejected,
 )
 from pipeline.features.row_reader import RowReader
 from pipeline.features.table import Box, open_table
-from pipeline.index.metadata import FACTS, Effort, IndexFacts, PartFacts, read_facts, write_facts
-from pipeline.locate.confidence import Confidence, read_confidence, write_confidence
-from pipeline.locate.logistic import Logistic
-from pipeline.locate.reliability import Bin
+from pipeline.index.metadata import (
+    METADATA_FILE,
+    IndexMetadata,
+    PartMetadata,
+    SearchParams,
+    read_metadata,
+    write_metadata,
+)
+from pipeline.locate.confidence import Calibration, read_calibration, write_calibration
+from pipeline.locate.logistic import LogisticModel
+from pipeline.locate.reliability import ReliabilityBin
 from pipeline.retrieval.results import INPUTS, METRICS, VIEWS, read_inputs, read_rows, write_inputs
 from pipeline.shards import record_table
 from pipeline.shards.manifest import MANIFEST, Manifest, Shard, read_manifest
@@ -170,15 +177,17 @@ def test_a_damaged_record_part_is_refused_and_not_taken_for_done(tmp_path: Path)
 
 
 def test_a_damaged_list_of_what_was_refused_is_named(tmp_path: Path) -> None:
-    rejections.write(str(tmp_path), [Rejection(path="a", reason="b", found="c")], keep=False)
-    path = tmp_path / rejections.FILE
+    rejections.write_rejections(
+        str(tmp_path), [Rejection(path="a", reason="b", found="c")], keep=False
+    )
+    path = tmp_path / rejections.REJECTED_FILE
     good = path.read_bytes()
     for data in damages(good, 100):
         if data is None:
             continue
         path.write_bytes(data)
         said = sentence_of(
-            lambda: rejections.write(
+            lambda: rejections.write_rejections(
                 str(tmp_path), [Rejection(path="d", reason="e", found="f")], keep=True
             )
         )
@@ -191,14 +200,14 @@ def test_a_damaged_list_of_what_was_refused_is_named(tmp_path: Path) -> None:
 
 def test_a_damaged_list_of_a_table_is_named_and_written_again(tmp_path: Path) -> None:
     rows = [("shard", "key", "reason", "found")]
-    list_rejected(str(tmp_path), rows)
+    write_rejected(str(tmp_path), rows)
     path = tmp_path / "_rejected" / "rejected.parquet"
 
     look = look_or_say_gone(path, lambda: read_rejected(str(tmp_path)).to_pylist())
     assert found_or_equal(path, look, 100) > 80
     for data in damages(path.read_bytes(), 30, seed=1):
         path.write_bytes(data or b"")
-        list_rejected(str(tmp_path), rows)
+        write_rejected(str(tmp_path), rows)
         assert len(read_rejected(str(tmp_path))) == 1
 
 
@@ -224,7 +233,7 @@ def test_a_damaged_manifest_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_damaged_index_json_is_refused(tmp_path: Path) -> None:
-    part = PartFacts(
+    part = PartMetadata(
         faiss="index.faiss",
         ids="ids.arrow",
         first_row=0,
@@ -232,7 +241,7 @@ def test_a_damaged_index_json_is_refused(tmp_path: Path) -> None:
         table_parts={"gallery-drone-000000.parquet": "s" * 64},
         files={"index.faiss": {"bytes": 9, "sha256": "0" * 64}},
     )
-    facts = IndexFacts(
+    facts = IndexMetadata(
         factory="Flat",
         metric="inner product",
         rows=5,
@@ -243,7 +252,7 @@ def test_a_damaged_index_json_is_refused(tmp_path: Path) -> None:
         why="few rows",
         refine="none",
         on_disk=False,
-        effort=Effort(breadth=1),
+        effort=SearchParams(breadth=1),
         target_recall=0.9,
         unit_rows=9,
         part_rows=9,
@@ -255,31 +264,32 @@ def test_a_damaged_index_json_is_refused(tmp_path: Path) -> None:
         parts=(part,),
         trained={},
     )
-    write_facts(str(tmp_path), facts)
-    path = tmp_path / FACTS
+    write_metadata(str(tmp_path), facts)
+    path = tmp_path / METADATA_FILE
     assert (
-        found_or_equal(path, look_or_say_gone(path, lambda: read_facts(str(tmp_path))), 400) > 300
+        found_or_equal(path, look_or_say_gone(path, lambda: read_metadata(str(tmp_path))), 400)
+        > 300
     )
 
 
 def test_a_damaged_calibration_is_refused(tmp_path: Path) -> None:
-    model = Logistic(
+    model = LogisticModel(
         mean_F=(0.1, 0.2, 0.3, 0.4),
         scale_F=(1.0,) * 4,
         coefficient_F=(1.5, 2.5, 3.5, 4.5),
         intercept=0.25,
     )
-    calibration = Confidence(
+    calibration = Calibration(
         fingerprint="f" * 64,
         gallery=5,
         asked="places held out",
         spacing_m=10.0,
-        within_m=5.0,
+        agreement_radius_m=5.0,
         tolerance_m=3.0,
         outside=0.5,
         model=model,
         threshold=0.5,
-        sharpness=9.0,
+        inverse_temperature=9.0,
         elsewhere=0.1,
         photos=3,
         locations=2,
@@ -287,11 +297,11 @@ def test_a_damaged_calibration_is_refused(tmp_path: Path) -> None:
         right_kept=0.6,
         outside_unknown=0.8,
         calibration_error=0.02,
-        bins=(Bin(said=0.5, seen=0.4, share=1.0),),
+        bins=(ReliabilityBin(said=0.5, seen=0.4, share=1.0),),
     )
     path = tmp_path / "calibration.json"
-    write_confidence(str(path), calibration)
-    look = look_or_say_gone(path, lambda: read_confidence(str(path), {"fingerprint": "f" * 64}))
+    write_calibration(str(path), calibration)
+    look = look_or_say_gone(path, lambda: read_calibration(str(path), {"fingerprint": "f" * 64}))
     assert found_or_equal(path, look, 400) > 300
 
 
@@ -307,7 +317,7 @@ def test_an_evaluation_is_read_back_as_it_was_written_or_not_at_all(tmp_path: Pa
     ]
     storage.write_json(str(tmp_path / VIEWS), [{"views": 3, "r1": 0.5}])
     write_inputs(
-        str(tmp_path), {"ranked": {"queries": "q" * 64}, "shown": {}}, storage.as_json(metrics)
+        str(tmp_path), {"ranked": {"queries": "q" * 64}, "shown": {}}, storage.encode_json(metrics)
     )
     storage.write_json(str(tmp_path / METRICS), metrics)
     for name, listed in ((METRICS, METRICS), (VIEWS, VIEWS)):

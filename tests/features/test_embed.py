@@ -9,7 +9,7 @@ import pytest
 from pipeline.batches.ordered import CHANGED
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.features.embed import EmbeddingSettings, Encoder, Network, embed_gallery
+from pipeline.features.embed import EmbeddingSettings, Encoder, EncoderSpec, embed_gallery
 from pipeline.features.part import read_rejected
 from pipeline.features.table import open_table, read_footer
 from pipeline.shards.manifest import read_manifest
@@ -17,7 +17,7 @@ from pipeline.shards.samples import read_shard
 from tests.damaging import say_again
 
 
-def mean_colour_network(fingerprint: str = "f" * 64) -> Network:
+def mean_colour_network(fingerprint: str = "f" * 64) -> EncoderSpec:
     """An encoder that needs no training: the unit vector of the mean colour."""
 
     def factory(threads: int) -> Encoder:
@@ -28,7 +28,7 @@ def mean_colour_network(fingerprint: str = "f" * 64) -> Network:
 
         return encode
 
-    return Network(fingerprint=fingerprint, image_size=32, factory=factory)
+    return EncoderSpec(fingerprint=fingerprint, image_size=32, factory=factory)
 
 
 def test_every_image_has_one_row_with_its_label_and_position(

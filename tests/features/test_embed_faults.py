@@ -21,9 +21,15 @@ import pytest
 from pipeline.core import cluster, json_files, storage
 from pipeline.core.cluster import Node
 from pipeline.core.errors import InputError
-from pipeline.features.embed import EmbeddingSettings, Encoder, Incomplete, Network, embed_gallery
+from pipeline.features.embed import (
+    EmbeddingSettings,
+    Encoder,
+    EncoderSpec,
+    IncompleteEmbedding,
+    embed_gallery,
+)
 from pipeline.features.part import part_names, read_footer, read_rejected
-from pipeline.features.table import open_table, verify
+from pipeline.features.table import open_table, verify_table
 from pipeline.shards.manifest import Shard, read_manifest
 from tests.damaging import say_again
 
@@ -33,8 +39,8 @@ def network_of_colours(
     pids: str = "",
     at_start: Callable[[], None] = lambda: None,
     spoil: str = "",
-) -> Network:
-    """An encoder that needs no weights: the mean colour's unit vector. It takes `seconds` a batch,
+) -> EncoderSpec:
+    """An encoder that needs no weights: the mean colour's unit vector. It takes `parse_time` a batch,
     and its worker leaves its process id in the folder `pids`; what `spoil` names happens to a black
     image."""
 
@@ -58,7 +64,7 @@ def network_of_colours(
 
         return encode
 
-    return Network(fingerprint="f" * 64, image_size=16, resizer="pillow", factory=factory)
+    return EncoderSpec(fingerprint="f" * 64, image_size=16, resizer="pillow", factory=factory)
 
 
 def settings_of(shards: str | Path, out: str | Path, **more: Any) -> EmbeddingSettings:
@@ -119,7 +125,7 @@ def test_a_shard_that_kills_its_worker_is_set_aside_and_the_rest_is_done(
     pids.mkdir()
     blacken(copied, shard)
     with pytest.raises(
-        Incomplete, match=rf"1 of \d+ shards .* again: {shard.name} \(lost 3 workers: "
+        IncompleteEmbedding, match=rf"1 of \d+ shards .* again: {shard.name} \(lost 3 workers: "
     ):
         embed_gallery(settings_of(copied, out), network_of_colours(spoil="kill", pids=str(pids)))
     # Two at first, and one for each death after which there was more to do.
@@ -149,7 +155,8 @@ def test_an_error_nobody_foresaw_costs_the_shard_and_not_its_neighbours(
     shard = a_shard(copied)
     blacken(copied, shard)
     with pytest.raises(
-        Incomplete, match=rf"{shard.name} \(lost 3 workers: ZeroDivisionError: a kernel failed\)"
+        IncompleteEmbedding,
+        match=rf"{shard.name} \(lost 3 workers: ZeroDivisionError: a kernel failed\)",
     ):
         embed_gallery(
             settings_of(copied, tmp_path / "table", workers=1), network_of_colours(spoil="raise")
@@ -163,11 +170,11 @@ def test_an_embedding_that_is_no_number_never_reaches_the_table(
     shard = a_shard(copied)
     blacken(copied, shard)
     with pytest.raises(
-        Incomplete,
+        IncompleteEmbedding,
         match=rf"the network gives {shard.split}-{shard.view}-\S+ an embedding of length nan",
     ):
         embed_gallery(settings_of(copied, tmp_path / "table"), network_of_colours(spoil="nan"))
-    verify(str(tmp_path / "table"))
+    verify_table(str(tmp_path / "table"))
 
 
 def test_a_tar_that_is_cut_off_is_set_aside_at_once_and_done_when_it_is_whole(
@@ -179,7 +186,7 @@ def test_a_tar_that_is_cut_off_is_set_aside_at_once_and_done_when_it_is_whole(
     whole = tar.read_bytes()
     tar.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(
-        Incomplete, match=rf"{shard.name} \(unusable: \S+{shard.name}\.tar has \d+ bytes"
+        IncompleteEmbedding, match=rf"{shard.name} \(unusable: \S+{shard.name}\.tar has \d+ bytes"
     ):
         embed_gallery(settings_of(copied, out), network_of_colours(pids=str(pids)))
     assert len(list(pids.iterdir())) <= 2  # no worker was lost over it
@@ -232,7 +239,7 @@ def test_a_full_disk_ends_the_stage_with_a_sentence_and_it_goes_on_when_there_is
 ) -> None:
     out = tmp_path / "table"
     with pytest.raises(
-        Incomplete, match=r"cannot be written \(No space left on device\).*to go on"
+        IncompleteEmbedding, match=r"cannot be written \(No space left on device\).*to go on"
     ):
         embed_gallery(
             settings_of(tiny_shards, out, workers=1), network_of_colours(at_start=full_disk())

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from pipeline.core.errors import InputError
 from pipeline.features import row_reader
-from pipeline.features.row_reader import RowReader, readable
+from pipeline.features.row_reader import RowReader, supports_row_reads
 from tests.index.index_tables import clustered, write_table_part
 
 NAME = "gallery-satellite-000000.parquet"
@@ -106,7 +106,7 @@ def test_a_part_that_is_another_shards_or_gone_is_refused(tmp_path: Path) -> Non
 
 
 def test_few_parts_are_open_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(row_reader, "OPEN_PARTS", 2)
+    monkeypatch.setattr(row_reader, "MAX_OPEN_PARTS", 2)
     for number in range(5):
         write_table_part(tmp_path, number, clustered(4, 8, number))
     reader = RowReader(str(tmp_path), 8)
@@ -119,5 +119,5 @@ def test_few_parts_are_open_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_only_tables_on_this_machine_are_read_by_rows() -> None:
-    assert readable("/somewhere/table")
-    assert not readable("memory://table")
+    assert supports_row_reads("/somewhere/table")
+    assert not supports_row_reads("memory://table")

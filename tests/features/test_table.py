@@ -15,12 +15,12 @@ from pipeline.core.records import Rejection, Split, View
 from pipeline.features.part import (
     PartFooter,
     PartRows,
-    list_rejected,
     read_footer,
     read_rejected,
     write_part,
+    write_rejected,
 )
-from pipeline.features.table import Box, FeatureTable, open_table, verify
+from pipeline.features.table import Box, FeatureTable, open_table, verify_table
 
 FOOTER = PartFooter(fingerprint="f" * 64, shard_sha256="s" * 64, rows=5)
 
@@ -265,7 +265,7 @@ def test_an_embedding_that_is_no_unit_vector_is_refused_with_its_part(
     ):
         table.embeddings()
     with pytest.raises(InputError, match=r"query-drone-000000\.parquet"):
-        verify(str(tmp_path))
+        verify_table(str(tmp_path))
     assert table.select(Split.GALLERY).embeddings().shape == (5, 8)
 
 
@@ -273,7 +273,7 @@ def test_a_key_that_is_there_twice_is_refused_with_both_parts(tmp_path: Path) ->
     write(tmp_path, "query", "drone", 0)
     shutil.copy(tmp_path / "query-drone-000000.parquet", tmp_path / "query-drone-000001.parquet")
     said = r"query-drone-000001\.parquet holds key query-drone-0, which query-drone-000000\.parquet holds too"
-    for opened in (open_table, verify):
+    for opened in (open_table, verify_table):
         with pytest.raises(InputError, match=said):
             opened(str(tmp_path))
 
@@ -290,10 +290,10 @@ def test_parts_of_other_numbers_are_refused(tmp_path: Path) -> None:
 
 def test_the_list_of_what_has_no_row_is_beside_the_parts_and_in_nobodys_way(tmp_path: Path) -> None:
     write(tmp_path, "query", "drone", 0)
-    assert list_rejected(
+    assert write_rejected(
         str(tmp_path), [("s", "k", "not an image", "9 bytes"), ("r", None, "unusable", "cut off")]
     )
-    assert not list_rejected(
+    assert not write_rejected(
         str(tmp_path), [("r", None, "unusable", "cut off"), ("s", "k", "not an image", "9 bytes")]
     )
     assert read_rejected(str(tmp_path))["shard"].to_pylist() == ["r", "s"]
@@ -302,13 +302,13 @@ def test_the_list_of_what_has_no_row_is_beside_the_parts_and_in_nobodys_way(tmp_
         == pyarrow.dataset.dataset(tmp_path).count_rows()
         == open_table(str(tmp_path)).rows
     )
-    assert list_rejected(str(tmp_path), [])
+    assert write_rejected(str(tmp_path), [])
     assert len(read_rejected(str(tmp_path))) == 0
 
 
 def test_the_snippets_of_the_docs_run(tmp_path: Path) -> None:
     vectors = write(tmp_path, "query", "drone", 0)
-    list_rejected(str(tmp_path), [("s", "k", "not an image", "9 bytes")])
+    write_rejected(str(tmp_path), [("s", "k", "not an image", "9 bytes")])
     frame = pd.read_parquet(tmp_path, filters=[("view", "==", "drone")])
     assert np.array_equal(np.stack(frame.embedding.to_list()), vectors)
     duckdb = pytest.importorskip("duckdb")

@@ -33,7 +33,7 @@ def examples(quick: int, share: float = 1.0) -> settings:
         max_examples=max(1, round(EXAMPLES * share)) if EXAMPLES else quick,
         derandomize=not EXAMPLES,
         database=None,
-        deadline=None,  # `bounded` stops what takes too long while it runs
+        deadline=None,  # `bounded_map` stops what takes too long while it runs
         suppress_health_check=list(HealthCheck),
         print_blob=True,
     )
@@ -60,11 +60,9 @@ def bounded(
         yield
     except refusals as error:
         told = str(error).strip()
-        assert told, "an error without a word"  # noqa: PT017  # any of several exceptions
+        assert told, "an error without a word"  # any of several exceptions
         if isinstance(error, InputError):  # others become a Rejection, which cuts them
-            assert len(str(error)) <= LONGEST_SENTENCE, (
-                f"a sentence of {len(str(error))} characters"
-            )
+            assert len(told) <= LONGEST_SENTENCE, f"a sentence of {len(told)} characters"
     finally:
         resource.setrlimit(resource.RLIMIT_AS, held)
         signal.setitimer(signal.ITIMER_REAL, 0)

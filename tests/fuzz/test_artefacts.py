@@ -20,11 +20,22 @@ from pipeline.core.json_files import is_file_name
 from pipeline.core.records import Rejection, Split, View
 from pipeline.features.part import PartFooter, PartRows, read_rejected, write_part
 from pipeline.features.row_reader import RowReader
-from pipeline.features.table import open_table, verify
-from pipeline.index.metadata import Effort, IndexFacts, PartFacts, as_said, read_facts
-from pipeline.locate.confidence import FEATURES, Confidence, read_confidence, write_confidence
-from pipeline.locate.logistic import Logistic
-from pipeline.locate.reliability import Bin
+from pipeline.features.table import open_table, verify_table
+from pipeline.index.metadata import (
+    IndexMetadata,
+    PartMetadata,
+    SearchParams,
+    metadata_dict,
+    read_metadata,
+)
+from pipeline.locate.confidence import (
+    FEATURE_NAMES,
+    Calibration,
+    read_calibration,
+    write_calibration,
+)
+from pipeline.locate.logistic import LogisticModel
+from pipeline.locate.reliability import ReliabilityBin
 from pipeline.report.inputs import read_findings, read_training
 from pipeline.shards.manifest import Manifest, Shard, read_manifest
 from pipeline.shards.pack import PackingSettings, finished
@@ -49,7 +60,7 @@ MANIFEST = Manifest(
     rejected=0,
 )
 FILE = {"bytes": 10, "sha256": "0" * 64}
-FACTS = IndexFacts(
+FACTS = IndexMetadata(
     factory="Flat",
     metric="inner product",
     rows=2,
@@ -60,7 +71,7 @@ FACTS = IndexFacts(
     why="small",
     refine="none",
     on_disk=False,
-    effort=Effort(breadth=1),
+    effort=SearchParams(breadth=1),
     target_recall=0.95,
     unit_rows=2,
     part_rows=2,
@@ -70,7 +81,7 @@ FACTS = IndexFacts(
     expected_bytes=None,
     measured={"recall_at_1": 1.0},
     parts=(
-        PartFacts(
+        PartMetadata(
             faiss="index.faiss",
             ids="ids.arrow",
             first_row=0,
@@ -81,18 +92,18 @@ FACTS = IndexFacts(
     ),
     trained={"trained.faiss": FILE},
 )
-NUMBERS = (0.1,) * len(FEATURES)
-CONFIDENCE = Confidence(
+NUMBERS = (0.1,) * len(FEATURE_NAMES)
+CONFIDENCE = Calibration(
     fingerprint="0" * 64,
     gallery=2,
     asked="photos",
     spacing_m=20.0,
-    within_m=50.0,
+    agreement_radius_m=50.0,
     tolerance_m=25.0,
     outside=0.5,
-    model=Logistic(mean_F=NUMBERS, scale_F=NUMBERS, coefficient_F=NUMBERS, intercept=0.0),
+    model=LogisticModel(mean_F=NUMBERS, scale_F=NUMBERS, coefficient_F=NUMBERS, intercept=0.0),
     threshold=0.5,
-    sharpness=1.0,
+    inverse_temperature=1.0,
     elsewhere=0.0,
     photos=10,
     locations=5,
@@ -100,7 +111,7 @@ CONFIDENCE = Confidence(
     right_kept=0.5,
     outside_unknown=0.5,
     calibration_error=0.1,
-    bins=(Bin(said=0.5, seen=0.5, share=1.0),),
+    bins=(ReliabilityBin(said=0.5, seen=0.5, share=1.0),),
 )
 
 
@@ -147,9 +158,9 @@ def test_a_shards_name_that_leads_elsewhere_is_refused(name: str, folder: Path) 
 @given(st.data())
 @examples(120)
 def test_what_an_index_says_of_itself(folder: Path, data: st.DataObject) -> None:
-    put(data, folder / "index" / "index.json", as_said(FACTS))
+    put(data, folder / "index" / "index.json", metadata_dict(FACTS))
     with bounded(InputError):
-        found = read_facts(str(folder / "index"))
+        found = read_metadata(str(folder / "index"))
         assert all(is_file_name(name) for part in found.parts for name in part.files)
 
 
@@ -157,11 +168,11 @@ def test_what_an_index_says_of_itself(folder: Path, data: st.DataObject) -> None
 @examples(80)
 def test_a_calibration(folder: Path, data: st.DataObject) -> None:
     path = folder / "calibration.json"
-    write_confidence(str(path), CONFIDENCE)
+    write_calibration(str(path), CONFIDENCE)
     put(data, path, json.loads(path.read_text()))
     with bounded(InputError):
-        found = read_confidence(str(path), {"fingerprint": "0" * 64})
-        assert np.isfinite(found.model.probabilities(np.zeros((1, len(FEATURES))))).all()
+        found = read_calibration(str(path), {"fingerprint": "0" * 64})
+        assert np.isfinite(found.model.probabilities(np.zeros((1, len(FEATURE_NAMES))))).all()
 
 
 @cache
@@ -228,7 +239,7 @@ def test_a_part_of_a_feature_table(folder: Path, data: st.DataObject) -> None:
     with bounded(InputError):
         open_table(str(folder / "table")).labels()
     with bounded(InputError):
-        verify(str(folder / "table"))
+        verify_table(str(folder / "table"))
     with bounded(InputError):
         RowReader(str(folder / "table"), 8).read("part.parquet", "0" * 64, np.array([0, 49, 7]))
 

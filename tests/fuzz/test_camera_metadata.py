@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pipeline.images.camera_tags import read_tags
-from pipeline.images.image_blocks import Blocks, UnreadableTag, find_blocks
-from pipeline.sources.kml import place_of_kml
+from pipeline.images.image_blocks import MetadataBlocks, UnreadableTag, find_metadata
+from pipeline.sources.kml import parse_kml
 from pipeline.sources.text_tables import Unreadable
 from tests.fuzz.bounds import bounded, examples
 from tests.fuzz.hostile import damaged, numbers
@@ -83,7 +83,7 @@ def photo(form: str) -> bytes:
 def test_a_photos_tags(data: st.DataObject, form: str, whole: bool) -> None:
     told = data.draw(damaged(photo(form)))
     with bounded(UnreadableTag):
-        read_tags(find_blocks(told, whole))
+        read_tags(find_metadata(told, whole))
 
 
 @given(st.data(), st.sampled_from(["<", ">"]))
@@ -98,7 +98,7 @@ def test_directories_that_point_anywhere(data: st.DataObject, order: str) -> Non
         st.binary(max_size=64)
     )
     with bounded(UnreadableTag):
-        read_tags(Blocks(exif=block))
+        read_tags(MetadataBlocks(exif=block))
 
 
 @given(
@@ -111,9 +111,9 @@ def test_directories_that_point_anywhere(data: st.DataObject, order: str) -> Non
 def test_an_xmp_packet(cells: list[str], head: str, encoding: str, data: st.DataObject) -> None:
     packet = (head + XMP.format(*cells)).encode(encoding, "replace")
     with bounded(UnreadableTag):
-        read_tags(Blocks(xmp=packet))
+        read_tags(MetadataBlocks(xmp=packet))
     with bounded(UnreadableTag):
-        read_tags(Blocks(xmp=data.draw(damaged(packet))))
+        read_tags(MetadataBlocks(xmp=data.draw(damaged(packet))))
 
 
 @given(
@@ -124,21 +124,21 @@ def test_an_xmp_packet(cells: list[str], head: str, encoding: str, data: st.Data
 def test_a_kml(cells: list[str], head: str, encoding: str, kind: str, data: st.DataObject) -> None:
     told = KML.format(*cells, head=head, kind=kind).encode(encoding, "replace")
     with bounded(Unreadable):
-        place_of_kml(told)
+        parse_kml(told)
     with bounded(Unreadable):
-        place_of_kml(data.draw(damaged(told)))
+        parse_kml(data.draw(damaged(told)))
 
 
 def test_points_within_points_are_read_in_time() -> None:
     with bounded(Unreadable):
-        place_of_kml(b"<Point>" * 60_000 + b"</Point>" * 60_000)
+        parse_kml(b"<Point>" * 60_000 + b"</Point>" * 60_000)
 
 
 def test_a_number_that_goes_on_and_on_is_read_in_time() -> None:
     long = "1" * 500_000 + "x"
     with bounded(UnreadableTag):
-        read_tags(Blocks(xmp=XMP.format(long, long, long, long, long).encode()[: 1 << 20]))
+        read_tags(MetadataBlocks(xmp=XMP.format(long, long, long, long, long).encode()[: 1 << 20]))
     with bounded(UnreadableTag):
-        read_tags(Blocks(xmp=XMP.format(*["1" * 100_000 + "x"] * 5).encode()))
+        read_tags(MetadataBlocks(xmp=XMP.format(*["1" * 100_000 + "x"] * 5).encode()))
     with bounded(Unreadable):
-        place_of_kml(f"<Point><coordinates>{long},1</coordinates></Point>".encode())
+        parse_kml(f"<Point><coordinates>{long},1</coordinates></Point>".encode())

@@ -13,9 +13,9 @@ from PIL import Image
 
 from jobs.command_line import cli
 from pipeline.core import progress as told
-from pipeline.core.errors import InputError, Unfinished
-from pipeline.core.progress import UNSEEN, console, progress, results, visible
-from pipeline.core.rejections import FILE
+from pipeline.core.errors import Incomplete, InputError
+from pipeline.core.progress import CONTROL_CHARACTERS, console, escape_controls, progress, results
+from pipeline.core.rejections import REJECTED_FILE
 from pipeline.locate.photo_files import find_photos
 from pipeline.shards.manifest import read_manifest
 from pipeline.shards.pack import PackingSettings, pack
@@ -30,11 +30,15 @@ text = st.text(max_size=30) | st.sampled_from(NAMES)
 @given(text)
 @examples(100)
 def test_a_terminal_is_given_text(name: str) -> None:
-    assert not UNSEEN.search(visible(name))
+    assert not CONTROL_CHARACTERS.search(escape_controls(name))
     for each in (console, results):
         with each.capture() as captured:
             each.print(name, soft_wrap=True)
-        assert captured.get() == visible(name).expandtabs(8) + "\n" or "\t" in name or "\n" in name
+        assert (
+            captured.get() == escape_controls(name).expandtabs(8) + "\n"
+            or "\t" in name
+            or "\n" in name
+        )
 
 
 @given(text)
@@ -42,7 +46,9 @@ def test_a_terminal_is_given_text(name: str) -> None:
 def test_a_bar_shows_names_as_they_are(name: str) -> None:
     stream = io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(told, "console", told._Plain(file=stream, force_terminal=True, width=200))
+        patch.setattr(
+            told, "console", told._PlainConsole(file=stream, force_terminal=True, width=200)
+        )
         with progress(2, name) as meter:
             meter.advance(1, fact=name)
             meter.note(name)
@@ -62,7 +68,7 @@ def test_an_error_is_one_line(
     assert ended.value.code == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert visible(name) in said
+    assert escape_controls(name) in said
 
 
 def raw(name: str) -> bytes:
@@ -100,10 +106,10 @@ def test_files_of_any_name_are_packed_or_refused(
     source: Photos | University1652, world: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "shards"
-    with bounded(InputError, Unfinished):
+    with bounded(InputError, Incomplete):
         pack(source, PackingSettings(root=str(world), out=str(out), workers=0, max_bad_fraction=1))
         packed = sum(shard.samples for shard in read_manifest(str(out)).shards)
         assert packed >= len(FILES) - 6
-    assert (out / FILE).exists()
+    assert (out / REJECTED_FILE).exists()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["shards"]
     assert len(find_photos([str(world)])) == len(FILES)

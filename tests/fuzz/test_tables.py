@@ -328,7 +328,7 @@ def read_tiles(path: Path, seconds: float = 10) -> None:
 def test_a_view_without_end_is_given_up(
     folder: Path, view: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mbtiles, "PATIENCE_S", 0.5)
+    monkeypatch.setattr(mbtiles, "QUERY_TIMEOUT_S", 0.5)
     path = folder / "view.mbtiles"
     path.unlink(missing_ok=True)
     with closing(sqlite3.connect(path)) as database:

@@ -13,10 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, PngImagePlugin
 
-from pipeline.images.camera_tags import CameraTags, number, read_tags
+from pipeline.images.camera_tags import CameraTags, parse_number, read_tags
 from pipeline.images.exif import read_exif
-from pipeline.images.image_blocks import EXIF_HEADER, XMP_HEADER, Blocks, UnreadableTag, find_blocks
-from pipeline.images.xmp import DEEPEST, read_xmp
+from pipeline.images.image_blocks import (
+    EXIF_HEADER,
+    XMP_HEADER,
+    MetadataBlocks,
+    UnreadableTag,
+    find_metadata,
+)
+from pipeline.images.xmp import MAX_DEPTH, read_xmp
 
 PARIS = {1: "N", 2: (48.0, 51.0, 29.6), 3: "E", 4: (2.0, 17.0, 40.2)}
 "48 + 51 / 60 + 29.6 / 3600 = 48.8582222; 2 + 17 / 60 + 40.2 / 3600 = 2.2945"
@@ -62,7 +68,7 @@ def gps_block(lat: list[tuple[int, int]], lon: list[tuple[int, int]], refs: str 
 
 
 def of(gps: dict[int, Any] | None = None, xmp: bytes | None = None, **more: Any) -> CameraTags:
-    return read_tags(Blocks(exif=exif(gps, **more), xmp=xmp))
+    return read_tags(MetadataBlocks(exif=exif(gps, **more), xmp=xmp))
 
 
 def test_degrees_minutes_and_seconds_become_a_position() -> None:
@@ -72,7 +78,7 @@ def test_degrees_minutes_and_seconds_become_a_position() -> None:
 
 
 def test_a_photo_without_a_fix_has_no_position() -> None:
-    assert read_tags(Blocks()) == CameraTags()
+    assert read_tags(MetadataBlocks()) == CameraTags()
     assert of({0: b"\x02\x03\0\0"}).position is None
     assert of({2: (0.0, 0.0, 0.0), 4: (0.0, 0.0, 0.0)}).position is None
     assert (
@@ -103,13 +109,13 @@ def test_an_impossible_position_is_an_error_that_says_what_was_found(
 
 def test_rationals_over_nothing_are_no_numbers() -> None:
     whole = [(48, 1), (30, 1), (0, 1)]
-    assert read_tags(Blocks(exif=gps_block(whole, whole, "SW"))).position == (-48.5, -48.5)
+    assert read_tags(MetadataBlocks(exif=gps_block(whole, whole, "SW"))).position == (-48.5, -48.5)
     with pytest.raises(UnreadableTag, match="GPSLatitude 48/1 30/1 0/0"):
-        read_tags(Blocks(exif=gps_block([(48, 1), (30, 1), (0, 0)], whole)))
+        read_tags(MetadataBlocks(exif=gps_block([(48, 1), (30, 1), (0, 0)], whole)))
     with pytest.raises(UnreadableTag, match="GPSLongitude 1/0 0/1 0/1"):
-        read_tags(Blocks(exif=gps_block(whole, [(1, 0), (0, 1), (0, 1)])))
+        read_tags(MetadataBlocks(exif=gps_block(whole, [(1, 0), (0, 1), (0, 1)])))
     with pytest.raises(UnreadableTag, match="not three rationals"):
-        read_tags(Blocks(exif=gps_block(whole, whole[:2])))
+        read_tags(MetadataBlocks(exif=gps_block(whole, whole[:2])))
 
 
 @given(st.integers(-90 * 10**7, 90 * 10**7), st.integers(-180 * 10**7, 180 * 10**7))
@@ -124,7 +130,7 @@ def test_a_position_comes_back_from_its_rationals(lat: int, lon: int) -> None:
     block = gps_block(
         rationals(lat), rationals(lon), ("S" if lat < 0 else "N") + ("W" if lon < 0 else "E")
     )
-    found = read_tags(Blocks(exif=block)).position
+    found = read_tags(MetadataBlocks(exif=block)).position
     assert found == (pytest.approx((lat / 1e7, lon / 1e7), abs=1e-12) if lat or lon else None)
 
 
@@ -220,7 +226,7 @@ def test_a_doctype_is_refused_in_any_encoding_before_entities_can_grow() -> None
 @pytest.mark.parametrize(
     ("hostile", "found"),
     [
-        (b"<a>" * (DEEPEST + 1), "elements within each other"),
+        (b"<a>" * (MAX_DEPTH + 1), "elements within each other"),
         (b"<a>" + b" " * (1 << 20), "XMP of 1048579 bytes"),
         (b"<a b='1'", "no XML"),
         (b"<?xml version='1.0' encoding='martian'?><a/>", "XMP"),
@@ -234,18 +240,18 @@ def test_xmp_has_bounds(hostile: bytes, found: str) -> None:
 def test_a_truncated_or_circular_exif_block_is_an_error_and_never_a_loop() -> None:
     block = exif(PARIS)
     with pytest.raises(UnreadableTag, match="directory"):
-        read_tags(Blocks(exif=block[:30]))
+        read_tags(MetadataBlocks(exif=block[:30]))
     with pytest.raises(UnreadableTag, match="GPSLongitude of EXIF type 5"):
-        read_tags(Blocks(exif=block[:-8]))
+        read_tags(MetadataBlocks(exif=block[:-8]))
     with pytest.raises(UnreadableTag, match="not with a TIFF header"):
-        read_tags(Blocks(exif=b"lorem ipsum dolor"))
+        read_tags(MetadataBlocks(exif=b"lorem ipsum dolor"))
     circular = b"II*\0" + struct.pack("<IHHHIII", 8, 1, 0x8825, 4, 1, 8, 8)
-    assert read_tags(Blocks(exif=circular)) == CameraTags()
+    assert read_tags(MetadataBlocks(exif=circular)) == CameraTags()
     huge = b"II*\0" + struct.pack("<IHHHIII", 8, 1, 700, 1, 0xFFFFFFFF, 8, 0)
     assert read_exif(huge).main[700].raw is None
     with pytest.raises(UnreadableTag, match="65535 entries"):
-        read_tags(Blocks(exif=b"MM\0*\0\0\0\x08\xff\xff" + bytes(100)))
-    assert read_tags(Blocks(exif=b"\0\0")) == CameraTags(), "an empty block"
+        read_tags(MetadataBlocks(exif=b"MM\0*\0\0\0\x08\xff\xff" + bytes(100)))
+    assert read_tags(MetadataBlocks(exif=b"\0\0")) == CameraTags(), "an empty block"
 
 
 def test_blocks_are_found_in_every_kind_of_file_that_carries_them() -> None:
@@ -259,7 +265,7 @@ def test_blocks_are_found_in_every_kind_of_file_that_carries_them() -> None:
             image.save(stream, kind, **options)  # type: ignore[arg-type]
         else:
             image.save(stream, kind, exif=EXIF_HEADER + exif(PARIS), **options)  # type: ignore[arg-type]
-        tags = read_tags(find_blocks(stream.getvalue(), whole=True))
+        tags = read_tags(find_metadata(stream.getvalue(), whole=True))
         assert tags.height_m == 50.1, kind
         assert kind == "TIFF" or tags.position == pytest.approx((48.8582222, 2.2945)), kind
 
@@ -268,10 +274,10 @@ def test_a_beginning_that_ends_too_early_is_told_from_a_photo_without_tags() -> 
     stream = io.BytesIO()
     Image.new("RGB", (8, 8)).save(stream, "JPEG", exif=EXIF_HEADER + exif(PARIS))
     data = stream.getvalue()
-    assert find_blocks(data[:60], whole=False) == Blocks(cut=True)
-    assert not find_blocks(data[:-9], whole=False).cut, "the scan is of no interest"
-    assert find_blocks(b"MM\0*" + bytes(9), whole=False) == Blocks(cut=True)
-    assert find_blocks(b"no image", whole=True) == Blocks()
+    assert find_metadata(data[:60], whole=False) == MetadataBlocks(cut=True)
+    assert not find_metadata(data[:-9], whole=False).cut, "the scan is of no interest"
+    assert find_metadata(b"MM\0*" + bytes(9), whole=False) == MetadataBlocks(cut=True)
+    assert find_metadata(b"no image", whole=True) == MetadataBlocks()
 
 
 @pytest.mark.parametrize(
@@ -279,7 +285,7 @@ def test_a_beginning_that_ends_too_early_is_told_from_a_photo_without_tags() -> 
     [("+50.10", 50.1), (" -.5 ", -0.5), ("1e2", 100), ("", None), ("1_0", None), ("nan", None), ("٣", None), ("1e999", None)],
 )  # fmt: skip
 def test_numbers_are_plain(text: str, value: float | None) -> None:
-    assert number(text) == value
+    assert parse_number(text) == value
 
 
 def segment(content: bytes) -> bytes:
@@ -313,7 +319,7 @@ def test_a_damaged_photo_gives_tags_or_the_one_error(
 
 def judge(data: bytes, whole: bool) -> None:
     try:
-        tags = read_tags(find_blocks(data, whole))
+        tags = read_tags(find_metadata(data, whole))
     except UnreadableTag:
         return
     if tags.position is not None:

@@ -22,7 +22,7 @@ from PIL import Image, ImageOps
 
 from pipeline.core.records import View
 from pipeline.images.decode import DecodeError, Pixels, decode
-from pipeline.images.transforms import Augmentation, Resizer, augment, preprocessing, resize
+from pipeline.images.transforms import Augmentation, Resizer, augment, preprocessing_name, resize
 
 ROOT = Path(__file__).parents[2]
 RESIZERS: tuple[Resizer, ...] = ("torch", "pillow")
@@ -311,8 +311,8 @@ def test_decoding_and_inspecting_do_not_wait_for_torch() -> None:
 
 
 def test_the_preprocessing_says_who_resized_and_pillows_is_what_it_always_was() -> None:
-    assert preprocessing("pillow") == "resize bicubic pillow, ImageNet normalisation"
-    assert preprocessing() == preprocessing("torch") != preprocessing("pillow")
+    assert preprocessing_name("pillow") == "resize bicubic pillow, ImageNet normalisation"
+    assert preprocessing_name() == preprocessing_name("torch") != preprocessing_name("pillow")
 
 
 @pytest.mark.parametrize("by", RESIZERS)

@@ -25,9 +25,9 @@ from pipeline.index import build as index_build
 from pipeline.index import workspace
 from pipeline.index.build import IndexSettings, build_index, parse_bytes
 from pipeline.index.part import read_faiss
-from pipeline.index.plan import Gallery, Plan, plan_index
+from pipeline.index.plan import GallerySpec, IndexPlan, plan_index
 from pipeline.index.searcher import Index
-from pipeline.index.units import even_groups, merge, units_of
+from pipeline.index.units import even_groups, merge_units, plan_units
 from tests.index.index_tables import clustered, write_gallery, write_table_part
 
 MERGED = ["Flat", "SQ8", "IVF8,SQ8", "IVF8,PQ8x4fs", "IVF8,RaBitQ", "PCA16,IVF8,SQ8"]
@@ -61,7 +61,7 @@ def test_units_make_the_index_that_one_pass_makes(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factory: str
 ) -> None:
     whole = build(table, tmp_path / "whole", factory=factory)
-    monkeypatch.setattr("pipeline.index.plan.LEAST_UNIT_ROWS", 250)
+    monkeypatch.setattr("pipeline.index.plan.MIN_UNIT_ROWS", 250)
     monkeypatch.setattr("pipeline.index.plan.UNIT_SHARE", 0)
     units = build(table, tmp_path / "units", factory=factory)
     assert units.told.unit_rows == 250
@@ -73,7 +73,7 @@ def test_ray_builds_what_this_process_builds(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ray_cluster: None
 ) -> None:
     here = build(table, tmp_path / "here", factory="IVF8,SQ8")
-    monkeypatch.setattr("pipeline.index.plan.LEAST_UNIT_ROWS", 250)
+    monkeypatch.setattr("pipeline.index.plan.MIN_UNIT_ROWS", 250)
     monkeypatch.setattr("pipeline.index.plan.UNIT_SHARE", 0)
     there = build(table, tmp_path / "there", factory="IVF8,SQ8", workers=2)
     assert (tmp_path / "there" / "index.faiss").read_bytes() == (
@@ -146,10 +146,10 @@ def test_a_killed_build_goes_on_to_the_same_answers(
     done = sorted((out / "_building").glob("unit-*.faiss"))
     assert len(done) == left
     before = {unit: unit.stat().st_mtime_ns for unit in done}
-    monkeypatch.setattr("pipeline.index.plan.LEAST_UNIT_ROWS", 250)
+    monkeypatch.setattr("pipeline.index.plan.MIN_UNIT_ROWS", 250)
     monkeypatch.setattr("pipeline.index.plan.UNIT_SHARE", 0)
     monkeypatch.setattr(
-        workspace.Workshop, "clear", lambda self: None
+        workspace.BuildWorkspace, "clear", lambda self: None
     )  # to look at the units afterwards
     resumed = build(table, out, factory="IVF8,SQ8")
     assert {unit: unit.stat().st_mtime_ns for unit in done} == before
@@ -162,7 +162,7 @@ def test_unfinished_work_of_another_plan_is_not_gone_on_with(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "index"
-    monkeypatch.setattr(index_build, "finish", lambda *arguments: pytest.fail("stopped here"))
+    monkeypatch.setattr(index_build, "finish_index", lambda *arguments: pytest.fail("stopped here"))
     with pytest.raises(pytest.fail.Exception):
         build(table, out, factory="IVF8,SQ8")
     monkeypatch.undo()
@@ -178,8 +178,8 @@ def test_unfinished_work_of_another_plan_is_not_gone_on_with(
 def test_lists_on_the_disk_answer_as_lists_in_memory(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def on_disk(gallery: object, on_disk: bool = True) -> Plan:
-        return Plan(
+    def on_disk(gallery: object, on_disk: bool = True) -> IndexPlan:
+        return IndexPlan(
             factory="IVF8,RaBitQ",
             refine="table",
             on_disk=on_disk,
@@ -214,7 +214,7 @@ def test_the_planner_is_told_of_strong_directions(tmp_path: Path) -> None:
     write_table_part(tmp_path / "table", 0, vectors)
     told: list[int | None] = []
 
-    def noted(gallery: Gallery) -> Plan:
+    def noted(gallery: GallerySpec) -> IndexPlan:
         told.append(gallery.effective_dimension)
         return plan_index(replace(gallery, rows=10**6))
 
@@ -369,13 +369,13 @@ def test_budgets_are_read_as_people_write_them() -> None:
 
 
 def test_units_are_whole_parts_of_the_table_in_order() -> None:
-    units = units_of({"a": 3, "b": 4, "c": 9, "d": 1}, 8)
+    units = plan_units({"a": 3, "b": 4, "c": 9, "d": 1}, 8)
     assert [(unit.table_parts, unit.rows) for unit in units] == [
         (("a", "b"), 7),
         (("c",), 9),
         (("d",), 1),
     ]
-    assert units_of({}, 8) == []
+    assert plan_units({}, 8) == []
 
 
 @given(st.lists(st.integers(1, 50), max_size=40), st.integers(1, 200))
@@ -391,13 +391,13 @@ def test_groups_are_consecutive_and_about_as_large_as_wanted(sizes: list[int], w
 def test_merged_lists_take_no_more_than_they_hold(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.index.plan.LEAST_UNIT_ROWS", 250)
+    monkeypatch.setattr("pipeline.index.plan.MIN_UNIT_ROWS", 250)
     monkeypatch.setattr("pipeline.index.plan.UNIT_SHARE", 0)
-    monkeypatch.setattr(workspace.Workshop, "clear", lambda self: None)
+    monkeypatch.setattr(workspace.BuildWorkspace, "clear", lambda self: None)
     out = tmp_path / "index"
     build(table, out, factory="IVF8,SQ8")
     units = sorted(str(unit) for unit in (out / "_building").glob("unit-*.faiss"))
-    merged = merge(str(out / "trained.faiss"), units)
+    merged = merge_units(str(out / "trained.faiss"), units)
     assert merged.ntotal == 1000
     assert sum(merged.invlists.list_size(number) for number in range(8)) == 1000
     numbers = np.concatenate([_ids(merged, number) for number in range(8)])

@@ -15,7 +15,7 @@ from pipeline.evaluation.evaluate import EvaluationSettings, plan
 from pipeline.features.table import open_table
 from pipeline.index.build import IndexSettings, build_index
 from pipeline.index.searcher import Index
-from pipeline.index.units import is_whole, vouch
+from pipeline.index.units import checksum_ok, write_checksum
 from pipeline.index.update import extend_index, verify_index
 from tests.damaging import damages, found_or_equal, look_or_say_gone
 from tests.index.index_tables import write_gallery
@@ -78,7 +78,7 @@ def test_the_trained_index_is_looked_at_where_it_is_used(
 def test_an_index_too_large_to_hash_is_looked_at_when_asked(
     table: str, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.index.searcher.LOOKED_AT", 0)
+    monkeypatch.setattr("pipeline.index.searcher.HASHED_ON_OPEN_BYTES", 0)
     out = Path(shutil.copytree(built, tmp_path / "index"))
     ids = out / "ids.arrow"
     ids.write_bytes(ids.read_bytes().replace(b"gallery", b"gallary", 1))
@@ -99,7 +99,7 @@ class Killed(Exception):
 def test_damage_to_what_a_killed_build_left_costs_work_and_nothing_else(
     name: str, table: str, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.index.plan.LEAST_UNIT_ROWS", 100)
+    monkeypatch.setattr("pipeline.index.plan.MIN_UNIT_ROWS", 100)
     monkeypatch.setattr("pipeline.index.plan.UNIT_SHARE", 0)
     left, expected = tmp_path / "left", answers(built, table)
 
@@ -107,7 +107,7 @@ def test_damage_to_what_a_killed_build_left_costs_work_and_nothing_else(
         raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr("pipeline.index.workspace.Workshop._merge", killed)
+        patch.setattr("pipeline.index.workspace.BuildWorkspace._merge", killed)
         with pytest.raises(Killed):
             build_index(settings(table, left))
     good = (left / "_building" / name).read_bytes()
@@ -127,15 +127,15 @@ def test_damage_to_what_a_killed_build_left_costs_work_and_nothing_else(
 def test_a_file_is_whole_as_long_as_it_is_what_was_vouched_for(tmp_path: Path) -> None:
     path = tmp_path / "unit.faiss"
     path.write_bytes(np.random.default_rng(0).bytes(500))
-    assert not is_whole(str(path))
-    vouch(str(path))
-    look = look_or_say_gone(path, lambda: is_whole(str(path)))
+    assert not checksum_ok(str(path))
+    write_checksum(str(path))
+    look = look_or_say_gone(path, lambda: checksum_ok(str(path)))
     assert look()
     good = path.read_bytes()
     for data in damages(good, 40):
         if data is not None:
             path.write_bytes(data)
-            assert is_whole(str(path)) == (data == good)
+            assert checksum_ok(str(path)) == (data == good)
 
 
 def test_a_table_is_looked_at_before_an_index_is_built_of_it(table: str, tmp_path: Path) -> None:

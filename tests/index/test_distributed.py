@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from pipeline.core.errors import InputError
-from pipeline.core.geo import Near
+from pipeline.core.geo import Circle
 from pipeline.core.records import Split, View
 from pipeline.features.table import open_table
 from pipeline.index.build import IndexSettings, build_index
-from pipeline.index.distributed import SpreadIndex
-from pipeline.index.filters import Where
+from pipeline.index.distributed import DistributedIndex
+from pipeline.index.filters import Filter
 from pipeline.index.searcher import Index
 from pipeline.index.update import remove_locations
 from tests.index.index_tables import write_gallery
@@ -43,7 +43,7 @@ def test_actors_answer_together_what_one_process_answers(
     table, path = index
     queries_QD = open_table(table).select(Split.QUERY).embeddings()
     here = Index(path)
-    with SpreadIndex(path, actors=2) as spread:
+    with DistributedIndex(path, actors=2) as spread:
         assert len(here.told.parts) == 3
         assert (len(spread), spread.dimension, spread.facts["fingerprint"]) == (
             599,
@@ -52,8 +52,8 @@ def test_actors_answer_together_what_one_process_answers(
         )
         for where in (
             None,
-            Where(near=Near(lat=0.1, lon=1, radius_m=5_000)),
-            Where(locations=frozenset(["00003"])),
+            Filter(near=Circle(lat=0.1, lon=1, radius_m=5_000)),
+            Filter(locations=frozenset(["00003"])),
         ):
             assert spread.search(queries_QD, 12, where) == here.search(queries_QD, 12, where)
         with pytest.raises(InputError, match=r"expected \(queries, 32\)"):
@@ -69,6 +69,6 @@ def test_a_damaged_part_is_refused_before_any_question(
     file.write_bytes(whole[:-1])
     try:
         with pytest.raises(InputError, match=r"index-000001\.faiss has"):
-            SpreadIndex(path, actors=3)
+            DistributedIndex(path, actors=3)
     finally:
         file.write_bytes(whole)

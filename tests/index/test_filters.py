@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core.errors import InputError
-from pipeline.core.geo import Box, Near, haversine_m
+from pipeline.core.geo import Box, Circle, haversine_m
 from pipeline.core.records import View
-from pipeline.index.filters import Where
+from pipeline.index.filters import Filter
 
 LATS = [0.0, 10.0, -10.0, 89.9999, None]
 LONS = [179.999, 20.0, -179.0, 0.0, None]
@@ -29,28 +29,30 @@ def rows_of(
     return pa.RecordBatch.from_arrays(columns, ["lat", "lon", "view", "location"])
 
 
-def meant(where: Where) -> list[int]:
+def meant(where: Filter) -> list[int]:
     rows = rows_of(LATS, LONS, ["satellite"] * 4 + ["drone"], ["a", "b", "c", "a", "b"])
     return np.flatnonzero(where.mask(rows)).tolist()
 
 
 def test_without_conditions_every_row_may_answer() -> None:
-    assert meant(Where()) == [0, 1, 2, 3, 4]
+    assert meant(Filter()) == [0, 1, 2, 3, 4]
 
 
 def test_each_condition_alone_and_all_together() -> None:
-    assert meant(Where(view=View.DRONE)) == [4]
-    assert meant(Where(view=View.STREET)) == []
-    assert meant(Where(locations=frozenset(["a", "unheard-of"]))) == [0, 3]
-    assert meant(Where(locations=frozenset())) == []
-    assert meant(Where(box=Box(south=-90, north=90, west=170, east=-170))) == [0, 2], (
+    assert meant(Filter(view=View.DRONE)) == [4]
+    assert meant(Filter(view=View.STREET)) == []
+    assert meant(Filter(locations=frozenset(["a", "unheard-of"]))) == [0, 3]
+    assert meant(Filter(locations=frozenset())) == []
+    assert meant(Filter(box=Box(south=-90, north=90, west=170, east=-170))) == [0, 2], (
         "over the meridian of 180 degrees"
     )
-    assert meant(Where(near=Near(lat=0, lon=-179.999, radius_m=300))) == [0], (
+    assert meant(Filter(near=Circle(lat=0, lon=-179.999, radius_m=300))) == [0], (
         "222 m over that meridian"
     )
-    assert meant(Where(near=Near(lat=89.9999, lon=180, radius_m=30))) == [3], "22 m over the pole"
-    together = Where(
+    assert meant(Filter(near=Circle(lat=89.9999, lon=180, radius_m=30))) == [3], (
+        "22 m over the pole"
+    )
+    together = Filter(
         view=View.SATELLITE,
         locations=frozenset("a"),
         box=Box(south=-1, north=1, west=-180, east=180),
@@ -59,8 +61,8 @@ def test_each_condition_alone_and_all_together() -> None:
 
 
 def test_a_row_without_a_position_is_in_no_box_and_no_circle() -> None:
-    assert 4 not in meant(Where(box=Box(south=-90, north=90, west=-180, east=180)))
-    assert 4 not in meant(Where(near=Near(lat=0, lon=0, radius_m=3e7)))
+    assert 4 not in meant(Filter(box=Box(south=-90, north=90, west=-180, east=180)))
+    assert 4 not in meant(Filter(near=Circle(lat=0, lon=0, radius_m=3e7)))
 
 
 @given(
@@ -77,7 +79,7 @@ def test_a_circle_holds_what_is_within_its_radius(
         ["drone"] * len(places),
         ["a"] * len(places),
     )
-    found_N = Where(near=Near(lat=lat, lon=lon, radius_m=radius)).mask(rows)
+    found_N = Filter(near=Circle(lat=lat, lon=lon, radius_m=radius)).mask(rows)
     assert np.array_equal(found_N, haversine_m(places_N2, np.array([lat, lon])) <= radius)
 
 
@@ -87,4 +89,4 @@ def test_a_circle_holds_what_is_within_its_radius(
 )
 def test_what_is_no_circle_is_refused(lat: float, lon: float, radius: float) -> None:
     with pytest.raises(InputError, match="expected a latitude from -90 to 90"):
-        Near(lat=lat, lon=lon, radius_m=radius)
+        Circle(lat=lat, lon=lon, radius_m=radius)

@@ -10,10 +10,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core.errors import InputError
-from pipeline.index.plan import EXACT_ROWS, FAMILIES, Gallery, Plan, plan_factory, plan_index
+from pipeline.index.plan import (
+    EXACT_ROWS,
+    FAMILIES,
+    GallerySpec,
+    IndexPlan,
+    plan_factory,
+    plan_index,
+)
 
 galleries = st.builds(
-    Gallery,
+    GallerySpec,
     rows=st.integers(1, 10**9),
     dimension=st.sampled_from([16, 100, 512, 768, 2048]),
     budget=st.floats(1e8, 1e12),
@@ -24,7 +31,7 @@ galleries = st.builds(
 )
 
 
-def planned(gallery: Gallery) -> Plan | None:
+def planned(gallery: GallerySpec) -> IndexPlan | None:
     try:
         return plan_index(gallery)
     except InputError:
@@ -32,7 +39,7 @@ def planned(gallery: Gallery) -> Plan | None:
 
 
 @given(galleries)
-def test_a_plan_is_never_over_the_budget(gallery: Gallery) -> None:
+def test_a_plan_is_never_over_the_budget(gallery: GallerySpec) -> None:
     plan = planned(gallery)
     if plan is not None:
         assert plan.search_bytes <= gallery.budget
@@ -42,7 +49,7 @@ def test_a_plan_is_never_over_the_budget(gallery: Gallery) -> None:
 
 
 @given(galleries, st.floats(1, 100))
-def test_more_memory_never_means_less_recall(gallery: Gallery, more: float) -> None:
+def test_more_memory_never_means_less_recall(gallery: GallerySpec, more: float) -> None:
     plan = planned(gallery)
     if plan is not None:
         richer = plan_index(replace(gallery, budget=gallery.budget * more))
@@ -51,14 +58,14 @@ def test_more_memory_never_means_less_recall(gallery: Gallery, more: float) -> N
 
 
 @given(galleries)
-def test_what_fits_into_no_budget_is_refused_with_what_it_would_take(gallery: Gallery) -> None:
+def test_what_fits_into_no_budget_is_refused_with_what_it_would_take(gallery: GallerySpec) -> None:
     starved = replace(gallery, budget=1e6)
     with pytest.raises(InputError, match=r"GB at least, by .*raise --memory-budget"):
         plan_index(starved)
 
 
 @given(galleries)
-def test_every_plan_is_one_that_faiss_builds(gallery: Gallery) -> None:
+def test_every_plan_is_one_that_faiss_builds(gallery: GallerySpec) -> None:
     plan = planned(replace(gallery, rows=min(gallery.rows, 10**7)))
     if plan is not None:
         index = faiss.index_factory(gallery.dimension, plan.factory, faiss.METRIC_INNER_PRODUCT)
@@ -68,18 +75,18 @@ def test_every_plan_is_one_that_faiss_builds(gallery: Gallery) -> None:
 
 
 @given(galleries)
-def test_vectors_that_cannot_be_read_singly_are_not_reckoned_with(gallery: Gallery) -> None:
+def test_vectors_that_cannot_be_read_singly_are_not_reckoned_with(gallery: GallerySpec) -> None:
     plan = planned(replace(gallery, rows_readable=False))
     assert plan is None or plan.refine == "none"
 
 
 def test_few_rows_are_searched_exactly_and_the_sentence_says_so() -> None:
-    plan = plan_index(Gallery(rows=EXACT_ROWS, dimension=2048, budget=4e9, target_recall=0.95))
+    plan = plan_index(GallerySpec(rows=EXACT_ROWS, dimension=2048, budget=4e9, target_recall=0.95))
     assert (plan.factory, plan.training_rows, plan.expected_recall) == ("Flat", 0, 1.0)
     assert plan.why == "exact search: 100,000 rows are few enough to look at each"
     assert (
         plan_index(
-            Gallery(rows=EXACT_ROWS + 1, dimension=2048, budget=4e9, target_recall=0.95)
+            GallerySpec(rows=EXACT_ROWS + 1, dimension=2048, budget=4e9, target_recall=0.95)
         ).factory
         != "Flat"
     )
@@ -90,7 +97,7 @@ def test_memory_is_what_it_comes_to() -> None:
     centroids.
     """
     plan = plan_index(
-        Gallery(rows=10**6, dimension=2048, budget=8e9, target_recall=0.95, rows_readable=False)
+        GallerySpec(rows=10**6, dimension=2048, budget=8e9, target_recall=0.95, rows_readable=False)
     )
     assert plan.factory == "IVF2048,SQ8"
     assert plan.search_bytes == pytest.approx(2.056e9 + 2048 * 2048 * 4 + 300e6, rel=0.01)
@@ -98,7 +105,7 @@ def test_memory_is_what_it_comes_to() -> None:
 
 
 def test_a_tight_budget_leaves_the_lists_on_the_disk_or_takes_smaller_codes() -> None:
-    gallery = Gallery(rows=10**7, dimension=2048, budget=4e9, target_recall=0.95)
+    gallery = GallerySpec(rows=10**7, dimension=2048, budget=4e9, target_recall=0.95)
     assert (plan_index(gallery).factory, plan_index(gallery).refine) == (
         "IVF2048,PQ256x4fs",
         "table",
@@ -112,21 +119,21 @@ def test_a_tight_budget_leaves_the_lists_on_the_disk_or_takes_smaller_codes() ->
 
 
 def test_few_strong_directions_are_made_use_of() -> None:
-    gallery = Gallery(rows=10**6, dimension=2048, budget=4e9, target_recall=0.95)
+    gallery = GallerySpec(rows=10**6, dimension=2048, budget=4e9, target_recall=0.95)
     assert plan_index(replace(gallery, effective_dimension=256)).factory.startswith("PCA256,IVF")
     assert not plan_index(replace(gallery, effective_dimension=1500)).factory.startswith("PCA")
 
 
 def test_recall_beyond_every_family_is_approached_as_far_as_it_goes() -> None:
     best = max(family.ceiling for family in FAMILIES)
-    gallery = Gallery(rows=10**6, dimension=2048, budget=64e9, target_recall=1.0)
+    gallery = GallerySpec(rows=10**6, dimension=2048, budget=64e9, target_recall=1.0)
     assert plan_index(gallery).expected_recall == best
     assert plan_index(replace(gallery, target_recall=0.99)).factory == "IVF2048,SQfp16"
 
 
 def test_a_factory_of_the_users_is_taken_as_it_is() -> None:
     plan = plan_factory(
-        Gallery(rows=10**6, dimension=2048, budget=64e9, target_recall=1.0),
+        GallerySpec(rows=10**6, dimension=2048, budget=64e9, target_recall=1.0),
         "IVF16384,PQ64",
         "table",
     )

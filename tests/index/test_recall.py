@@ -8,10 +8,17 @@ import pytest
 from pipeline.core.records import Split
 from pipeline.features.table import open_table
 from pipeline.index.build import IndexSettings, build_index
-from pipeline.index.metadata import Effort
-from pipeline.index.recall import Held, efforts, exact_search, recall, tuned, without
+from pipeline.index.metadata import SearchParams
+from pipeline.index.recall import (
+    RecallQueries,
+    exact_search,
+    measure_recall,
+    search_param_grid,
+    tune,
+    without_own_row,
+)
 from pipeline.index.searcher import Index
-from pipeline.index.train import effective_dimension, new_index, sample
+from pipeline.index.train import effective_dimension, new_index, sample_rows
 from pipeline.index.workspace import rows_by_part
 from tests.index.index_tables import clustered, write_gallery
 
@@ -34,7 +41,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Index]:
 
 def test_a_query_is_not_credited_with_itself() -> None:
     found = np.array([[5, 7, 9], [1, 2, 3], [4, 0, 6]])
-    assert without(found, np.array([7, -1, 4])).tolist() == [[5, 9], [1, 2], [0, 6]]
+    assert without_own_row(found, np.array([7, -1, 4])).tolist() == [[5, 9], [1, 2], [0, 6]]
 
 
 def test_exact_search_is_brute_force_whatever_the_blocks(
@@ -54,22 +61,24 @@ def test_recall_by_hand(built: tuple[str, Index]) -> None:
     """
     table, index = built
     queries = open_table(table).select(Split.QUERY).embeddings()[:2]
-    most = Effort(breadth=16, candidates=60)
+    most = SearchParams(breadth=16, candidates=60)
     nearest = index.search_rows(queries, 10, effort=most)[1]
     wrong = nearest.copy()
     wrong[0, :4] = [10_000, 10_001, 10_002, 10_003]
-    held = Held(queries_QD=queries, exact_QK=wrong, own_Q=np.array([-1, -1]), source="")
-    assert recall(index, held, most) == (0.5, 0.8)
+    held = RecallQueries(
+        queries_QD=queries, exact_QK=wrong, own_row_Q=np.array([-1, -1]), source=""
+    )
+    assert measure_recall(index, held, most) == (0.5, 0.8)
 
 
 def test_efforts_grow_from_the_least_to_the_most() -> None:
-    lists = list(efforts(new_index("IVF12,SQ8", 32), "none"))
+    lists = list(search_param_grid(new_index("IVF12,SQ8", 32), "none"))
     assert [effort.breadth for effort in lists] == [1, 2, 4, 8, 12]
-    graph = list(efforts(new_index("HNSW8,SQ8", 32), "none"))
+    graph = list(search_param_grid(new_index("HNSW8,SQ8", 32), "none"))
     assert graph[0].breadth == 16
     assert all(later.breadth > earlier.breadth for earlier, later in pairwise(graph))
-    assert len(list(efforts(new_index("Flat", 32), "none"))) == 1
-    refined = list(efforts(new_index("PCA16,IVF4,SQ8", 32), "table"))
+    assert len(list(search_param_grid(new_index("Flat", 32), "none"))) == 1
+    refined = list(search_param_grid(new_index("PCA16,IVF4,SQ8", 32), "table"))
     assert [(e.breadth, e.candidates) for e in refined] == [
         (1, 10),
         (2, 10),
@@ -87,28 +96,32 @@ def test_the_least_effort_that_reaches_the_target_is_taken(built: tuple[str, Ind
         open_table(table).select(Split.GALLERY),
     )
     exact = exact_search(queries, gallery, 10)
-    held = Held(queries_QD=queries, exact_QK=exact, own_Q=np.full(len(queries), -1), source="")
-    ladder = list(efforts(new_index("IVF16,PQ4x4fs", 32), "table"))
-    effort, _, at_10 = tuned(index, held, iter(ladder), 0.9)
+    held = RecallQueries(
+        queries_QD=queries, exact_QK=exact, own_row_Q=np.full(len(queries), -1), source=""
+    )
+    ladder = list(search_param_grid(new_index("IVF16,PQ4x4fs", 32), "table"))
+    effort, _, at_10 = tune(index, held, iter(ladder), 0.9)
     assert at_10 >= 0.9
     less = [step for step in ladder if step.breadth < effort.breadth]
-    assert all(recall(index, held, step)[1] < 0.9 for step in less)
+    assert all(measure_recall(index, held, step)[1] < 0.9 for step in less)
     assert (
         effort.candidates == 1
-        or recall(index, held, Effort(breadth=effort.breadth, candidates=effort.candidates // 2))[1]
+        or measure_recall(
+            index, held, SearchParams(breadth=effort.breadth, candidates=effort.candidates // 2)
+        )[1]
         < 0.9
     )
-    best, _, most = tuned(index, held, iter(ladder), 1.01)
-    assert most == max(recall(index, held, step)[1] for step in ladder)
+    best, _, most = tune(index, held, iter(ladder), 1.01)
+    assert most == max(measure_recall(index, held, step)[1] for step in ladder)
     assert best in ladder
 
 
 def test_a_sample_has_of_each_part_its_share(built: tuple[str, Index]) -> None:
     table = open_table(built[0]).select(Split.GALLERY)
-    numbers, vectors = sample(table, rows_by_part(table), 30)
+    numbers, vectors = sample_rows(table, rows_by_part(table), 30)
     assert numbers.tolist() == [*range(10), *range(200, 210), *range(400, 410)]
     assert np.array_equal(vectors, table.embeddings()[numbers])
-    assert len(sample(table, rows_by_part(table), 10**6)[0]) == 600
+    assert len(sample_rows(table, rows_by_part(table), 10**6)[0]) == 600
 
 
 def test_directions_are_counted_by_the_length_they_hold() -> None:

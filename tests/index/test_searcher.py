@@ -11,14 +11,14 @@ import pytest
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.core.geo import Box, Near
+from pipeline.core.geo import Box, Circle
 from pipeline.core.records import Split, View
 from pipeline.features.table import Floats, open_table
 from pipeline.index.build import IndexSettings, build_index
-from pipeline.index.filters import Where
-from pipeline.index.metadata import Effort
-from pipeline.index.part import EXACT_ROWS, NOBODY
-from pipeline.index.searcher import Index, merged
+from pipeline.index.filters import Filter
+from pipeline.index.metadata import SearchParams
+from pipeline.index.part import FILTERED_EXACT_ROWS, NO_ROW
+from pipeline.index.searcher import Index, merge_results
 from tests.index.index_tables import write_gallery
 
 FACTORIES = [
@@ -32,15 +32,15 @@ FACTORIES = [
     "IVF8,PQ8x4,Refine(SQ8)",
 ]
 FILTERS = {
-    "view": Where(view=View.SATELLITE),
-    "another view": Where(view=View.STREET),
-    "locations": Where(locations=frozenset(["00003", "20007", "unheard-of"])),
-    "box": Where(box=Box(south=0.05, north=0.12, west=0, east=1.5)),
-    "circle": Where(near=Near(lat=0.1, lon=2, radius_m=4_000)),
-    "all of them": Where(
+    "view": Filter(view=View.SATELLITE),
+    "another view": Filter(view=View.STREET),
+    "locations": Filter(locations=frozenset(["00003", "20007", "unheard-of"])),
+    "box": Filter(box=Box(south=0.05, north=0.12, west=0, east=1.5)),
+    "circle": Filter(near=Circle(lat=0.1, lon=2, radius_m=4_000)),
+    "all of them": Filter(
         view=View.SATELLITE,
         box=Box(south=0, north=1, west=-1, east=5),
-        near=Near(lat=0.1, lon=1, radius_m=9_000),
+        near=Circle(lat=0.1, lon=1, radius_m=9_000),
     ),
 }
 
@@ -57,13 +57,13 @@ def build(table: str, out: Path, **changes: object) -> str:
     return str(out)
 
 
-def brute_force(table: str, where: Where | None, k: int) -> tuple[Floats, list[list[str]], Floats]:
+def brute_force(table: str, where: Filter | None, k: int) -> tuple[Floats, list[list[str]], Floats]:
     """The queries, and the keys and scores that a loop over all rows finds for each."""
     opened = open_table(table)
     gallery, queries_QD = opened.select(Split.GALLERY), opened.select(Split.QUERY).embeddings()
     scores_QN = queries_QD @ gallery.embeddings().T
     masks = [
-        (where or Where()).mask(rows.combine_chunks().to_batches()[0])
+        (where or Filter()).mask(rows.combine_chunks().to_batches()[0])
         for _, rows in gallery.numbered(["view", "location", "lat", "lon"])
     ]
     scores_QN[:, ~np.concatenate(masks)] = -np.inf
@@ -120,8 +120,8 @@ def test_a_filter_finds_enough_where_too_many_are_left_to_look_at_each(
     three times as many.
     """
     out = build(table, tmp_path / "index", factory=factory, refine=True, target_recall=0.9)
-    monkeypatch.setattr("pipeline.index.part.EXACT_ROWS", 0)
-    where = Where(box=Box(south=0, north=1, west=0.5, east=1.5))
+    monkeypatch.setattr("pipeline.index.part.FILTERED_EXACT_ROWS", 0)
+    where = Filter(box=Box(south=0, north=1, west=0.5, east=1.5))
     queries_QD, keys, _ = brute_force(table, where, 10)
     found = [[hit.key for hit in hits] for hits in Index(out).search(queries_QD, 10, where)]
     assert all(key.startswith("gallery-1-") for hits in found for key in hits)
@@ -134,7 +134,7 @@ def test_a_table_that_is_elsewhere_is_answered_by_codes(
 ) -> None:
     """Single vectors cannot be read from an object store: a narrow filter then looks at every code."""
     out = build(table, tmp_path / "index", factory=factory)
-    monkeypatch.setattr("pipeline.index.searcher.readable", lambda path: False)
+    monkeypatch.setattr("pipeline.index.searcher.supports_row_reads", lambda path: False)
     where = FILTERS["locations"]
     queries_QD, keys, scores = brute_force(table, where, 2)
     found = Index(out).search(queries_QD, 2, where)
@@ -147,8 +147,8 @@ def test_candidates_scored_again_have_exact_scores_and_better_order(
 ) -> None:
     out = build(table, tmp_path / "index", factory="IVF4,PQ4x4fs", refine=True, target_recall=0.01)
     queries_QD, keys, scores = brute_force(table, None, 10)
-    rough = Index(out).search(queries_QD, 10, effort=Effort(breadth=4))
-    refined = Index(out).search(queries_QD, 10, effort=Effort(breadth=4, candidates=30))
+    rough = Index(out).search(queries_QD, 10, effort=SearchParams(breadth=4))
+    refined = Index(out).search(queries_QD, 10, effort=SearchParams(breadth=4, candidates=30))
     right = [
         np.mean(
             [
@@ -193,21 +193,21 @@ def test_plain_faiss_opens_the_index_and_ids_are_row_numbers(table: str, tmp_pat
 
 
 def test_what_parts_find_is_merged_by_score_then_row() -> None:
-    one = np.array([[0.9, 0.5, -np.inf]], np.float32), np.array([[4, 2, NOBODY]])
+    one = np.array([[0.9, 0.5, -np.inf]], np.float32), np.array([[4, 2, NO_ROW]])
     other = np.array([[0.9, 0.7, 0.5]], np.float32), np.array([[3, 9, 1]])
-    scores, rows = merged([one, other], 5)
+    scores, rows = merge_results([one, other], 5)
     assert rows.tolist() == [[3, 4, 9, 1, 2]]
     assert scores.tolist() == [[np.float32(s) for s in (0.9, 0.9, 0.7, 0.5, 0.5)]]
-    assert merged([one], 3)[1].tolist() == [[4, 2, NOBODY]]
+    assert merge_results([one], 3)[1].tolist() == [[4, 2, NO_ROW]]
 
 
 def test_more_rows_than_there_are_cannot_be_found(table: str, tmp_path: Path) -> None:
     index = Index(build(table, tmp_path / "index"))
     queries_QD = open_table(table).select(Split.QUERY).embeddings()
     assert [len(hits) for hits in index.search(queries_QD[:3], 1000)] == [600, 600, 600]
-    assert index.search(queries_QD[:2], 3, Where(locations=frozenset(["nowhere"]))) == [[], []]
+    assert index.search(queries_QD[:2], 3, Filter(locations=frozenset(["nowhere"]))) == [[], []]
     assert index.search(queries_QD[:0], 3) == []
-    assert EXACT_ROWS > 600, "the filters above are to be searched exactly"
+    assert FILTERED_EXACT_ROWS > 600, "the filters above are to be searched exactly"
 
 
 @pytest.mark.parametrize("shape", [(32,), (1, 31), (2, 3, 32)])

@@ -13,7 +13,7 @@ from pipeline.core.records import Split, View
 from pipeline.features.table import open_table
 from pipeline.index import workspace
 from pipeline.index.build import IndexSettings, build_index
-from pipeline.index.filters import Where
+from pipeline.index.filters import Filter
 from pipeline.index.searcher import Index
 from pipeline.index.update import extend_index, remove_locations, verify_index
 from tests.index.index_tables import clustered, write_gallery, write_table_part
@@ -113,7 +113,7 @@ def test_removed_locations_answer_no_more(table: Path, tmp_path: Path, factory: 
     assert not {hit.location for hit in left} & {*gone}
     assert len(left) == 40 * 8
     assert len(Index(out)) == 395
-    assert Index(out).search(clustered(2, 32, 1), 3, Where(locations=frozenset(gone))) == [[], []]
+    assert Index(out).search(clustered(2, 32, 1), 3, Filter(locations=frozenset(gone))) == [[], []]
 
 
 def test_a_removed_location_that_comes_back_in_a_new_part_is_found(
@@ -125,9 +125,9 @@ def test_a_removed_location_that_comes_back_in_a_new_part_is_found(
     extend_index(str(table), out)
     assert [
         hit.key
-        for hit in Index(out).search(clustered(1, 32, 1), 3, Where(locations=frozenset(["10003"])))[
-            0
-        ]
+        for hit in Index(out).search(
+            clustered(1, 32, 1), 3, Filter(locations=frozenset(["10003"]))
+        )[0]
     ] == ["gallery-7-0"]
 
 
@@ -158,12 +158,12 @@ def test_a_table_that_has_changed_is_refused(table: Path, tmp_path: Path) -> Non
     with pytest.raises(InputError, match="no longer holds 1 of the 2 parts"):
         extend_index(str(table), out)
     with pytest.raises(InputError, match="no longer of the shard that the index was built from"):
-        Index(out).search(clustered(1, 32, 1), 3, Where(locations=frozenset(["10003"])))
+        Index(out).search(clustered(1, 32, 1), 3, Filter(locations=frozenset(["10003"])))
     shutil.rmtree(table)
     with pytest.raises(
         InputError, match="which is not there; expected the feature table where it was"
     ):
-        Index(out).search(clustered(1, 32, 1), 3, Where(locations=frozenset(["10003"])))
+        Index(out).search(clustered(1, 32, 1), 3, Filter(locations=frozenset(["10003"])))
     assert len(Index(out).search(clustered(1, 32, 1), 3)[0]) == 3, (
         "lists of codes answer without the table"
     )

@@ -25,7 +25,7 @@ from model.checkpoint import Checkpoint, CheckpointError, loads
 from model.pvda import FeatureEncoder
 from model.training import Training
 from pipeline.core import storage
-from pipeline.core.errors import InputError, Unfinished
+from pipeline.core.errors import Incomplete, InputError
 from tests.launcher import Job, Launcher
 from tests.processes import below, named, strike
 
@@ -245,7 +245,7 @@ def test_checkpoints_are_kept_on_any_storage() -> None:
     checkpoints = Checkpoints(run, None)
     for epoch in (1, 2, 3):
         checkpoints.write(made(epoch, step=epoch))
-    assert storage.names(run.out) == ["checkpoint-0002-00002.pt", "last.pt"]
+    assert storage.list_names(run.out) == ["checkpoint-0002-00002.pt", "last.pt"]
     storage.write_bytes(storage.join(run.out, "last.pt"), b"torn")
     said: list[str] = []
     found = find_checkpoint(run, said.append)
@@ -253,7 +253,7 @@ def test_checkpoints_are_kept_on_any_storage() -> None:
     assert (found[0], found[1].epoch, found[1].step) == ("checkpoint-0002-00002.pt", 2, 2)
     assert len(said) == 1
     Checkpoints(run, found).write(made(4))  # a damaged file is not kept
-    assert storage.names(run.out) == ["checkpoint-0002-00002.pt", "last.pt"]
+    assert storage.list_names(run.out) == ["checkpoint-0002-00002.pt", "last.pt"]
     storage.remove(storage.join(run.out, "last.pt"))
     assert find_checkpoint(run, said.append) is not None
     assert "last.pt is missing" in said[-1]
@@ -276,7 +276,7 @@ def test_a_run_that_diverges_stops_with_one_sentence_and_keeps_the_last_good_che
     steps = count()
     monkeypatch.setattr(Training, "step", poisoned)
     with pytest.raises(
-        Unfinished,
+        Incomplete,
         match=r"diverged in epoch 3, by step 1 of 3: location_loss\S* is nan, expected a finite",
     ):
         train(settings(tiny_shards, tmp_path))

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from jobs.encoding import encoder as encoders
-from jobs.encoding.encoder import PROBES, EncoderSettings, network_of, some_images
+from jobs.encoding.encoder import PROBE_IMAGES, EncoderSettings, first_images, make_encoder_spec
 from jobs.training.checkpoints import Run
 from jobs.training.loop import untrained
 from jobs.training.recipes import smoke
@@ -39,7 +39,7 @@ def images_of(
     embedding: EmbeddingSettings, size: int, resizer: Resizer, count: int
 ) -> encoders.Bytes:
     manifest = open_manifest(embedding.shards, embedding.split, embedding.view)
-    return some_images(embedding.shards, manifest, size, resizer, count)
+    return first_images(embedding.shards, manifest, size, resizer, count)
 
 
 def test_the_images_to_check_by_are_the_same_each_time_and_of_every_split_and_view(
@@ -58,13 +58,13 @@ def test_a_shard_without_one_image_that_can_be_decoded_is_said_beforehand(
 ) -> None:
     monkeypatch.setattr(encoders, "decoded", lambda samples, *given: iter([]))
     with pytest.raises(InputError, match="none of the first images of"):
-        images_of(asked(tiny_shards), 32, "torch", PROBES)
+        images_of(asked(tiny_shards), 32, "torch", PROBE_IMAGES)
 
 
 def test_the_fast_encoder_of_a_worker_computes_what_the_plain_one_does(
     tiny_shards: str, checkpoint: bytes
 ) -> None:
-    made = network_of(checkpoint, "it", asked(tiny_shards)).factory(1)
+    made = make_encoder_spec(checkpoint, "it", asked(tiny_shards)).factory(1)
     images = images_of(asked(tiny_shards), 64, "torch", 5)
     plain = embed(build_encoder(loads(checkpoint)), torch.from_numpy(images)).numpy()
     assert np.abs(made(images) - plain).max() < 1e-4
@@ -75,7 +75,7 @@ def test_how_it_was_made_is_in_the_fingerprint_unless_it_makes_no_difference(
     tiny_shards: str, checkpoint: bytes
 ) -> None:
     def fingerprint(**changes: Any) -> str:
-        return network_of(
+        return make_encoder_spec(
             checkpoint, "it", asked(tiny_shards), EncoderSettings(**changes)
         ).fingerprint
 
@@ -101,7 +101,7 @@ def test_int8_where_it_cannot_be_had_is_refused_before_any_worker_starts(
 
     monkeypatch.setattr(encoders, "require_int8", without)
     with pytest.raises(InputError, match="choose --precision float32"):
-        network_of(checkpoint, "it", asked(tiny_shards), EncoderSettings(precision="int8"))
+        make_encoder_spec(checkpoint, "it", asked(tiny_shards), EncoderSettings(precision="int8"))
 
 
 def test_what_an_encoder_says_of_itself_reaches_the_terminal(
@@ -112,6 +112,6 @@ def test_what_an_encoder_says_of_itself_reaches_the_terminal(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     embedding = asked(tiny_shards, out=str(tmp_path), split=Split.QUERY)
-    embed_gallery(embedding, network_of(checkpoint, "it", embedding))
+    embed_gallery(embedding, make_encoder_spec(checkpoint, "it", embedding))
     assert "folded encoder in float32" in capsys.readouterr().err
     assert open_table(str(tmp_path)).rows > 0

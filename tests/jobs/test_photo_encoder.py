@@ -15,7 +15,7 @@ from model.pvda import FeatureEncoder, PVDAConfig
 from pipeline.batches.ordered import stack
 from pipeline.core.errors import InputError
 from pipeline.images.decode import decode
-from pipeline.images.transforms import Resizer, preprocessing, resize
+from pipeline.images.transforms import Resizer, preprocessing_name, resize
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def checkpoint(lively_encoder: FeatureEncoder) -> bytes:
 def facts(
     checkpoint: bytes, resizer: Resizer = "torch", mirror: bool = True, precision: Any = "float32"
 ) -> dict[str, Any]:
-    said = with_precision(f"{preprocessing(resizer)}, mirror {mirror}", precision)
+    said = with_precision(f"{preprocessing_name(resizer)}, mirror {mirror}", precision)
     return {"fingerprint": fingerprint(loads(checkpoint), said)}
 
 

@@ -23,7 +23,7 @@ from jobs.training.checkpoints import Run, read_checkpoint
 from jobs.training.loop import Place, train_worker, untrained
 from jobs.training.recipes import Recipe, paper, smoke
 from model.checkpoint import CheckpointError, build_encoder, dumps, loads
-from pipeline.core.errors import InputError, Unfinished
+from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.progress import progress
 from pipeline.images.decode import DecodeError, Pixels, decode
 from pipeline.shards.samples import read_shard
@@ -193,7 +193,7 @@ def test_what_a_ray_worker_refuses_comes_back_as_it_was_said_and_is_not_tried_ag
     tiny_shards: str, tmp_path: Path, ray_cluster: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
     rates = replace(tiny(1).optimisation, backbone_rate=1e30, head_rate=1e30, classifier_rate=1e30)
-    with pytest.raises(Unfinished, match="training diverged in epoch 1"):
+    with pytest.raises(Incomplete, match="training diverged in epoch 1"):
         train(
             settings(
                 tiny_shards,

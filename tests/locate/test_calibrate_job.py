@@ -18,9 +18,9 @@ from model.checkpoint import Checkpoint, dumps, fingerprint, loads
 from model.pvda import FeatureEncoder, PVDAConfig
 from pipeline.core.errors import InputError
 from pipeline.features.table import PartFooter, PartRows, write_part
-from pipeline.images.transforms import preprocessing, resize
+from pipeline.images.transforms import preprocessing_name, resize
 from pipeline.index.build import IndexSettings, build_index
-from pipeline.locate.confidence import find_confidence
+from pipeline.locate.confidence import find_calibration
 from pipeline.shards.pack import PackingSettings, pack
 from pipeline.sources.university1652 import University1652
 
@@ -54,7 +54,7 @@ def world(tmp_path: Path, ray_cluster: None, lively_encoder: FeatureEncoder) -> 
     plain = Checkpoint(network=network, recipe={}, locations=[], epoch=0, history=[], state=state)
     data = dumps(replace(plain, locations=[f"{place:04d}" for place in range(TRAINED)]))
     (tmp_path / "last.pt").write_bytes(data)
-    mark = fingerprint(loads(data), f"{preprocessing()}, mirror True")
+    mark = fingerprint(loads(data), f"{preprocessing_name()}, mirror True")
     rows_ND, _ = PhotoEncoder(data, "last.pt", {"fingerprint": mark}).encode(
         [image(5000 + n) for n in range(GALLERY)]
     )
@@ -84,9 +84,9 @@ def test_photos_of_places_not_trained_on_calibrate_an_index(
     made = calibrate_index(Settings(**world))
     assert (made.photos, made.locations) == (2 * HELD, HELD)
     assert made.right == pytest.approx(0.5, abs=0.1)  # a photo of something else may hit by chance
-    assert (made.gallery, made.spacing_m, made.within_m) == (GALLERY, None, 0)
+    assert (made.gallery, made.spacing_m, made.agreement_radius_m) == (GALLERY, None, 0)
     facts = json.loads((tmp_path / "index" / "index.json").read_text())
-    assert find_confidence(world["index"], facts) == made
+    assert find_calibration(world["index"], facts) == made
     assert (tmp_path / "index" / "calibration.svg").read_text().startswith("<svg")
     capsys.readouterr()
     assert calibrate_index(Settings(**world)) == made

@@ -10,26 +10,26 @@ import pytest
 from pipeline.core.errors import InputError
 from pipeline.core.records import View
 from pipeline.features.table import Floats
-from pipeline.index.filters import Where
+from pipeline.index.filters import Filter
 from pipeline.index.searcher import Hit
 from pipeline.locate.calibration import (
-    Example,
-    Gallery,
-    Judging,
-    best_radius,
-    best_threshold,
-    calibrate,
-    is_right,
-    out_of_fold,
+    CalibrationContext,
+    CalibrationCriteria,
+    CalibrationExample,
+    choose_agreement_radius,
+    cross_validated_probabilities,
+    fit_calibration,
+    is_correct,
+    youden_threshold,
 )
-from pipeline.locate.calibration_data import Labelled, examples
-from pipeline.locate.confidence import Confidence
-from pipeline.locate.locate import answers, judged, scores_of
+from pipeline.locate.calibration_data import LabelledImages, make_examples
+from pipeline.locate.confidence import Calibration
+from pipeline.locate.locate import answers_from_hits, consensus_of, consensus_scores
 from pipeline.locate.logistic import sigmoid
-from pipeline.locate.track import TRACKED
+from pipeline.locate.track import TRACK_CANDIDATES
 
 METRE = 1 / 111_195.08  # degrees of latitude
-GALLERY = Gallery(fingerprint="f" * 64, rows=40, spacing_m=300.0)
+GALLERY = CalibrationContext(fingerprint="f" * 64, rows=40, spacing_m=300.0)
 
 
 def hit(location: str, score: float, north_m: float | None = 0.0) -> Hit:
@@ -44,7 +44,7 @@ def hit(location: str, score: float, north_m: float | None = 0.0) -> Hit:
     )
 
 
-def made(count: int, rng: np.random.Generator) -> list[Example]:
+def made(count: int, rng: np.random.Generator) -> list[CalibrationExample]:
     """Photos whose own place scores about 0.6, and 39 others about 0.35: right answers are those
     with high scores.
     """
@@ -57,7 +57,7 @@ def made(count: int, rng: np.random.Generator) -> list[Example]:
         own = hit(f"p{number % 30}", float(rng.normal(0.6, 0.12)))
         inside = sorted([own, *others], key=lambda h: -h.score)
         found.append(
-            Example(
+            CalibrationExample(
                 location=own.location, lat=0.0, lon=8.0, inside=tuple(inside), outside=tuple(others)
             )
         )
@@ -65,15 +65,15 @@ def made(count: int, rng: np.random.Generator) -> list[Example]:
 
 
 @pytest.fixture(scope="module")
-def fitted() -> Confidence:
-    return calibrate(made(900, np.random.default_rng(0)), Judging(), GALLERY)
+def fitted() -> Calibration:
+    return fit_calibration(made(900, np.random.default_rng(0)), CalibrationCriteria(), GALLERY)
 
 
-def test_probabilities_of_photos_never_seen_mean_what_they_say(fitted: Confidence) -> None:
+def test_probabilities_of_photos_never_seen_mean_what_they_say(fitted: Calibration) -> None:
     fresh = made(900, np.random.default_rng(1))
     for low, high in ((0, 0.2), (0.2, 0.8), (0.8, 1)):
-        inside = answers([one.inside for one in fresh], 5, fitted)
-        outside = answers([one.outside for one in fresh], 5, fitted)
+        inside = answers_from_hits([one.inside for one in fresh], 5, fitted)
+        outside = answers_from_hits([one.outside for one in fresh], 5, fitted)
         told = [
             (a.probability or 0, a.location == one.location)
             for a, one in zip(inside, fresh, strict=True)
@@ -86,13 +86,17 @@ def test_probabilities_of_photos_never_seen_mean_what_they_say(fitted: Confidenc
 
 
 def test_photos_from_elsewhere_are_unknown_at_the_threshold_and_what_it_costs_is_told(
-    fitted: Confidence,
+    fitted: Calibration,
 ) -> None:
     fresh = made(900, np.random.default_rng(2))
-    outside = np.mean([not one.known for one in answers([one.outside for one in fresh], 5, fitted)])
+    outside = np.mean(
+        [not one.known for one in answers_from_hits([one.outside for one in fresh], 5, fitted)]
+    )
     right = [
         a.known
-        for a, one in zip(answers([e.inside for e in fresh], 5, fitted), fresh, strict=True)
+        for a, one in zip(
+            answers_from_hits([e.inside for e in fresh], 5, fitted), fresh, strict=True
+        )
         if a.location == one.location
     ]
     assert outside == pytest.approx(fitted.outside_unknown, abs=0.05)
@@ -100,10 +104,10 @@ def test_photos_from_elsewhere_are_unknown_at_the_threshold_and_what_it_costs_is
     assert outside > 0.8
 
 
-def test_fewer_photos_from_elsewhere_make_the_same_score_surer(fitted: Confidence) -> None:
+def test_fewer_photos_from_elsewhere_make_the_same_score_surer(fitted: Calibration) -> None:
     data = made(900, np.random.default_rng(0))
-    rare = calibrate(data, Judging(outside=0.1), GALLERY)
-    agreed, scores_K = judged(data[0].inside, 0), scores_of(data[0].inside)
+    rare = fit_calibration(data, CalibrationCriteria(outside=0.1), GALLERY)
+    agreed, scores_K = consensus_of(data[0].inside, 0), consensus_scores(data[0].inside)
     assert rare.probability(agreed, scores_K) > fitted.probability(agreed, scores_K)
 
 
@@ -112,16 +116,20 @@ def test_the_threshold_keeps_most_right_and_fewest_wrong() -> None:
     wrong ones.
     """
     said, yes = np.array([0.9, 0.6, 0.5, 0.4, 0.3]), np.array([1.0, 1, 0, 0, 1])
-    assert best_threshold(said, yes, np.ones(5)) == 0.6
+    assert youden_threshold(said, yes, np.ones(5)) == 0.6
 
 
 def test_an_answer_is_right_by_its_location_or_by_its_distance() -> None:
-    example = Example(location="own", lat=0.0, lon=8.0, inside=(hit("other", 0.9, 20),), outside=())
-    agreed = judged(example.inside, 0)
-    assert is_right(agreed, example, 25)
-    assert not is_right(agreed, example, 15)
-    named = Example(location="own", lat=None, lon=None, inside=(hit("own", 0.9, None),), outside=())
-    assert is_right(judged(named.inside, 0), named, 25)
+    example = CalibrationExample(
+        location="own", lat=0.0, lon=8.0, inside=(hit("other", 0.9, 20),), outside=()
+    )
+    agreed = consensus_of(example.inside, 0)
+    assert is_correct(agreed, example, 25)
+    assert not is_correct(agreed, example, 15)
+    named = CalibrationExample(
+        location="own", lat=None, lon=None, inside=(hit("own", 0.9, None),), outside=()
+    )
+    assert is_correct(consensus_of(named.inside, 0), named, 25)
 
 
 def test_neighbours_agree_only_where_that_surely_places_photos_better() -> None:
@@ -143,20 +151,22 @@ def test_neighbours_agree_only_where_that_surely_places_photos_better() -> None:
     ]
     alone = Hit(key="k", location="far", view=View.SATELLITE, lat=1.0, lon=1.0, score=0.1)
     overlapping = [
-        Example(location=f"photo{n}", lat=0.0, lon=0.0, inside=(*tiles, alone), outside=())
+        CalibrationExample(
+            location=f"photo{n}", lat=0.0, lon=0.0, inside=(*tiles, alone), outside=()
+        )
         for n in range(5)
     ]
-    apart = Example(
+    apart = CalibrationExample(
         location="a",
         lat=0.0,
         lon=8.0,
         inside=(hit("a", 0.9), hit("b", 0.8, 60), hit("c", 0.7, 50)),
         outside=(),
     )
-    assert best_radius(overlapping, 25, 40.0) == 1.5 * 40
-    assert best_radius(overlapping[:1], 25, 40.0) == 0.5 * 40
-    assert best_radius([apart] * 9, 25, 40.0) == 0.5 * 40
-    assert best_radius([apart], 25, None) == 0
+    assert choose_agreement_radius(overlapping, 25, 40.0) == 1.5 * 40
+    assert choose_agreement_radius(overlapping[:1], 25, 40.0) == 0.5 * 40
+    assert choose_agreement_radius([apart] * 9, 25, 40.0) == 0.5 * 40
+    assert choose_agreement_radius([apart], 25, None) == 0
 
 
 def test_no_photo_is_judged_by_a_model_that_has_seen_its_location() -> None:
@@ -168,7 +178,7 @@ def test_no_photo_is_judged_by_a_model_that_has_seen_its_location() -> None:
     locations = np.array([f"place{n % 20}" for n in range(200)])
     odd = locations == "place7"
     yes = np.where(odd, x_NF[:, 0] < 0, x_NF[:, 0] > 0).astype(float)
-    said = out_of_fold(x_NF, yes, np.ones(200), locations)
+    said = cross_validated_probabilities(x_NF, yes, np.ones(200), locations)
     assert ((said > 0.5) == (x_NF[:, 0] > 0))[odd].all()
     assert sigmoid(np.array([0.0]))[0] == 0.5
 
@@ -176,9 +186,9 @@ def test_no_photo_is_judged_by_a_model_that_has_seen_its_location() -> None:
 def test_too_few_places_and_answers_that_are_all_right_are_refused() -> None:
     few = [one for one in made(60, np.random.default_rng(0)) if one.location in {"p1", "p2"}]
     with pytest.raises(InputError, match=r"4 photos of 2 locations.*--hold-out"):
-        calibrate(few, Judging(), GALLERY)
+        fit_calibration(few, CalibrationCriteria(), GALLERY)
     sure = [
-        Example(
+        CalibrationExample(
             location=f"p{n}",
             lat=0.0,
             lon=8.0,
@@ -188,7 +198,7 @@ def test_too_few_places_and_answers_that_are_all_right_are_refused() -> None:
         for n in range(20)
     ]
     with pytest.raises(InputError, match="20 of 20 photos are answered rightly"):
-        calibrate(sure, Judging(), GALLERY)
+        fit_calibration(sure, CalibrationCriteria(), GALLERY)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +207,7 @@ def test_too_few_places_and_answers_that_are_all_right_are_refused() -> None:
 )
 def test_judging_that_makes_no_sense_is_refused(given: dict[str, float], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        Judging(**given)
+        CalibrationCriteria(**given)
 
 
 class Rows:
@@ -218,39 +228,39 @@ class Rows:
         return len(self.hits)
 
     def search(
-        self, queries_QD: Floats, k: int = 10, where: Where | None = None
+        self, queries_QD: Floats, k: int = 10, where: Filter | None = None
     ) -> list[list[Hit]]:
         return [self.hits[:k] for _ in queries_QD]
 
 
-def labelled(location: str, vector: list[float], north_m: float = 0.0) -> Labelled:
+def labelled(location: str, vector: list[float], north_m: float = 0.0) -> LabelledImages:
     facts = {
         "key": f"train-{location}",
         "location": location,
         "view": "drone",
         "geotag": {"lat": north_m * METRE, "lon": 8.0},
     }
-    return Labelled(facts=[facts], embeddings_QD=np.array([vector], np.float32))
+    return LabelledImages(facts=[facts], embeddings_QD=np.array([vector], np.float32))
 
 
 def test_a_place_of_many_rows_is_left_out_whole_and_others_take_their_ranks() -> None:
-    (example,) = examples(
+    (example,) = make_examples(
         labelled("own", [1, 0]), labelled("x", [0, 1]), Rows(100, 60), 300.0, 25.0
     )
     assert {one.location for one in example.inside} == {"own"}
-    assert [one.location for one in example.outside] == [f"o{n}" for n in range(TRACKED)]
+    assert [one.location for one in example.outside] == [f"o{n}" for n in range(TRACK_CANDIDATES)]
 
 
 def test_a_place_that_the_index_lacks_is_ranked_by_its_own_images() -> None:
     """Its image scores 0.9975, between the third and the fourth row."""
     photos, own = labelled("new", [1, 0], -9000), labelled("new", [0.9975, 0], -9000)
-    (example,) = examples(photos, own, Rows(0, 60), 300.0, 25.0)
+    (example,) = make_examples(photos, own, Rows(0, 60), 300.0, 25.0)
     assert [one.location for one in example.inside][:4] == ["o0", "o1", "o2", "new"]
     assert "new" not in {one.location for one in example.outside}
 
 
 def test_images_near_a_photo_s_place_are_left_out_under_whatever_name() -> None:
-    (example,) = examples(
+    (example,) = make_examples(
         labelled("photo", [1, 0], 5000), labelled("x", [0, 1]), Rows(0, 60), 300.0, 25.0
     )
     assert "o1" in {one.location for one in example.inside}

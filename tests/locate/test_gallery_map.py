@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.core.geo import EARTH_M
+from pipeline.core.geo import EARTH_RADIUS_M
 from pipeline.core.records import Split
 from pipeline.index.build import IndexSettings, build_index
 from pipeline.index.searcher import Index
 from pipeline.index.update import remove_locations
-from pipeline.locate.gallery_map import GalleryMap, gallery_map
+from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
 from tests.index.index_tables import write_gallery
 
-DEGREE_M = EARTH_M * np.pi / 180
+DEGREE_M = EARTH_RADIUS_M * np.pi / 180
 
 
 def on_a_grid(side: int, rows: int | None = None) -> GalleryMap:
@@ -51,7 +51,7 @@ def test_the_nearest_are_found_across_the_meridian_of_180_degrees() -> None:
 def test_the_rows_of_an_index_are_on_its_map(tmp_path: Path) -> None:
     table = write_gallery(tmp_path / "table", parts=2, rows=10)
     build_index(IndexSettings(table=str(table), out=str(tmp_path / "index"), view=None, split=None))
-    gallery = gallery_map(Index(str(tmp_path / "index")))
+    gallery = read_gallery_map(Index(str(tmp_path / "index")))
     assert gallery.rows == len(gallery.keys) == 60
     assert np.isnan(gallery.places_N2[:, 1]).sum() == 12  # every fifth row has no longitude
     assert gallery.spacing_m is not None
@@ -62,6 +62,6 @@ def test_removed_locations_are_on_the_map_no_more(tmp_path: Path) -> None:
     out = str(tmp_path / "index")
     build_index(IndexSettings(table=str(table), out=out, split=Split.GALLERY))
     remove_locations(out, ["10003"])
-    gallery = gallery_map(Index(out))
+    gallery = read_gallery_map(Index(out))
     assert gallery.rows == len(gallery.keys) == 19
     assert "gallery-1-3" not in gallery.keys

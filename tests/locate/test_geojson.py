@@ -6,7 +6,7 @@ import json
 
 from pipeline.core.records import Rejection, View
 from pipeline.index.searcher import Hit
-from pipeline.locate.geojson import COLUMNS, Located, geojson, table
+from pipeline.locate.geojson import CSV_COLUMNS, LocatedPhoto, to_csv, to_geojson
 from pipeline.locate.locate import Answer, Position
 
 HIT = Hit(
@@ -25,18 +25,18 @@ def answer(known: bool = True, lat: float = 46.0) -> Answer:
     )
 
 
-FOUND = Located(name="a.jpg", photos=("a.jpg",), answer=answer(), taken_at="10")
-UNKNOWN = Located(name="b.jpg", photos=("b.jpg",), answer=answer(known=False), taken_at="20")
-DAMAGED = Located(
+FOUND = LocatedPhoto(name="a.jpg", photos=("a.jpg",), answer=answer(), taken_at="10")
+UNKNOWN = LocatedPhoto(name="b.jpg", photos=("b.jpg",), answer=answer(known=False), taken_at="20")
+DAMAGED = LocatedPhoto(
     name="c.jpg",
     photos=("c.jpg",),
     rejected=(Rejection(path="c.jpg", reason="empty file", found="0 bytes"),),
 )
-LATER = Located(name="d.jpg", photos=("d.jpg",), answer=answer(lat=47.0), taken_at="30")
+LATER = LocatedPhoto(name="d.jpg", photos=("d.jpg",), answer=answer(lat=47.0), taken_at="30")
 
 
 def test_a_known_place_is_a_point_with_its_longitude_first() -> None:
-    said = json.loads(geojson([FOUND], {"index": "i"}, track=False))
+    said = json.loads(to_geojson([FOUND], {"index": "i"}, track=False))
     assert said["type"] == "FeatureCollection"
     assert said["pvda"] == {"index": "i"}
     (feature,) = said["features"]
@@ -55,13 +55,13 @@ def test_a_known_place_is_a_point_with_its_longitude_first() -> None:
 
 
 def test_an_unknown_place_is_no_point_on_a_map_but_its_best_guess_is_told() -> None:
-    (feature,) = json.loads(geojson([UNKNOWN], {}, track=False))["features"]
+    (feature,) = json.loads(to_geojson([UNKNOWN], {}, track=False))["features"]
     assert feature["geometry"] is None
     assert (feature["properties"]["known"], feature["properties"]["lat"]) == (False, 46.0)
 
 
 def test_a_damaged_photo_is_listed_with_its_reason() -> None:
-    (feature,) = json.loads(geojson([DAMAGED], {}, track=False))["features"]
+    (feature,) = json.loads(to_geojson([DAMAGED], {}, track=False))["features"]
     assert feature["geometry"] is None
     assert feature["properties"]["rejected"] == [
         {"path": "c.jpg", "reason": "empty file", "found": "0 bytes"}
@@ -69,18 +69,20 @@ def test_a_damaged_photo_is_listed_with_its_reason() -> None:
 
 
 def test_a_flight_is_a_line_through_the_known_places_with_their_times() -> None:
-    line = json.loads(geojson([FOUND, UNKNOWN, LATER], {}, track=True))["features"][0]
+    line = json.loads(to_geojson([FOUND, UNKNOWN, LATER], {}, track=True))["features"][0]
     assert line["geometry"] == {"type": "LineString", "coordinates": [[8.0, 46.0], [8.0, 47.0]]}
     assert line["properties"]["times"] == ["10", "30"]
 
 
 def test_one_known_place_makes_no_line() -> None:
-    assert json.loads(geojson([FOUND, UNKNOWN], {}, track=True))["features"][0]["geometry"] is None
+    assert (
+        json.loads(to_geojson([FOUND, UNKNOWN], {}, track=True))["features"][0]["geometry"] is None
+    )
 
 
 def test_the_table_has_a_row_per_answer_and_nothing_where_nothing_is_known() -> None:
-    rows = list(csv.DictReader(io.StringIO(table([FOUND, DAMAGED]).decode())))
-    assert tuple(rows[0]) == COLUMNS
+    rows = list(csv.DictReader(io.StringIO(to_csv([FOUND, DAMAGED]).decode())))
+    assert tuple(rows[0]) == CSV_COLUMNS
     assert (rows[0]["known"], rows[0]["lat"], rows[0]["candidate"]) == (
         "true",
         "46.0",
@@ -91,6 +93,8 @@ def test_the_table_has_a_row_per_answer_and_nothing_where_nothing_is_known() -> 
 
 def test_names_that_are_no_unicode_are_written_as_they_are() -> None:
     name = b"caf\xe9.jpg".decode("utf-8", "surrogateescape")
-    odd = Located(name=name, photos=(name,), answer=answer())
-    assert b"caf\xe9.jpg" in table([odd])
-    assert json.loads(geojson([odd], {}, track=False))["features"][0]["properties"]["photo"] == name
+    odd = LocatedPhoto(name=name, photos=(name,), answer=answer())
+    assert b"caf\xe9.jpg" in to_csv([odd])
+    assert (
+        json.loads(to_geojson([odd], {}, track=False))["features"][0]["properties"]["photo"] == name
+    )

@@ -9,19 +9,27 @@ import pytest
 from pipeline.core.errors import InputError
 from pipeline.core.records import View
 from pipeline.features.table import Floats
-from pipeline.index.filters import Where
+from pipeline.index.filters import Filter
 from pipeline.index.searcher import Hit
 from pipeline.locate.confidence import (
-    Confidence,
-    features,
-    find_confidence,
-    read_confidence,
-    write_confidence,
+    Calibration,
+    confidence_features,
+    find_calibration,
+    read_calibration,
+    write_calibration,
 )
-from pipeline.locate.flight import settle
-from pipeline.locate.locate import CONSIDERED, NOTHING, answers, judged, levelled, locate, scores_of
-from pipeline.locate.logistic import Logistic
-from pipeline.locate.reliability import Bin
+from pipeline.locate.flight import apply_track
+from pipeline.locate.locate import (
+    CONSENSUS_CANDIDATES,
+    NO_ANSWER,
+    answers_from_hits,
+    consensus_of,
+    consensus_scores,
+    locate_embeddings,
+    relative_scores,
+)
+from pipeline.locate.logistic import LogisticModel
+from pipeline.locate.reliability import ReliabilityBin
 from pipeline.locate.track import Motion
 
 METRE = 1 / 111_195.08  # degrees of latitude
@@ -39,22 +47,22 @@ def hit(location: str, score: float, north_m: float | None = 0.0) -> Hit:
     )
 
 
-def confidence(**changes: Any) -> Confidence:
+def confidence(**changes: Any) -> Calibration:
     """Sure by the margin alone: 0.5 where it is 0.1."""
-    model = Logistic(
+    model = LogisticModel(
         mean_F=(0, 0.1, 0, 0), scale_F=(1, 0.05, 1, 1), coefficient_F=(0, 2.0, 0, 0), intercept=0.0
     )
-    plain = Confidence(
+    plain = Calibration(
         fingerprint="f" * 64,
         gallery=3,
         asked="",
         spacing_m=300.0,
-        within_m=150.0,
+        agreement_radius_m=150.0,
         tolerance_m=25.0,
         outside=0.5,
         model=model,
         threshold=0.4,
-        sharpness=20.0,
+        inverse_temperature=20.0,
         elsewhere=1.0,
         photos=100,
         locations=20,
@@ -62,7 +70,7 @@ def confidence(**changes: Any) -> Confidence:
         right_kept=0.8,
         outside_unknown=0.9,
         calibration_error=0.02,
-        bins=(Bin(said=0.1, seen=0.2, share=1.0),),
+        bins=(ReliabilityBin(said=0.1, seen=0.2, share=1.0),),
     )
     return replace(plain, **changes)
 
@@ -79,7 +87,7 @@ class Gallery:
         return len(self.hits)
 
     def search(
-        self, queries_QD: Floats, k: int = 10, where: Where | None = None
+        self, queries_QD: Floats, k: int = 10, where: Filter | None = None
     ) -> list[list[Hit]]:
         self.asked.append(k)
         return [self.hits[:k] for _ in queries_QD]
@@ -91,7 +99,7 @@ HITS = [hit("a", 0.9), hit("b", 0.7, 1000), hit("c", 0.5, 2000)]
 def test_an_answer_is_the_place_of_the_best_candidate_and_its_radius_reaches_half_way_to_the_next() -> (
     None
 ):
-    (found,) = answers([HITS], 2, spacing_m=300)
+    (found,) = answers_from_hits([HITS], 2, spacing_m=300)
     assert found.position is not None
     assert (found.location, found.position.lat, found.position.radius_m) == ("a", 46, 150)
     assert [one.location for one in found.candidates] == ["a", "b"]
@@ -101,24 +109,26 @@ def test_an_answer_is_the_place_of_the_best_candidate_and_its_radius_reaches_hal
 def test_a_sure_answer_is_known_and_a_doubtful_one_is_not() -> None:
     """Margins 0.2 and 0.05: sigmoid(2 * 2) and sigmoid(2 * -1)."""
     doubtful = [hit("a", 0.75), hit("b", 0.7, 1000), hit("c", 0.5, 2000)]
-    sure, other = answers([HITS, doubtful], 5, confidence())
+    sure, other = answers_from_hits([HITS, doubtful], 5, confidence())
     assert sure.probability == pytest.approx(1 / (1 + np.exp(-4)))
     assert other.probability == pytest.approx(1 / (1 + np.exp(2)))
     assert (sure.known, other.known) == (True, False)
 
 
 def test_the_features_are_score_margin_depth_and_share() -> None:
-    assert features(judged(HITS, 0), scores_of(HITS)) == pytest.approx([0.9, 0.2, 0.2, 1 / 3])
+    assert confidence_features(consensus_of(HITS, 0), consensus_scores(HITS)) == pytest.approx(
+        [0.9, 0.2, 0.2, 1 / 3]
+    )
 
 
 def test_nothing_found_is_unknown_and_the_others_keep_their_order() -> None:
-    found = answers([[], HITS, []], 5, confidence())
-    assert found[0] == found[2] == NOTHING
+    found = answers_from_hits([[], HITS, []], 5, confidence())
+    assert found[0] == found[2] == NO_ANSWER
     assert found[1].location == "a"
 
 
 def test_candidates_without_positions_name_a_place_without_a_position() -> None:
-    (found,) = answers([[hit("a", 0.9, None), hit("b", 0.2, None)]], 5)
+    (found,) = answers_from_hits([[hit("a", 0.9, None), hit("b", 0.2, None)]], 5)
     assert (found.location, found.position, found.known) == ("a", None, True)
 
 
@@ -127,23 +137,24 @@ def test_as_many_candidates_decide_however_few_are_shown() -> None:
         [hit(f"{number:02d}", 0.9 - number / 100, 500 * number) for number in range(20)]
     )
     few, many = (
-        locate(gallery, np.ones((1, 4), np.float32), k, None, confidence())[0] for k in (1, 15)
+        locate_embeddings(gallery, np.ones((1, 4), np.float32), k, None, confidence())[0]
+        for k in (1, 15)
     )
-    assert gallery.asked[1:] == [CONSIDERED, 15]
+    assert gallery.asked[1:] == [CONSENSUS_CANDIDATES, 15]
     assert (len(few.candidates), len(many.candidates)) == (1, 15)
     assert few.probability == many.probability
 
 
 def test_levels_are_told_from_the_last_candidate_considered() -> None:
     hits = [hit("a", 1 - number / 100) for number in range(12)]
-    assert levelled(hits)[[0, CONSIDERED - 1]] == pytest.approx([0.09, 0])
-    assert levelled([]).shape == (0,)
+    assert relative_scores(hits)[[0, CONSENSUS_CANDIDATES - 1]] == pytest.approx([0.09, 0])
+    assert relative_scores([]).shape == (0,)
 
 
 def test_a_calibration_comes_back_as_it_was_written(tmp_path: Any) -> None:
-    write_confidence(str(tmp_path / "calibration.json"), confidence())
-    assert find_confidence(str(tmp_path), {"fingerprint": "f" * 64}) == confidence()
-    assert find_confidence(str(tmp_path / "elsewhere"), {"fingerprint": "f" * 64}) is None
+    write_calibration(str(tmp_path / "calibration.json"), confidence())
+    assert find_calibration(str(tmp_path), {"fingerprint": "f" * 64}) == confidence()
+    assert find_calibration(str(tmp_path / "elsewhere"), {"fingerprint": "f" * 64}) is None
 
 
 @pytest.mark.parametrize(
@@ -157,13 +168,13 @@ def test_a_calibration_comes_back_as_it_was_written(tmp_path: Any) -> None:
 def test_what_is_no_calibration_is_refused(tmp_path: Any, text: str, sentence: str) -> None:
     (tmp_path / "calibration.json").write_text(text)
     with pytest.raises(InputError, match=sentence):
-        read_confidence(str(tmp_path / "calibration.json"), {"fingerprint": "f" * 64})
+        read_calibration(str(tmp_path / "calibration.json"), {"fingerprint": "f" * 64})
 
 
 def test_another_network_s_calibration_is_refused(tmp_path: Any) -> None:
-    write_confidence(str(tmp_path / "calibration.json"), confidence())
+    write_calibration(str(tmp_path / "calibration.json"), confidence())
     with pytest.raises(InputError, match="network ffffffffffff and the index with 000"):
-        read_confidence(str(tmp_path / "calibration.json"), {"fingerprint": "0" * 64})
+        read_calibration(str(tmp_path / "calibration.json"), {"fingerprint": "0" * 64})
 
 
 def test_a_flight_settles_a_doubtful_photo_whatever_the_order_of_its_answers() -> None:
@@ -174,8 +185,8 @@ def test_a_flight_settles_a_doubtful_photo_whatever_the_order_of_its_answers() -
     first, last = (
         [hit(name, 0.9, north), hit("z", 0.3, 50_000)] for name, north in (("a", 0), ("d", 400))
     )
-    single = answers([last, middle, first], 5, confidence(spacing_m=None))
-    found = settle(single, [20, 10, 0], confidence(spacing_m=None), Motion(max_speed=25))
+    single = answers_from_hits([last, middle, first], 5, confidence(spacing_m=None))
+    found = apply_track(single, [20, 10, 0], confidence(spacing_m=None), Motion(max_speed=25))
     assert [one.location for one in single] == ["d", "b", "a"]
     assert [one.location for one in found] == ["d", "c", "a"]
     assert found[1].position is not None
@@ -185,9 +196,9 @@ def test_a_flight_settles_a_doubtful_photo_whatever_the_order_of_its_answers() -
 
 def test_the_fewer_photos_of_a_flight_are_expected_elsewhere_the_surer_the_others() -> None:
     doubtful = [hit("a", 0.5), hit("z", 0.45, 50_000)]
-    single = answers([doubtful], 5, confidence())
+    single = answers_from_hits([doubtful], 5, confidence())
     rare, common = (
-        settle(single, [0], confidence(), Motion(elsewhere=share))[0] for share in (0.01, 0.9)
+        apply_track(single, [0], confidence(), Motion(elsewhere=share))[0] for share in (0.01, 0.9)
     )
     assert (rare.known, common.known) == (True, False)
 
@@ -198,8 +209,8 @@ def test_a_photo_that_the_track_passes_over_is_unknown() -> None:
         [hit(name, 0.9, north), hit("z", 0.2, 50_000)]
         for name, north in (("a", 0), ("c", 50), ("d", 100))
     ]
-    single = answers([near[0], far, *near[1:]], 5, confidence())
-    found = settle(
+    single = answers_from_hits([near[0], far, *near[1:]], 5, confidence())
+    found = apply_track(
         single, [0, 10, 20, 30], replace(confidence(), elsewhere=0.0), Motion(max_speed=25)
     )
     assert [one.known for one in found] == [True, False, True, True]

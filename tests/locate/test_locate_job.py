@@ -17,13 +17,13 @@ from jobs.locate import Settings, locate_photos, main
 from model.checkpoint import Checkpoint, dumps, fingerprint, loads
 from model.pvda import FeatureEncoder, PVDAConfig
 from pipeline.core import storage
-from pipeline.core.errors import InputError, Unfinished
-from pipeline.core.geo import Near
+from pipeline.core.errors import Incomplete, InputError
+from pipeline.core.geo import Circle
 from pipeline.features.table import PartFooter, PartRows, write_part
-from pipeline.images.transforms import preprocessing, resize
+from pipeline.images.transforms import preprocessing_name, resize
 from pipeline.index.build import IndexSettings, build_index
-from pipeline.locate.confidence import Confidence, write_confidence
-from pipeline.locate.logistic import Logistic
+from pipeline.locate.confidence import Calibration, write_calibration
+from pipeline.locate.logistic import LogisticModel
 
 PLACES = 12
 STEP = 1e-3  # degrees between places, about 111 m
@@ -48,7 +48,7 @@ def world(tmp_path: Path, lively_encoder: FeatureEncoder) -> dict[str, str]:
         Checkpoint(network=network, recipe={}, locations=[], epoch=0, history=[], state=state)
     )
     (tmp_path / "last.pt").write_bytes(data)
-    mark = fingerprint(loads(data), f"{preprocessing()}, mirror True")
+    mark = fingerprint(loads(data), f"{preprocessing_name()}, mirror True")
     rows_ND, _ = PhotoEncoder(data, "last.pt", {"fingerprint": mark}).encode(
         [photo(place) for place in range(PLACES)]
     )
@@ -84,18 +84,18 @@ def settings(world: dict[str, str], **changes: Any) -> Settings:
 
 
 def calibrated(world: dict[str, str]) -> None:
-    sure = Logistic(mean_F=(0,) * 4, scale_F=(1,) * 4, coefficient_F=(0,) * 4, intercept=2.0)
-    confidence = Confidence(
+    sure = LogisticModel(mean_F=(0,) * 4, scale_F=(1,) * 4, coefficient_F=(0,) * 4, intercept=2.0)
+    confidence = Calibration(
         fingerprint=world["mark"],
         gallery=PLACES,
         asked="",
         spacing_m=111.0,
-        within_m=50.0,
+        agreement_radius_m=50.0,
         tolerance_m=25.0,
         outside=0.5,
         model=sure,
         threshold=0.4,
-        sharpness=5000.0,
+        inverse_temperature=5000.0,
         elsewhere=0.0,
         photos=100,
         locations=20,
@@ -105,7 +105,7 @@ def calibrated(world: dict[str, str]) -> None:
         calibration_error=0.02,
         bins=(),
     )
-    write_confidence(f"{world['index']}/calibration.json", confidence)
+    write_calibration(f"{world['index']}/calibration.json", confidence)
 
 
 def test_each_photo_is_placed_where_it_was_taken(world: dict[str, str], tmp_path: Path) -> None:
@@ -142,7 +142,9 @@ def test_photos_of_one_folder_are_one_query_together(world: dict[str, str]) -> N
 
 
 def test_near_a_place_only_what_lies_there_answers(world: dict[str, str]) -> None:
-    located = locate_photos(settings(world, near=Near(lat=46 + STEP * 2, lon=8.0, radius_m=150.0)))
+    located = locate_photos(
+        settings(world, near=Circle(lat=46 + STEP * 2, lon=8.0, radius_m=150.0))
+    )
     found = {hit.location for one in located if one.answer for hit in one.answer.candidates}
     assert found == {"0001", "0002", "0003"}
 
@@ -151,7 +153,7 @@ def test_a_damaged_photo_is_told_the_others_are_answered_and_the_exit_code_is_1(
     world: dict[str, str],
 ) -> None:
     (Path(world["photos"]) / "0a.jpg").write_bytes(b"\xff\xd8\xff no image")
-    with pytest.raises(Unfinished, match=r"1 of 5 photos could not be decoded: .*out.geojson"):
+    with pytest.raises(Incomplete, match=r"1 of 5 photos could not be decoded: .*out.geojson"):
         main(settings(world))
     said = json.loads(Path(world["out"]).read_text())["features"]
     assert [len(feature["properties"]["rejected"]) for feature in said] == [0, 1, 0, 0, 0]

@@ -5,11 +5,18 @@ better.
 import numpy as np
 import pytest
 
-from pipeline.locate.logistic import RIDGE, Logistic, choices, fit_choices, fit_logistic, sigmoid
+from pipeline.locate.logistic import (
+    RIDGE,
+    LogisticModel,
+    choice_log_probabilities,
+    fit_choice_model,
+    fit_logistic,
+    sigmoid,
+)
 
 
 def test_a_model_says_what_its_formula_says() -> None:
-    model = Logistic(mean_F=(1.0,), scale_F=(2.0,), coefficient_F=(3.0,), intercept=-1.5)
+    model = LogisticModel(mean_F=(1.0,), scale_F=(2.0,), coefficient_F=(3.0,), intercept=-1.5)
     assert model.probabilities(np.array([[1.0], [2.0]])) == pytest.approx(
         [1 / (1 + np.exp(1.5)), 0.5]
     )
@@ -60,23 +67,23 @@ def test_examples_that_part_perfectly_leave_coefficients_finite() -> None:
 
 def test_choices_are_a_softmax_with_none_of_them_last() -> None:
     """Weights 2, 1 and 3 of six."""
-    said = np.exp(choices(np.array([[np.log(2), 0.0, -np.inf]]), 1.0, np.log(3)))
+    said = np.exp(choice_log_probabilities(np.array([[np.log(2), 0.0, -np.inf]]), 1.0, np.log(3)))
     assert said == pytest.approx(np.array([[2 / 6, 1 / 6, 0, 3 / 6]]))
 
 
 def test_choices_made_by_known_odds_give_the_odds_back() -> None:
     rng = np.random.default_rng(0)
     x_NK = rng.uniform(0, 0.4, size=(4000, 5))
-    p_NC = np.exp(choices(x_NK, 12.0, 2.0))
+    p_NC = np.exp(choice_log_probabilities(x_NK, 12.0, 2.0))
     chosen_N = np.array([rng.choice(6, p=p_C) for p_C in p_NC])
-    sharpness, outside = fit_choices(x_NK, chosen_N, np.ones(4000))
-    assert sharpness == pytest.approx(12, rel=0.1)
+    inverse_temperature, outside = fit_choice_model(x_NK, chosen_N, np.ones(4000))
+    assert inverse_temperature == pytest.approx(12, rel=0.1)
     assert outside == pytest.approx(2, abs=0.2)
 
 
 def test_candidates_that_are_not_there_are_never_chosen() -> None:
     x_NK = np.array([[0.3, -np.inf], [0.1, -np.inf]] * 10)
-    sharpness, outside = fit_choices(x_NK, np.array([0, 2] * 10), np.ones(20))
-    said = np.exp(choices(x_NK[:2], sharpness, outside))
+    inverse_temperature, outside = fit_choice_model(x_NK, np.array([0, 2] * 10), np.ones(20))
+    said = np.exp(choice_log_probabilities(x_NK[:2], inverse_temperature, outside))
     assert said[:, 1].tolist() == [0, 0]
     assert said[0, 0] > 0.5 > said[1, 0]

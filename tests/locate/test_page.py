@@ -16,18 +16,25 @@ from pipeline.core.geo import haversine_m
 from pipeline.core.records import Rejection, View
 from pipeline.index.searcher import Hit
 from pipeline.locate.gallery_map import GalleryMap
-from pipeline.locate.geojson import Located
+from pipeline.locate.geojson import LocatedPhoto
 from pipeline.locate.locate import Answer, Position
-from pipeline.locate.page import SHOWN, Surroundings, away_m, render, short, told_m
+from pipeline.locate.page import (
+    MAX_SHOWN,
+    PageContext,
+    distance_to_m,
+    format_distance,
+    render_page,
+    short_name,
+)
 from pipeline.locate.page_map import (
-    SIDE,
-    Frame,
-    frame_of,
-    keys_around,
-    matrix,
-    overview,
-    place_map,
-    square,
+    MAP_SIDE_PX,
+    MapFrame,
+    fit_frame,
+    nearby_keys,
+    overview_map,
+    position_map,
+    square_footprint,
+    svg_matrix,
 )
 
 CHROMIUM = next(
@@ -77,9 +84,9 @@ def picture() -> bytes:
 
 
 LOCATED = [
-    Located(name="flight/a.jpg", photos=("flight/a.jpg",), answer=answer(), taken_at="10"),
-    Located(name=HOSTILE, photos=(HOSTILE,), answer=answer(known=False)),
-    Located(
+    LocatedPhoto(name="flight/a.jpg", photos=("flight/a.jpg",), answer=answer(), taken_at="10"),
+    LocatedPhoto(name=HOSTILE, photos=(HOSTILE,), answer=answer(known=False)),
+    LocatedPhoto(
         name="c.jpg",
         photos=("c.jpg",),
         rejected=(Rejection(path="c.jpg", reason="empty file", found=HOSTILE),),
@@ -87,23 +94,23 @@ LOCATED = [
 ]
 
 
-def page(located: list[Located] = LOCATED, **changes: Any) -> str:
+def page(located: list[LocatedPhoto] = LOCATED, **changes: Any) -> str:
     given: dict[str, Any] = {
         "title": "Where?",
         "gallery": gallery(),
         "confidence": None,
         "fingerprint": "f" * 64,
     } | changes
-    return render(
+    return render_page(
         located,
-        Surroundings(**given),
+        PageContext(**given),
         lambda names: {},
         lambda keys: dict.fromkeys(keys, picture()),
     )
 
 
 def test_the_page_tells_places_what_is_unknown_and_what_is_damaged() -> None:
-    text = page(truths={"flight/a.jpg": (30 * METRE, 8.0)})
+    text = page(true_positions={"flight/a.jpg": (30 * METRE, 8.0)})
     assert "0.000000, 8.000000" in text
     assert "truly 30 m away" in text
     assert "1 of 3 photos" in re.sub(r"\s+", " ", text)
@@ -124,18 +131,18 @@ def test_a_picture_on_many_maps_is_held_once() -> None:
 
 
 def test_long_lists_are_shown_in_part_and_it_is_said() -> None:
-    text = page([LOCATED[0]] * (SHOWN + 20))
-    assert text.count('<article class="photo">') == SHOWN
-    assert f"{SHOWN} of them are shown" in text
+    text = page([LOCATED[0]] * (MAX_SHOWN + 20))
+    assert text.count('<article class="photo">') == MAX_SHOWN
+    assert f"{MAX_SHOWN} of them are shown" in text
 
 
 def test_the_map_puts_metres_where_they_belong() -> None:
     """100 m north and east of the middle of a map of 400 m: three quarters across, a quarter down."""
-    frame = Frame(lat=60.0, lon=8.0, half_m=200)
+    frame = MapFrame(lat=60.0, lon=8.0, half_m=200)
     x, y = frame.pixels(np.array([[60 + 100 * METRE, 8 + 200 * METRE]]))[0]
-    assert (x, y) == pytest.approx((0.75 * SIDE, 0.25 * SIDE), abs=0.1)
-    assert frame.length(200) == SIDE / 2
-    assert [Frame(lat=0, lon=0, half_m=half).bar_m for half in (200, 3700, 9, 101)] == [
+    assert (x, y) == pytest.approx((0.75 * MAP_SIDE_PX, 0.25 * MAP_SIDE_PX), abs=0.1)
+    assert frame.length(200) == MAP_SIDE_PX / 2
+    assert [MapFrame(lat=0, lon=0, half_m=half).bar_m for half in (200, 3700, 9, 101)] == [
         100,
         1000,
         2,
@@ -145,38 +152,38 @@ def test_the_map_puts_metres_where_they_belong() -> None:
 
 def test_the_map_crosses_the_meridian_of_180_degrees() -> None:
     around = gallery(lon=180.0)
-    view = place_map(answer(lon=180.0), around, {})
+    view = position_map(answer(lon=180.0), around, {})
     assert view is not None
     assert len(view.tiles) == 9
-    frame = frame_of(around.places_N2)
+    frame = fit_frame(around.places_N2)
     assert abs(frame.lon) == pytest.approx(180)
     assert frame.half_m < 200
 
 
 def test_tiles_lie_on_their_footprints_where_these_are_known() -> None:
-    corners = square(0.0, 8.0, 40.0)
+    corners = square_footprint(0.0, 8.0, 40.0)
     turned = (*corners[1:], corners[0])
-    view = place_map(answer(), gallery(), {"gallery-satellite-4": turned})
+    view = position_map(answer(), gallery(), {"gallery-satellite-4": turned})
     assert view is not None
     (tile,) = [one for one in view.tiles if one.key == "gallery-satellite-4"]
-    assert tile.matrix == matrix(view.frame.pixels(np.array(turned))[[0, 1, 3]])
+    assert tile.matrix == svg_matrix(view.frame.pixels(np.array(turned))[[0, 1, 3]])
     a, b, *_ = map(float, tile.matrix.removeprefix("matrix(").removesuffix(")").split())
     assert (a, b) == pytest.approx((0, view.frame.length(40)), abs=0.1)
-    assert "gallery-satellite-4" in keys_around(answer(), gallery())
+    assert "gallery-satellite-4" in nearby_keys(answer(), gallery())
 
 
 def test_a_square_has_sides_as_long_as_asked_for() -> None:
-    corners = np.array(square(60.0, 8.0, 40.0))
+    corners = np.array(square_footprint(60.0, 8.0, 40.0))
     assert haversine_m(corners, np.roll(corners, -1, axis=0)) == pytest.approx([40] * 4, rel=1e-3)
 
 
 def test_the_overview_has_a_mark_for_each_known_place_and_a_line_for_a_flight() -> None:
     answers = [("a", answer()), ("b", answer(known=False)), ("c", answer(lat=100 * METRE))]
-    view = overview(answers, gallery(), track=True)
+    view = overview_map(answers, gallery(), track=True)
     assert view is not None
     assert (len(view.dots), len(view.marks), len(view.line.split())) == (9, 2, 2)
     assert (
-        place_map(
+        position_map(
             Answer(
                 position=None, location="a", probability=None, known=True, candidates=(), agreeing=1
             ),
@@ -188,14 +195,14 @@ def test_the_overview_has_a_mark_for_each_known_place_and_a_line_for_a_flight() 
 
 
 def test_distances_and_names_are_told_briefly() -> None:
-    assert [told_m(metres) for metres in (None, 0.2, 99.6, 2345)] == [
+    assert [format_distance(metres) for metres in (None, 0.2, 99.6, 2345)] == [
         "",
         "here",
         "100 m away",
         "2.3 km away",
     ]
-    assert away_m(answer(), None) is None
-    assert short("/long/way/0001/image.jpg") == "0001/image.jpg"
+    assert distance_to_m(answer(), None) is None
+    assert short_name("/long/way/0001/image.jpg") == "0001/image.jpg"
 
 
 @pytest.mark.skipif(

@@ -7,7 +7,13 @@ import pytest
 from PIL import Image
 
 from pipeline.core.errors import InputError
-from pipeline.locate.photo_files import find_photos, folder_of, read_times, seconds, taken_at
+from pipeline.locate.photo_files import (
+    find_photos,
+    parent_folder,
+    parse_time,
+    read_taken_at,
+    read_times,
+)
 
 
 def test_folders_are_looked_through_and_each_photo_is_named_once(tmp_path: Path) -> None:
@@ -16,8 +22,8 @@ def test_folders_are_looked_through_and_each_photo_is_named_once(tmp_path: Path)
         (tmp_path / name).touch()
     found = find_photos([f"{tmp_path}/b.jpg", str(tmp_path)])
     assert [path.removeprefix(f"{tmp_path}/") for path in found] == ["b.jpg", "a.jpg", "deep/c.PNG"]
-    assert folder_of(found[2]) == f"{tmp_path}/deep"
-    assert folder_of("a.jpg") == "."
+    assert parent_folder(found[2]) == f"{tmp_path}/deep"
+    assert parent_folder("a.jpg") == "."
 
 
 def test_what_is_not_there_is_refused_by_its_name(tmp_path: Path) -> None:
@@ -33,16 +39,16 @@ def test_the_camera_says_when() -> None:
     stream, exif = io.BytesIO(), Image.Exif()
     exif.get_ifd(0x8769)[0x9003] = "2026:11:24 09:30:05"
     Image.new("RGB", (16, 16)).save(stream, "JPEG", exif=exif)
-    assert taken_at(stream.getvalue()) == "2026-11-24T09:30:05"
-    assert taken_at(b"no image") is None
+    assert read_taken_at(stream.getvalue()) == "2026-11-24T09:30:05"
+    assert read_taken_at(b"no image") is None
 
 
 def test_times_are_seconds_or_iso_8601() -> None:
-    assert seconds("12.5") == 12.5
-    assert seconds("2026-11-24T09:30:05.5") - seconds("2026-11-24T09:30:00") == 5.5
-    assert seconds("2026-11-24T10:30:00+01:00") == seconds("2026-11-24T09:30:00")
+    assert parse_time("12.5") == 12.5
+    assert parse_time("2026-11-24T09:30:05.5") - parse_time("2026-11-24T09:30:00") == 5.5
+    assert parse_time("2026-11-24T10:30:00+01:00") == parse_time("2026-11-24T09:30:00")
     with pytest.raises(ValueError, match="nan"):
-        seconds("nan")
+        parse_time("nan")
 
 
 def test_a_table_gives_times_by_path_or_by_name(tmp_path: Path) -> None:

@@ -7,17 +7,17 @@ import pytest
 
 from pipeline.core.arrays import Doubles
 from pipeline.core.errors import InputError
-from pipeline.core.geo import EARTH_M, haversine_m
-from pipeline.locate.track import Motion, Photo, Start, smooth
+from pipeline.core.geo import EARTH_RADIUS_M, haversine_m
+from pipeline.locate.track import Motion, TrackPhoto, TrackStart, smooth_track
 
-METRE = 180 / (np.pi * EARTH_M)  # degrees of latitude
+METRE = 180 / (np.pi * EARTH_RADIUS_M)  # degrees of latitude
 
 
-def photo(time_s: float, norths_m: list[float], chances: list[float]) -> Photo:
+def photo(time_s: float, norths_m: list[float], chances: list[float]) -> TrackPhoto:
     """Candidates so many metres north of the equator; what is left of the chances is elsewhere."""
     places = np.array([(north * METRE, 8.0) for north in norths_m]).reshape(-1, 2)
     left = 1 - sum(chances)
-    return Photo(
+    return TrackPhoto(
         time_s=time_s,
         places_K2=places,
         log_chance_K=np.log(chances),
@@ -34,7 +34,7 @@ def test_a_doubtful_photo_is_settled_by_its_neighbours() -> None:
         photo(10, [9000, 100], [0.5, 0.3]),
         photo(20, [200, 7000], [0.7, 0.2]),
     ]
-    found = smooth(flight, Motion(max_speed=10.5))
+    found = smooth_track(flight, Motion(max_speed=10.5))
     assert [one.chosen for one in found] == [0, 1, 0]
     assert found[1].probability > 0.5
 
@@ -42,51 +42,51 @@ def test_a_doubtful_photo_is_settled_by_its_neighbours() -> None:
 def test_a_photo_at_none_of_its_candidates_is_passed_over_and_the_limit_holds_across_it() -> None:
     """150 m in 20 s are flown, 5 km are not, though nobody is between."""
     flight = [photo(0, [0], [0.9]), photo(10, [9000], [0.5]), photo(20, [5000, 150], [0.6, 0.3])]
-    assert [one.chosen for one in smooth(flight, Motion(max_speed=10))] == [0, None, 1]
+    assert [one.chosen for one in smooth_track(flight, Motion(max_speed=10))] == [0, None, 1]
 
 
 def test_a_rough_start_settles_the_first_photo() -> None:
     flight = [photo(0, [0, 3000], [0.7, 0.2])]
-    start = Start(lat=2900 * METRE, lon=8.0, radius_m=500)
-    assert smooth(flight, Motion())[0].chosen == 0
-    found = smooth(flight, Motion(), start)[0]
+    start = TrackStart(lat=2900 * METRE, lon=8.0, radius_m=500)
+    assert smooth_track(flight, Motion())[0].chosen == 0
+    found = smooth_track(flight, Motion(), start)[0]
     assert found.chosen == 1
     assert found.probability == pytest.approx(0.2 / 0.3)
 
 
 def test_slack_is_added_to_every_way() -> None:
     flight = [photo(0, [0], [0.9]), photo(10, [140], [0.9])]
-    assert [one.chosen for one in smooth(flight, Motion(max_speed=10))] != [0, 0]
-    assert [one.chosen for one in smooth(flight, Motion(max_speed=10, slack_m=50))] == [0, 0]
+    assert [one.chosen for one in smooth_track(flight, Motion(max_speed=10))] != [0, 0]
+    assert [one.chosen for one in smooth_track(flight, Motion(max_speed=10, slack_m=50))] == [0, 0]
 
 
 def test_one_photo_keeps_the_chances_that_it_had() -> None:
-    found = smooth([photo(0, [0, 900], [0.5, 0.3])], Motion())[0]
+    found = smooth_track([photo(0, [0, 900], [0.5, 0.3])], Motion())[0]
     assert found.chance_K == pytest.approx([0.5, 0.3])
     assert found.chosen == 0
     assert found.probability == pytest.approx(0.5)
 
 
 def test_no_photos_and_photos_without_candidates_have_no_places() -> None:
-    assert smooth([], Motion()) == []
-    found = smooth([photo(0, [], []), photo(1, [5], [0.9])], Motion())
+    assert smooth_track([], Motion()) == []
+    found = smooth_track([photo(0, [], []), photo(1, [5], [0.9])], Motion())
     assert [one.chosen for one in found] == [None, 0]
     assert found[0].probability == pytest.approx(1)
 
 
 def test_a_candidate_without_a_position_is_never_chosen() -> None:
-    flight = Photo(
+    flight = TrackPhoto(
         time_s=0,
         places_K2=np.full((1, 2), np.nan),
         log_chance_K=np.log([0.99]),
         log_elsewhere=float(np.log(0.01)),
     )
-    assert smooth([flight], Motion())[0].chosen is None
+    assert smooth_track([flight], Motion())[0].chosen is None
 
 
 def test_the_way_across_the_meridian_of_180_degrees_is_short() -> None:
     flight = [
-        Photo(
+        TrackPhoto(
             time_s=10.0 * n,
             places_K2=np.array([[0, lon]]),
             log_chance_K=np.log([0.9]),
@@ -94,11 +94,11 @@ def test_the_way_across_the_meridian_of_180_degrees_is_short() -> None:
         )
         for n, lon in enumerate((179.9995, -179.9995))
     ]
-    assert [one.chosen for one in smooth(flight, Motion(max_speed=12))] == [0, 0]
+    assert [one.chosen for one in smooth_track(flight, Motion(max_speed=12))] == [0, 0]
 
 
 def chains(
-    flight: list[Photo], motion: Motion, start: Start | None
+    flight: list[TrackPhoto], motion: Motion, start: TrackStart | None
 ) -> dict[tuple[int | None, ...], float]:
     """Every chain that can be flown, with its weight: all combinations are tried."""
     weights = {}
@@ -113,7 +113,7 @@ def chains(
             if at is None:
                 continue
             here: Doubles = one.places_K2[at]
-            if last is not None and (seen is None or number - seen <= motion.remembered):
+            if last is not None and (seen is None or number - seen <= motion.max_gap_photos):
                 away = float(haversine_m(np.array(last[1:3]), here))
                 way = motion.max_speed * (one.time_s - last[0]) + motion.slack_m + last[3]
                 weight *= float(np.exp(motion.gain(np.array(way)))) if away <= way else 0.0
@@ -137,12 +137,12 @@ def test_track_and_probabilities_are_those_of_all_chains(seed: int) -> None:
         slack_m=20,
         places=40 if seed % 3 else 1,
         spacing_m=50,
-        remembered=1 + seed % 4,
+        max_gap_photos=1 + seed % 4,
     )
-    start = Start(lat=300 * METRE, lon=8.0, radius_m=200) if seed % 2 else None
+    start = TrackStart(lat=300 * METRE, lon=8.0, radius_m=200) if seed % 2 else None
     weights = chains(flight, motion, start)
     total = sum(weights.values())
-    found = smooth(flight, motion, start)
+    found = smooth_track(flight, motion, start)
     assert tuple(one.chosen for one in found) == max(weights, key=lambda chain: weights[chain])
     for number, one in enumerate(found):
         for at, chance in enumerate(one.chance_K):
@@ -160,8 +160,10 @@ def test_a_place_gains_by_how_few_others_are_within_reach() -> None:
 
 def test_near_places_are_likelier_than_elsewhere_though_no_photo_alone_says_so() -> None:
     flight = [photo(10.0 * n, [100.0 * n, 9000], [0.2, 0.2]) for n in range(4)]
-    assert [one.chosen for one in smooth(flight, Motion())] == [None] * 4
-    assert [one.chosen for one in smooth(flight, Motion(places=1000, spacing_m=100))] == [0] * 4
+    assert [one.chosen for one in smooth_track(flight, Motion())] == [None] * 4
+    assert [one.chosen for one in smooth_track(flight, Motion(places=1000, spacing_m=100))] == [
+        0
+    ] * 4
 
 
 def test_a_motion_that_makes_no_sense_is_refused() -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from jobs.embed_gallery import Settings as EmbedSettings
 from jobs.embed_gallery import main as embed_gallery
-from jobs.encoding.encoder import EncoderSettings, network_of
+from jobs.encoding.encoder import EncoderSettings, make_encoder_spec
 from jobs.import_weights import Settings, import_weights
 from model.backbones.resnet import ResNet
 from model.checkpoint import Checkpoint, CheckpointError, build_encoder, load_encoder, loads
@@ -217,7 +217,7 @@ def test_an_lpn_checkpoint_embeds_as_the_original_does(
     state = three_view_net(made_up(blocks, grown), parts)
     imported(tmp_path, state, size)
     path = tmp_path / "ours.pt"
-    encode = network_of(
+    encode = make_encoder_spec(
         path.read_bytes(), str(path), EmbeddingSettings(shards=tiny_shards, out="none")
     ).factory(2)
     images = photos(size)
@@ -370,7 +370,7 @@ def test_torchvisions_weights_become_a_checkpoint_whose_refinement_is_said_to_be
     with torch.inference_mode():
         assert torch.allclose(encoder(photos(256))[0], twin_maps(state, normal), atol=1e-4)
     embedding = EmbeddingSettings(shards=tiny_shards, out="none")
-    prints = {network_of(Path(out).read_bytes(), out, embedding).fingerprint for out in outs}
+    prints = {make_encoder_spec(Path(out).read_bytes(), out, embedding).fingerprint for out in outs}
     assert len(prints) == 1  # the same file gives the same network
     data = Path(outs[0]).read_bytes()
     other = [
@@ -378,7 +378,7 @@ def test_torchvisions_weights_become_a_checkpoint_whose_refinement_is_said_to_be
         EncoderSettings(mirror=False),
         EncoderSettings(precision="bfloat16"),
     ]
-    networks = [network_of(data, "it", embedding, settings) for settings in other]
+    networks = [make_encoder_spec(data, "it", embedding, settings) for settings in other]
     assert (
         len(prints | {network.fingerprint for network in networks}) == 4
     )  # tables of other preprocessing do not mix

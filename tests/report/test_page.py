@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from pipeline.core.errors import InputError
-from pipeline.images.thumbnails import Album, no_pictures, thumbnail
+from pipeline.images.thumbnails import ThumbnailCache, no_images, thumbnail
 from pipeline.report import page as report
 from pipeline.report.charts import scores_chart, views_chart
 from pipeline.report.inputs import Extras, Findings, read_training
@@ -106,10 +106,10 @@ def test_panels_frame_right_and_wrong_and_say_so_in_words() -> None:
 
 
 def test_the_best_true_match_is_shown_where_it_is_not_among_the_five() -> None:
-    panel = make_panel(TOWN[2], Album({}))
+    panel = make_panel(TOWN[2], ThumbnailCache({}))
     assert panel.truth
     assert (panel.truth.rank, panel.truth.key, panel.truth.right) == (40, "gallery-0003", True)
-    assert make_panel(TOWN[1], Album({})).truth is None
+    assert make_panel(TOWN[1], ThumbnailCache({})).truth is None
 
 
 def test_hostile_names_stay_names() -> None:
@@ -131,7 +131,7 @@ def test_the_page_needs_nothing_but_itself() -> None:
 
 
 def test_without_pictures_the_page_says_how_to_get_them() -> None:
-    text = report.render(findings(TOWN), Extras(title="Town"), no_pictures)
+    text = report.render(findings(TOWN), Extras(title="Town"), no_images)
     assert "evaluate again with <code>--shards</code>" in text
     assert "<img" not in text
 

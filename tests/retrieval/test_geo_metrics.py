@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from pipeline.core.geo import EARTH_M, haversine_m
+from pipeline.core.geo import EARTH_RADIUS_M, haversine_m
 from pipeline.retrieval.geo_metrics import measures, spatial_distance_metric
 
-DEGREE_M = math.pi / 180 * EARTH_M
+DEGREE_M = math.pi / 180 * EARTH_RADIUS_M
 
 
 def test_a_degree_of_a_meridian_and_of_a_parallel() -> None:
@@ -18,7 +18,7 @@ def test_a_degree_of_a_meridian_and_of_a_parallel() -> None:
     )
     assert haversine_m(np.array([0.0, 179.5]), np.array([0.0, -179.5])) == pytest.approx(DEGREE_M)
     assert haversine_m(np.array([90.0, 0]), np.array([-90.0, 0])) == pytest.approx(
-        math.pi * EARTH_M
+        math.pi * EARTH_RADIUS_M
     )
 
 

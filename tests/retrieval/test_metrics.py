@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.core.arrays import Whole
+from pipeline.core.arrays import Ints
 from pipeline.retrieval import metrics
 
 
-def ragged(ranks: list[list[int]]) -> tuple[Whole, Whole, int]:
+def ragged(ranks: list[list[int]]) -> tuple[Ints, Ints, int]:
     """Each query's match ranks, as the flat arrays that the measures take."""
     owner_P = np.repeat(np.arange(len(ranks)), [len(r) for r in ranks])
     return np.array([rank for r in ranks for rank in r], np.int64), owner_P, len(ranks)

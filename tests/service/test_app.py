@@ -16,15 +16,15 @@ from aiohttp.test_utils import BaseTestServer, TestClient
 from PIL import Image
 
 from pipeline.core.errors import InputError
-from pipeline.core.geo import Near
+from pipeline.core.geo import Circle
 from pipeline.core.records import Rejection, View
 from pipeline.index.searcher import Hit
 from pipeline.locate.locate import Answer, Position
-from pipeline.service.answerer import Outcome, Status
+from pipeline.service.answerer import Outcome, ServiceStatus
 from pipeline.service.app import Service
-from pipeline.service.batcher import Gone
+from pipeline.service.batcher import ReplicaLost
 from pipeline.service.engine import NotReady
-from pipeline.service.question import Question
+from pipeline.service.question import LocateRequest
 from pipeline.service.settings import ServiceSettings
 from tests.service.test_question import bomb, photo
 
@@ -32,7 +32,7 @@ TOKEN = "a-token-of-some-length"
 Client = TestClient[Any, Any]
 
 
-def answer_of(question: Question) -> Answer:
+def answer_of(question: LocateRequest) -> Answer:
     """Made up, as many candidates as were asked for."""
     hits = tuple(
         Hit(
@@ -61,30 +61,32 @@ class Engine:
     """
 
     def __init__(self) -> None:
-        self.asked: list[Sequence[Question]] = []
+        self.asked: list[Sequence[LocateRequest]] = []
         self.gate = asyncio.Event()
         self.gate.set()
         self.ready = True
 
-    async def answer(self, questions: Sequence[Question]) -> Sequence[Outcome]:
+    async def answer(self, questions: Sequence[LocateRequest]) -> Sequence[Outcome]:
         if not self.ready:
             raise NotReady("the network is being loaded")
         self.asked.append(questions)
         await self.gate.wait()
         return [self._one(question) for question in questions]
 
-    def _one(self, question: Question) -> Outcome:
+    def _one(self, question: LocateRequest) -> Outcome:
         with Image.open(io.BytesIO(question.photo)) as opened:
             if opened.width == 13:
-                raise Gone("the worker has died")
+                raise ReplicaLost("the worker has died")
             if opened.width == 14:
                 return Rejection(path="photo 1", reason="damaged image", found="99 bytes")
         return answer_of(question)
 
-    async def status(self) -> Status:
+    async def status(self) -> ServiceStatus:
         if not self.ready:
             raise NotReady("the network is being loaded")
-        return Status(fingerprint="f" * 64, rows=3, factory="Flat", calibrated=True, refused=None)
+        return ServiceStatus(
+            fingerprint="f" * 64, rows=3, factory="Flat", calibrated=True, refused=None
+        )
 
 
 class Server(BaseTestServer):
@@ -148,7 +150,9 @@ def test_a_photo_as_the_body_is_answered_with_position_confidence_and_candidates
         assert [hit["key"] for hit in body["candidates"]] == ["gallery-0", "gallery-1"]
         assert body["seconds"] >= 0
         [[question]] = engine.asked
-        assert question == Question(photo=photo(), near=Near(lat=47, lon=8, radius_m=500), top=2)
+        assert question == LocateRequest(
+            photo=photo(), near=Circle(lat=47, lon=8, radius_m=500), top=2
+        )
 
     served(test)
 
@@ -161,8 +165,8 @@ def test_a_form_is_answered_alike_and_its_fields_stand_before_the_querys() -> No
         response = await client.post("/locate?top=9", data=data)
         assert response.status == 200, await response.text()
         [[question]] = engine.asked
-        assert question == Question(
-            photo=photo("PNG"), near=Near(lat=47, lon=8, radius_m=500), top=3
+        assert question == LocateRequest(
+            photo=photo("PNG"), near=Circle(lat=47, lon=8, radius_m=500), top=3
         )
 
     served(test)

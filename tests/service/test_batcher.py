@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.service.batcher import Alone, Batcher, Gone
+from pipeline.service.batcher import Batcher, PoisonedItem, ReplicaLost
 
 
 class Doubling:
@@ -32,13 +32,13 @@ def run(main: Coroutine[Any, Any, None]) -> None:
     asyncio.run(asyncio.wait_for(main, 10))
 
 
-@given(count=st.integers(1, 40), largest=st.integers(1, 9), abreast=st.integers(1, 3))
+@given(count=st.integers(1, 40), largest=st.integers(1, 9), concurrency=st.integers(1, 3))
 def test_everyone_gets_their_own_answer_in_batches_in_order_of_arrival(
-    count: int, largest: int, abreast: int
+    count: int, largest: int, concurrency: int
 ) -> None:
     async def main() -> None:
         double, sizes = Doubling(), list[int]()
-        batcher = Batcher(double, largest=largest, abreast=abreast, on_batch=sizes.append)
+        batcher = Batcher(double, largest=largest, concurrency=concurrency, on_batch=sizes.append)
         found = await asyncio.gather(*(batcher.ask(number) for number in range(count)))
         assert found == [2 * number for number in range(count)]
         assert [number for batch in double.batches for number in batch] == list(range(count))
@@ -103,7 +103,7 @@ def test_of_a_batch_that_is_lost_only_the_one_that_kills_has_no_answer() -> None
         async def work(items: Sequence[int]) -> list[int]:
             await asyncio.sleep(0)
             if 13 in items:
-                raise Gone("the worker has died")
+                raise ReplicaLost("the worker has died")
             return [2 * item for item in items]
 
         batcher = Batcher(work, largest=8)
@@ -111,7 +111,7 @@ def test_of_a_batch_that_is_lost_only_the_one_that_kills_has_no_answer() -> None
             *(batcher.ask(number) for number in (1, 2, 13, 4)), return_exceptions=True
         )
         assert [found[0], found[1], found[3]] == [2, 4, 8]
-        assert isinstance(found[2], Alone)
+        assert isinstance(found[2], PoisonedItem)
         assert await batcher.ask(5) == 10
 
     run(main())
@@ -121,15 +121,15 @@ def test_the_seconds_to_wait_grow_with_the_queue_and_stay_between_1_and_60() -> 
     async def main() -> None:
         double = Doubling(gated=True)
         batcher = Batcher(double, largest=2)
-        assert batcher.wait_s == 1
+        assert batcher.retry_after_estimate_s == 1
         asked = [asyncio.create_task(batcher.ask(number)) for number in range(9)]
         await asyncio.sleep(0.01)
         assert (
-            batcher.wait_s == 5
+            batcher.retry_after_estimate_s == 5
         )  # four batches of a guessed second each wait behind the one at work
         asked += [asyncio.create_task(batcher.ask(number)) for number in range(300)]
         await asyncio.sleep(0.01)
-        assert batcher.wait_s == 60
+        assert batcher.retry_after_estimate_s == 60
         double.gate.set()
         await asyncio.gather(*asked)
 

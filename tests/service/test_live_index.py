@@ -22,10 +22,10 @@ from pipeline.features.table import Floats, PartFooter, PartRows, write_part
 from pipeline.index.build import IndexSettings, build_index
 from pipeline.locate.locate import Answer
 from pipeline.service import live_index
-from pipeline.service.answerer import Answerer, Outcome, Status
+from pipeline.service.answerer import Outcome, Predictor, ServiceStatus
 from pipeline.service.app import Service
 from pipeline.service.live_index import LiveIndex
-from pipeline.service.question import Question
+from pipeline.service.question import LocateRequest
 from pipeline.service.settings import ServiceSettings
 from tests.service.test_question import photo
 
@@ -87,8 +87,8 @@ class WidthEncoder:
         return inspect(data)[0]
 
 
-def ask(place: int, **where: Any) -> Question:
-    return Question(photo=photo(size=(16 + place, 16)), **where)
+def ask(place: int, **where: Any) -> LocateRequest:
+    return LocateRequest(photo=photo(size=(16 + place, 16)), **where)
 
 
 @pytest.fixture
@@ -180,15 +180,15 @@ def test_an_index_written_once_more_while_it_is_opened_is_left_for_the_next_look
     live = LiveIndex(str(path))
     replace(path, make_index(tmp_path / "new", 4))
     newer = make_index(tmp_path / "newer", 5)
-    opened = live_index.open_whole
+    opened = live_index.open_verified
 
-    def slow(at: str) -> live_index.Opened:
+    def slow(at: str) -> live_index.OpenedIndex:
         found = opened(at)
         if newer.joinpath("index.json").exists():
             replace(path, newer)
         return found
 
-    monkeypatch.setattr(live_index, "open_whole", slow)
+    monkeypatch.setattr(live_index, "open_verified", slow)
     live.look()
     assert len(live.current.index) == 3
     live.look()
@@ -201,8 +201,14 @@ def test_without_an_index_nothing_starts(tmp_path: Path) -> None:
 
 
 def test_one_pass_of_the_network_answers_a_batch_in_order_whatever_each_asks(path: Path) -> None:
-    answerer = Answerer(str(path), WidthEncoder)
-    questions = [ask(2), Question(photo=photo(size=(15, 15))), ask(0, top=1), ask(1), ask(2, top=1)]
+    answerer = Predictor(str(path), WidthEncoder)
+    questions = [
+        ask(2),
+        LocateRequest(photo=photo(size=(15, 15))),
+        ask(0, top=1),
+        ask(1),
+        ask(2, top=1),
+    ]
     found = answerer.answer(questions)
     assert isinstance(found[1], Rejection)
     answers = [one for one in found if isinstance(one, Answer)]
@@ -217,16 +223,16 @@ def test_requests_go_on_being_answered_while_the_index_is_replaced_again_and_aga
     """Two galleries by turns under a stream of requests; none fails, and the last one asked is the
     last one built.
     """
-    answerer = Answerer(str(path), WidthEncoder)
+    answerer = Predictor(str(path), WidthEncoder)
 
     class InThisProcess:
-        async def answer(self, questions: Sequence[Question]) -> list[Outcome]:
+        async def answer(self, questions: Sequence[LocateRequest]) -> list[Outcome]:
             return await asyncio.to_thread(answerer.answer, questions)
 
-        async def status(self) -> Status:
+        async def status(self) -> ServiceStatus:
             return answerer.status()
 
-    monkeypatch.setattr(live_index, "LOOK_EVERY_S", 0.02)
+    monkeypatch.setattr(live_index, "POLL_INTERVAL_S", 0.02)
     stop = threading.Event()
 
     async def main() -> list[int]:

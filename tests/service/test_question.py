@@ -9,8 +9,8 @@ import zlib
 import pytest
 from PIL import Image
 
-from pipeline.core.geo import Near
-from pipeline.service.question import MOST_SCANS, Refusal, question_of
+from pipeline.core.geo import Circle
+from pipeline.service.question import MAX_SCANS, RequestError, parse_request
 
 MEGAPIXELS = 1_000_000
 
@@ -36,23 +36,23 @@ def bomb(side: int) -> bytes:
     )
 
 
-def refused(photo: bytes, **fields: str) -> Refusal:
-    with pytest.raises(Refusal) as caught:
-        question_of(photo, fields, MEGAPIXELS)
+def refused(photo: bytes, **fields: str) -> RequestError:
+    with pytest.raises(RequestError) as caught:
+        parse_request(photo, fields, MEGAPIXELS)
     return caught.value
 
 
 @pytest.mark.parametrize("form", ["JPEG", "PNG", "WEBP"])
 def test_a_photo_alone_is_a_question(form: str) -> None:
-    asked = question_of(photo(form), {}, MEGAPIXELS)
+    asked = parse_request(photo(form), {}, MEGAPIXELS)
     assert (asked.near, asked.top) == (None, 5)
 
 
 def test_a_rough_position_is_a_circle() -> None:
-    asked = question_of(
+    asked = parse_request(
         photo(), {"lat": "47.5", "lon": "-8", "radius_m": "2e3", "top": "3"}, MEGAPIXELS
     )
-    assert asked.near == Near(lat=47.5, lon=-8.0, radius_m=2000.0)
+    assert asked.near == Circle(lat=47.5, lon=-8.0, radius_m=2000.0)
     assert asked.top == 3
 
 
@@ -118,5 +118,5 @@ def test_a_cmyk_photo_of_too_many_pixels_is_refused_before_it_is_decoded(
 def test_a_jpeg_of_a_hundred_scans_too_many_is_refused() -> None:
     data = photo()
     scan = b"\xff\xda\x00\x0c"
-    assert question_of(data[:-2] + scan * (MOST_SCANS - 1) + data[-2:], {}, MEGAPIXELS)
-    assert "scans" in refused(data[:-2] + scan * MOST_SCANS + data[-2:]).sentence
+    assert parse_request(data[:-2] + scan * (MAX_SCANS - 1) + data[-2:], {}, MEGAPIXELS)
+    assert "scans" in refused(data[:-2] + scan * MAX_SCANS + data[-2:]).sentence

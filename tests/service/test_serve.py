@@ -22,7 +22,7 @@ from typing import Any
 import pytest
 
 from jobs.encoding.photo_encoder import PhotoEncoder
-from jobs.serve import Settings, load, main
+from jobs.serve import Settings, load_predictor, main
 from model.checkpoint import Checkpoint, dumps
 from model.pvda import FeatureEncoder, PVDAConfig
 from pipeline.core import json_files
@@ -186,7 +186,7 @@ def test_a_replica_that_cannot_load_says_why_and_loads_once_it_can(
     checkpoint, index = road
     monkeypatch.setattr(replicas, "RETRY_S", 0.02)
     hidden = index.rename(index.with_name("hidden"))
-    replica = Replica(partial(load, str(checkpoint), str(index), None, 1))
+    replica = Replica(partial(load_predictor, str(checkpoint), str(index), None, 1))
     with pytest.raises(NotReady, match="no index at"):
         asyncio.run(replica.status())
     replica.check_health()  # another process would not find an index either
@@ -200,7 +200,7 @@ def test_a_replica_that_cannot_load_says_why_and_loads_once_it_can(
 def test_a_replica_whose_batch_does_not_end_is_ill(
     road: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    replica = Replica(partial(load, str(road[0]), str(road[1]), None, 1))
-    replica._began = time.monotonic() - replicas.STUCK_S - 1
+    replica = Replica(partial(load_predictor, str(road[0]), str(road[1]), None, 1))
+    replica._began = time.monotonic() - replicas.BATCH_TIMEOUT_S - 1
     with pytest.raises(TimeoutError, match="120 s"):
         replica.check_health()

@@ -16,8 +16,8 @@ from jobs.training.recipes import smoke
 from pipeline.batches.training import Reading, TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.features.embed import EmbeddingSettings, Encoder, missing_shards
-from pipeline.features.embed_worker import Network
+from pipeline.features.embed import EmbeddingSettings, Encoder, pending_shards
+from pipeline.features.embed_worker import EncoderSpec
 from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.shards.manifest import NOTE, Shard, read_manifest
 from pipeline.shards.pack import PackingSettings, pack
@@ -258,8 +258,8 @@ def test_a_part_of_a_table_with_damaged_pages_is_embedded_again_when_every_byte_
         raise AssertionError
 
     def missing(settings: EmbeddingSettings) -> list[Shard]:
-        network = Network(fingerprint="f" * 64, image_size=16, factory=never)
-        return missing_shards(settings, network, manifest.shards)
+        network = EncoderSpec(fingerprint="f" * 64, image_size=16, factory=never)
+        return pending_shards(settings, network, manifest.shards)
 
     asked = EmbeddingSettings(shards=str(out), out=str(table))
     assert missing(replace(asked, verify=True)) == []

@@ -16,7 +16,7 @@ from PIL import Image
 from pipeline.batches.training import Reading, TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.features.embed import EmbeddingSettings, Encoder, Network, embed_gallery
+from pipeline.features.embed import EmbeddingSettings, Encoder, EncoderSpec, embed_gallery
 from pipeline.features.table import open_table
 from pipeline.shards.external import facts_of, open_manifest
 from pipeline.shards.manifest import read_manifest
@@ -182,7 +182,7 @@ def test_others_shards_are_embedded_and_done_parts_are_known_again(
 
         return encode
 
-    network = Network(fingerprint="f" * 64, image_size=16, factory=factory)
+    network = EncoderSpec(fingerprint="f" * 64, image_size=16, factory=factory)
     out, (split, view) = str(tmp_path / "table"), TWO
     settings = EmbeddingSettings(shards=foreign, out=out, workers=1, split=split, view=view)
     assert embed_gallery(settings, network) == 10

@@ -21,7 +21,7 @@ from PIL import Image
 
 from jobs import make_shards
 from pipeline.core import storage
-from pipeline.core.errors import InputError, Unfinished
+from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View, make_key
 from pipeline.shards import pack as packing
 from pipeline.shards import record_table
@@ -455,7 +455,7 @@ def test_the_job_checks_and_exports_a_finished_set(
     assert "0 images, 15 without a place left out" in told
     (out / f"{manifest.shards[0].name}.tar").unlink()
     with pytest.raises(
-        Unfinished, match="is damaged in 1 places; run the command that packed it again"
+        Incomplete, match="is damaged in 1 places; run the command that packed it again"
     ):
         make_shards.check(str(out), verify=True)
 

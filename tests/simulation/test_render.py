@@ -7,10 +7,10 @@ from math import cos, radians, sin, tan
 import numpy as np
 import pytest
 
-from pipeline.simulation.appearance import Day, light
+from pipeline.simulation.appearance import Day, light_world
 from pipeline.simulation.flight import FlightPlan, Pose
-from pipeline.simulation.render import nadir, perspective
-from pipeline.simulation.scene import Scene, prepare
+from pipeline.simulation.render import render_nadir, render_perspective
+from pipeline.simulation.scene import Scene, prepare_scene
 from pipeline.simulation.shadows import cast_shadows
 from pipeline.simulation.world import ByteMap, Facade, World
 
@@ -49,7 +49,7 @@ def world(*spots: Spot, tower: tuple[float, float, float] | None = None) -> Worl
 
 
 def scene(*spots: Spot, tower: tuple[float, float, float] | None = None) -> Scene:
-    return prepare(world(*spots, tower=tower), NOON)
+    return prepare_scene(world(*spots, tower=tower), NOON)
 
 
 def where(frame: ByteMap, colour: tuple[int, int, int]) -> np.ndarray:
@@ -74,14 +74,14 @@ def project(pose: Pose, x: float, y: float, z: float, size: int) -> tuple[float,
 def test_points_of_the_ground_appear_where_a_pinhole_puts_them(heading: float) -> None:
     view = scene((0, 0, 1.5, RED), (18, 7, 1.5, GREEN))
     pose = FlightPlan(views=3).poses(radius_m=20, first_heading_deg=heading)[1]
-    frame = perspective(view, pose, size=128)
+    frame = render_perspective(view, pose, size=128)
     assert where(frame, RED).mean(axis=0) == pytest.approx((63.5, 63.5), abs=0.7)
     assert where(frame, GREEN).mean(axis=0) == pytest.approx(project(pose, 18, 7, 0, 128), abs=0.9)
 
 
 def test_the_top_of_a_tower_is_displaced_as_perspective_says() -> None:
     pose = FlightPlan().poses(radius_m=20)[40]
-    frame = perspective(scene(tower=(5, 20, 3)), pose, size=128)
+    frame = render_perspective(scene(tower=(5, 20, 3)), pose, size=128)
     assert where(frame, RED).mean(axis=0) == pytest.approx(project(pose, 5, 0, 20, 128), abs=1.2)
     base = project(pose, 5, 0, 0, 128)
     assert np.hypot(*(where(frame, RED).mean(axis=0) - base)) > 10
@@ -91,8 +91,8 @@ def test_a_facade_shows_below_the_roof_and_hides_what_is_behind_but_not_what_is_
     north_of_it, south_of_it = (0.0, 10.0, 1.5, GREEN), (0.0, -10.0, 1.5, GREEN)
     looking_north = FlightPlan().poses(radius_m=20)[36]
     assert looking_north.heading_deg == pytest.approx(0)
-    behind = perspective(scene(north_of_it, tower=(0, 20, 5)), looking_north, size=128)
-    before = perspective(scene(south_of_it, tower=(0, 20, 5)), looking_north, size=128)
+    behind = render_perspective(scene(north_of_it, tower=(0, 20, 5)), looking_north, size=128)
+    before = render_perspective(scene(south_of_it, tower=(0, 20, 5)), looking_north, size=128)
     assert len(where(behind, GREEN)) == 0
     assert len(where(before, GREEN)) > 10
     wall, roof = where(before, BLUE), where(before, RED)
@@ -102,7 +102,7 @@ def test_a_facade_shows_below_the_roof_and_hides_what_is_behind_but_not_what_is_
 
 
 def test_the_view_from_above_has_no_facade_and_the_roof_stands_where_the_building_does() -> None:
-    frame = nadir(scene((0, 20, 2, GREEN), tower=(10, 30, 4)), size=100, half_m=25)
+    frame = render_nadir(scene((0, 20, 2, GREEN), tower=(10, 30, 4)), size=100, half_m=25)
     assert len(where(frame, BLUE)) == 0
     rows, cols = where(frame, RED).mean(axis=0)
     assert (rows, cols) == pytest.approx((49.5, 49.5 + 10 * 2), abs=0.6)  # 2 pixels a metre
@@ -113,12 +113,12 @@ def test_the_view_from_above_has_no_facade_and_the_roof_stands_where_the_buildin
 
 
 def test_a_turn_of_the_satellite_turns_its_picture_clockwise() -> None:
-    frame = nadir(scene((0, 20, 2, GREEN)), size=100, half_m=25, turn_deg=90)
+    frame = render_nadir(scene((0, 20, 2, GREEN)), size=100, half_m=25, turn_deg=90)
     assert where(frame, GREEN).mean(axis=0) == pytest.approx((49.5, 49.5 + 40), abs=0.6)
 
 
 def test_a_shift_of_the_satellite_moves_its_middle() -> None:
-    frame = nadir(scene((10, 20, 2, GREEN)), size=100, half_m=25, shift_m=(10, 20))
+    frame = render_nadir(scene((10, 20, 2, GREEN)), size=100, half_m=25, shift_m=(10, 20))
     assert where(frame, GREEN).mean(axis=0) == pytest.approx((49.5, 49.5), abs=0.6)
 
 
@@ -142,24 +142,28 @@ def test_ground_in_shadow_is_darker_than_ground_in_the_sun_and_a_wall_in_the_sun
     None
 ):
     day = Day(sun_azimuth_deg=180, sun_elevation_deg=35, noise=0)
-    lit = light(world(tower=(0, 15, 3)), day).colour_HW3.mean(axis=2)
+    lit = light_world(world(tower=(0, 15, 3)), day).colour_HW3.mean(axis=2)
     assert lit[SIDE // 2 - 16, SIDE // 2] < 0.7 * lit[SIDE // 2 + 16, SIDE // 2]
     made = world(tower=(0, 15, 3))
     made.facing_HW[:] = np.pi  # both walls are said to face south
-    sunny = prepare(made, day)
+    sunny = prepare_scene(made, day)
     made.facing_HW[:] = 0
-    shady = prepare(made, day)
+    shady = prepare_scene(made, day)
     pose = FlightPlan().poses(radius_m=20)[36]
-    bright, dark = perspective(sunny, pose, size=64), perspective(shady, pose, size=64)
+    bright, dark = (
+        render_perspective(sunny, pose, size=64),
+        render_perspective(shady, pose, size=64),
+    )
     rows, cols = where(dark, BLUE).T
     assert rows.size > 20
     assert bright[rows, cols, 2].mean() > 1.5 * dark[rows, cols, 2].mean()
 
 
 def test_noise_comes_from_the_generator_alone() -> None:
-    noisy = prepare(world(), Day(noise=4.0))
+    noisy = prepare_scene(world(), Day(noise=4.0))
     one, same, other = (
-        nadir(noisy, size=64, half_m=20, rng=np.random.default_rng(seed)) for seed in (1, 1, 2)
+        render_nadir(noisy, size=64, half_m=20, rng=np.random.default_rng(seed))
+        for seed in (1, 1, 2)
     )
     assert (one == same).all()
     assert (one != other).any()
@@ -169,4 +173,4 @@ def test_noise_comes_from_the_generator_alone() -> None:
 def test_a_camera_that_sees_the_horizon_is_refused() -> None:
     level = Pose(x_m=0, y_m=-100, altitude_m=50, heading_deg=0, pitch_deg=-10, fov_deg=40)
     with pytest.raises(ValueError, match="look further down"):
-        perspective(scene(), level, size=32)
+        render_perspective(scene(), level, size=32)

@@ -13,9 +13,9 @@ from PIL import Image
 
 from pipeline.core import cluster
 from pipeline.core.errors import InputError
-from pipeline.simulation.layout import make_location
-from pipeline.simulation.location import Order, photograph
-from pipeline.simulation.simulate import SimulationSettings, plan, simulate
+from pipeline.simulation.layout import write_location
+from pipeline.simulation.location import LocationSpec, render_location
+from pipeline.simulation.simulate import SimulationSettings, plan_jobs, simulate
 
 
 def settings(out: Path, **changed: Any) -> SimulationSettings:
@@ -47,9 +47,9 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
             for done, job in enumerate(reversed(list(items))):
                 if done == stop_after:
                     raise KeyboardInterrupt
-                yield job, make_location(job)
+                yield job, write_location(job)
 
-        monkeypatch.setattr(cluster, "bounded", bounded)
+        monkeypatch.setattr(cluster, "bounded_map", bounded)
         monkeypatch.setattr(cluster, "connect", lambda: None)
         monkeypatch.setattr(cluster, "cpus", lambda: 1)
 
@@ -64,8 +64,8 @@ def test_the_folders_are_university_1652s_and_the_bytes_the_same_whatever_the_pa
     with monkeypatch.context() as patch:
         patch.setattr(
             cluster,
-            "bounded",
-            lambda submit, items, window: ((job, make_location(job)) for job in items),
+            "bounded_map",
+            lambda submit, items, window: ((job, write_location(job)) for job in items),
         )
         simulate(settings(tmp_path / "here"))
     assert digest(root) == digest(tmp_path / "here")
@@ -128,7 +128,7 @@ def test_a_run_that_was_stopped_goes_on_and_leaves_no_half_location(
     assert len(list((broken / ".parts").glob("0*.json"))) == 2
     # What a kill in the middle of a location leaves: some pictures under a hidden name, one folder
     # without its part.
-    first = plan(settings(broken), str(broken), [])[0]
+    first = plan_jobs(settings(broken), str(broken), [])[0]
     (broken / "train/drone" / f".{first.name}").mkdir(parents=True)
     (broken / "train/drone" / f".{first.name}" / "image-01.jpeg").write_bytes(b"half")
     (broken / "train/satellite" / first.name).mkdir(parents=True)
@@ -172,7 +172,7 @@ def test_textures_are_dealt_out_one_each_and_too_few_are_refused(
     for i in range(6):
         Image.new("RGB", (64, 64), (40 * i, 90, 80)).save(folder / f"{i}.png")
     names = [str(path) for path in sorted(folder.iterdir())]
-    jobs = plan(settings(tmp_path / "out", textures=str(folder)), "root", names)
+    jobs = plan_jobs(settings(tmp_path / "out", textures=str(folder)), "root", names)
     assert len({job.order.texture for job in jobs}) == len(jobs) == 5
     assert simulate(
         settings(tmp_path / "out", textures=str(folder), train_locations=1, test_locations=1)
@@ -209,7 +209,7 @@ def test_an_address_that_is_no_folder_is_refused() -> None:
 def test_mean_colour_alone_does_not_find_the_place() -> None:
     satellites, drones = [], []
     for location in range(1, 41):
-        taken = photograph(Order(seed=5, location=location, views=2, size=32))
+        taken = render_location(LocationSpec(seed=5, location=location, views=2, size=32))
         satellites.append(mean_colour(taken.satellite))
         drones.append([mean_colour(data) for data in taken.drone])
     gallery, queries = np.array(satellites), np.array(drones)

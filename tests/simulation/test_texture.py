@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 from pipeline.core.errors import InputError
-from pipeline.simulation.appearance import Day, light
-from pipeline.simulation.texture import RADIUS_PART, textured_world, usable_textures
+from pipeline.simulation.appearance import Day, light_world
+from pipeline.simulation.texture import RADIUS_FRACTION, textured_world, usable_textures
 
 
 def picture(
@@ -21,7 +21,7 @@ def picture(
 def test_a_picture_becomes_flat_ground_of_its_own_size(tmp_path: Path) -> None:
     ground = textured_world(str(picture(tmp_path / "a.png", 120, 96)), metres_per_pixel=0.3)
     assert ground.extent_m == pytest.approx(96 * 0.3)
-    assert ground.target_radius_m == pytest.approx(RADIUS_PART * 96 * 0.3)
+    assert ground.target_radius_m == pytest.approx(RADIUS_FRACTION * 96 * 0.3)
     assert not ground.height_HW.any()
     assert np.abs(ground.texture_HW3.astype(int) - (90, 140, 80)).max() <= 1
     assert ground.light_is_baked
@@ -29,7 +29,7 @@ def test_a_picture_becomes_flat_ground_of_its_own_size(tmp_path: Path) -> None:
 
 def test_light_and_shadow_of_a_photograph_are_left_alone_in_summer(tmp_path: Path) -> None:
     ground = textured_world(str(picture(tmp_path / "a.png")), metres_per_pixel=0.3)
-    assert (light(ground, Day(sun_elevation_deg=20)).colour_HW3 == ground.texture_HW3).all()
+    assert (light_world(ground, Day(sun_elevation_deg=20)).colour_HW3 == ground.texture_HW3).all()
 
 
 def test_green_turns_with_the_season_and_grey_does_not(tmp_path: Path) -> None:
@@ -38,8 +38,8 @@ def test_green_turns_with_the_season_and_grey_does_not(tmp_path: Path) -> None:
         str(picture(tmp_path / "b.png", colour=(120, 120, 120))), metres_per_pixel=0.3
     )
     winter = Day(season="winter")
-    assert (light(lawn, winter).colour_HW3 != lawn.texture_HW3).any()
-    assert (light(road, winter).colour_HW3 == road.texture_HW3).all()
+    assert (light_world(lawn, winter).colour_HW3 != lawn.texture_HW3).any()
+    assert (light_world(road, winter).colour_HW3 == road.texture_HW3).all()
 
 
 def test_a_height_map_beside_the_picture_is_taken_whatever_its_resolution(tmp_path: Path) -> None:

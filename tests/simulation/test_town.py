@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from pipeline.simulation.location import geotag
-from pipeline.simulation.town.town import EXTENT_IN_RADII, town
+from pipeline.simulation.town.town import EXTENT_IN_RADII, make_town
 from pipeline.simulation.world import World
 
 
 def made(seed: int, frame_pixels: int = 64) -> World:
-    return town(np.random.default_rng([7, seed]), frame_pixels=frame_pixels)
+    return make_town(np.random.default_rng([7, seed]), frame_pixels=frame_pixels)
 
 
 def test_the_same_seed_makes_the_same_town_and_another_seed_another_one() -> None:

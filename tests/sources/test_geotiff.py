@@ -24,10 +24,10 @@ from pipeline.core.errors import InputError
 from pipeline.core.records import GeoTag, ImageRecord, Rejection
 from pipeline.images.decode import DecodeError, decode
 from pipeline.sources.geotiff import GeoTiff
-from pipeline.sources.maps.colours import sample
-from pipeline.sources.maps.georeference import Georeference, named_crs, on_ellipsoid
-from pipeline.sources.maps.mosaic import opened
-from pipeline.sources.maps.tiles import plan_tiles, starts, window_of
+from pipeline.sources.maps.colours import sample_values
+from pipeline.sources.maps.georeference import Georeference, on_ellipsoid, parse_crs
+from pipeline.sources.maps.mosaic import open_mosaic
+from pipeline.sources.maps.tiles import parse_window, plan_tiles, tile_starts
 
 UTM = "EPSG:32633"
 NORTH_UP = rasterio.Affine(0.5, 0, 400_000, 0, -0.5, 5_800_000)
@@ -118,7 +118,7 @@ def test_tiles_cover_every_pixel_and_stay_inside(
         assert window.x + window.width <= width
         assert window.y + window.height <= height
         covered_HW[window.y : window.y + window.height, window.x : window.x + window.width] = True
-        assert window_of(window.part) == window
+        assert parse_window(window.part) == window
     assert covered_HW.all()
     assert (
         len({tile.window for tile in planned})
@@ -132,7 +132,7 @@ def test_tiles_cover_every_pixel_and_stay_inside(
 def test_neighbours_overlap_as_asked_and_the_last_ends_at_the_border(
     length: int, side: int, overlap: float
 ) -> None:
-    begins = starts(length, side, overlap)
+    begins = tile_starts(length, side, overlap)
     steps = np.diff(begins)
     assert set(steps[:-1]) <= {max(1, round(side * (1 - overlap)))}
     assert all(0 < step <= max(1, round(side * (1 - overlap))) for step in steps)
@@ -140,11 +140,11 @@ def test_neighbours_overlap_as_asked_and_the_last_ends_at_the_border(
 
 
 def test_a_hand_worked_plan() -> None:
-    assert starts(1000, 400, 0.25) == [0, 300, 600]
-    assert starts(1001, 400, 0.25) == [0, 300, 600, 601]
-    assert starts(399, 400, 0.25) == [0]
+    assert tile_starts(1000, 400, 0.25) == [0, 300, 600]
+    assert tile_starts(1001, 400, 0.25) == [0, 300, 600, 601]
+    assert tile_starts(399, 400, 0.25) == [0]
     with pytest.raises(ValueError, match="is no window"):
-        window_of("x1-y2")
+        parse_window("x1-y2")
 
 
 # Where tiles lie
@@ -159,7 +159,7 @@ def test_centres_and_corners_match_pyprojs_to_under_a_centimetre(
     found = tiles(root, tile_pixels=64, overlap=0.25)
     assert len(found) == 5 * 3
     for record in found:
-        window, tag = window_of(record.part), tag_of(record)
+        window, tag = parse_window(record.part), tag_of(record)
         left, top, right, bottom = (
             window.x,
             window.y,
@@ -197,7 +197,7 @@ def test_a_tile_of_100_metres_is_100_metres_on_the_ground(
 ) -> None:
     root = mosaic(tmp_path / "ortho.tif", np.ones((1, 512, 512), np.uint8), crs=crs, affine=affine)
     found = tiles(root, tile_m=100.0)
-    window = window_of(found[0].part)
+    window = parse_window(found[0].part)
     assert (window.width, window.height) == (across, down)
     footprint = tag_of(found[0]).footprint
     assert footprint is not None
@@ -272,7 +272,7 @@ def test_a_png_tile_is_the_mosaics_window_and_the_last_row_and_column_are_kept(
     }
     assert [found[0].location, found[-1].location] == ["ortho-0-0", "ortho-2-3"]
     for record in found:
-        window = window_of(record.part)
+        window = parse_window(record.part)
         rows, columns = slice(window.y, window.y + 64), slice(window.x, window.x + 64)
         assert (pixels(record) == np.moveaxis(values_BHW[:, rows, columns], 0, -1)).all()
 
@@ -341,7 +341,7 @@ def test_16_bits_are_stretched_between_percentiles_of_the_whole_mosaic(
     low, high = np.percentile(values_BHW, (2, 98))
     assert f"uint16 stretched from {low:.6g}..{high:.6g}" in capsys.readouterr().err
     for record in found:  # one stretch for all: tiles fit together
-        window = window_of(record.part)
+        window = parse_window(record.part)
         shown_BHW = values_BHW[:, window.y : window.y + 100, window.x : window.x + 100]
         expected_BHW = np.clip((shown_BHW - low) / (high - low) * 255, 0, 255)
         assert np.abs(pixels(record) - np.moveaxis(expected_BHW, 0, -1)).max() <= 0.51
@@ -351,7 +351,9 @@ def test_16_bits_are_stretched_between_percentiles_of_the_whole_mosaic(
 
 def test_a_large_mosaic_without_overviews_is_sampled_in_patches(tmp_path: Path) -> None:
     values_1HW = np.tile(np.arange(5000, dtype=np.uint16), (1, 40, 1))
-    found = np.concatenate(list(sample(opened(mosaic(tmp_path / "wide.tif", values_1HW)), (1,))))
+    found = np.concatenate(
+        list(sample_values(open_mosaic(mosaic(tmp_path / "wide.tif", values_1HW)), (1,)))
+    )
     assert len(found) == 16 * 16 * 64 * 40
     assert (found.min(), found.max()) == (0, 4999)
     assert abs(np.percentile(found, 50) - 2500) < 50
@@ -433,7 +435,7 @@ def test_tiles_of_nodata_are_left_out_and_counted(
 ) -> None:
     root = made_with_nodata(kind, tmp_path / "ortho.tif")
     found = tiles(root, tile_pixels=16)
-    assert [window_of(record.part).x for record in found[:3]] == [16, 32, 48]
+    assert [parse_window(record.part).x for record in found[:3]] == [16, 32, 48]
     assert "12 tiles of 16 x 16 px, 4 left out as nodata" in capsys.readouterr().err
     assert (
         len(tiles(root, tile_pixels=32, max_nodata=0.5)) == 4
@@ -630,6 +632,6 @@ def test_no_mosaic_and_no_root_are_told_apart(tmp_path: Path) -> None:
 
 
 def test_a_pixels_size_is_found_although_one_place_around_it_is_nowhere() -> None:
-    crs = named_crs("+proj=ortho +ellps=WGS84")
+    crs = parse_crs("+proj=ortho +ellps=WGS84")
     disc = Georeference(crs=crs, affine=rasterio.Affine(1000, 0, 6_370_000, 0, -1000, 0))
     assert np.isnan(disc.degrees(np.array([(0, 0), (100.0, 0)]))[:, 0]).tolist() == [False, True]

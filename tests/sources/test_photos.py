@@ -17,7 +17,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.records import ImageRecord, Rejection, Split, View
 from pipeline.images.decode import decode
 from pipeline.sources import SOURCES, name_of
-from pipeline.sources.photos import EARTH_M, HEAD, Photos, aimed_at
+from pipeline.sources.photos import EARTH_RADIUS_M, HEAD_BYTES, Photos, aim_point
 
 HERE = {1: "S", 2: (33.0, 30.0, 0.0), 3: "W", 4: (70.0, 45.0, 0.0)}
 "33.5 south, 70.75 west"
@@ -223,12 +223,12 @@ def test_only_the_beginning_of_a_photo_is_read_unless_its_tags_lie_further_on(
     exif.get_ifd(0x8825).update(HERE)
     pixels.save(tmp_path / "a.jpg", exif=exif)
     with (tmp_path / "a.jpg").open("ab") as jpeg:
-        jpeg.write(bytes(2 * HEAD))
+        jpeg.write(bytes(2 * HEAD_BYTES))
     pixels.save(tmp_path / "b.webp", exif=exif, lossless=True)
     info = TiffImagePlugin.ImageFileDirectory_v2()
     info[0x8825] = HERE
     pixels.save(tmp_path / "c.tif", tiffinfo=info)
-    assert all(path.stat().st_size > HEAD for path in tmp_path.iterdir())
+    assert all(path.stat().st_size > HEAD_BYTES for path in tmp_path.iterdir())
     found = records(tmp_path)
     assert sorted(read) == ["b.webp", "c.tif"]
     assert all(
@@ -304,8 +304,8 @@ def test_what_is_not_known_or_too_shallow_is_not_projected(
 def test_the_axis_arrives_height_over_tangent_ahead(
     heading: float, pitch: float, north_m: float, east_m: float
 ) -> None:
-    lat, lon = aimed_at(0.0, 10.0, 100.0, heading, pitch)
-    metre = 180 / math.pi / EARTH_M
+    lat, lon = aim_point(0.0, 10.0, 100.0, heading, pitch)
+    metre = 180 / math.pi / EARTH_RADIUS_M
     assert (lat, lon) == pytest.approx((north_m * metre, 10 + east_m * metre), abs=1e-9)
 
 
@@ -319,7 +319,7 @@ def test_the_axis_arrives_height_over_tangent_ahead(
 def test_the_axis_arrives_on_the_globe_at_the_right_distance(
     lat: float, lon: float, height: float, heading: float, pitch: float
 ) -> None:
-    there = aimed_at(lat, lon, height, heading, pitch)
+    there = aim_point(lat, lon, height, heading, pitch)
     assert abs(there[0]) <= 90
     assert -180 <= there[1] <= 180
 
@@ -330,6 +330,6 @@ def test_the_axis_arrives_on_the_globe_at_the_right_distance(
         )
 
     chord = float(np.linalg.norm(vector((lat, lon)) - vector(there)))
-    assert 2 * EARTH_M * math.asin(chord / 2) == pytest.approx(
+    assert 2 * EARTH_RADIUS_M * math.asin(chord / 2) == pytest.approx(
         height / math.tan(math.radians(-pitch)), abs=0.2, rel=1e-3
     )

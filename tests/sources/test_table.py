@@ -17,7 +17,7 @@ from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View
 from pipeline.sources import SOURCES
-from pipeline.sources.maps.geojson_shapes import as_footprint, centroid
+from pipeline.sources.maps.geojson_shapes import centroid, order_footprint
 from pipeline.sources.table import Table
 
 SQUARE = [[8.0, 47.0], [8.2, 47.0], [8.2, 47.1], [8.0, 47.1], [8.0, 47.0]]
@@ -280,7 +280,7 @@ def test_a_polygon_is_a_footprint_around_its_centroid(tmp_path: Path) -> None:
 def test_the_middle_of_a_field_of_a_metre_is_exact() -> None:
     corners = ((47.0, 8.0), (47.0, 8.00001), (47.00001, 8.00001), (47.00001, 8.0))
     assert centroid(corners) == pytest.approx((47.000005, 8.000005), abs=1e-12)
-    assert as_footprint(corners, 180)[0] == (47.0, 8.00001)
+    assert order_footprint(corners, 180)[0] == (47.0, 8.00001)
     assert centroid(((1.0, 2.0), (3.0, 4.0))) == (2.0, 3.0), "no area"
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.core.errors import InputError
 from pipeline.core.records import GeoTag, ImageRecord, Rejection, View
-from pipeline.sources.kml import LARGEST, place_of_kml
+from pipeline.sources.kml import MAX_KML_BYTES, parse_kml
 from pipeline.sources.text_tables import Unreadable
 from pipeline.sources.university1652 import University1652
 
@@ -63,9 +63,9 @@ def test_a_building_and_all_its_images_lie_where_its_kml_says(tmp_path: Path) ->
 
 def test_without_a_point_the_look_counts_and_without_that_the_first_coordinate() -> None:
     look = KML[: KML.index("<Point>")] + "</Placemark></Document></kml>"
-    assert place_of_kml(look.encode()) == (53.5, -1.5)
+    assert parse_kml(look.encode()) == (53.5, -1.5)
     line = "<kml><LineString><coordinates>2.5,48.5,10 3,49,10</coordinates></LineString></kml>"
-    assert place_of_kml(line.encode()) == (48.5, 2.5)
+    assert parse_kml(line.encode()) == (48.5, 2.5)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_without_a_point_the_look_counts_and_without_that_the_first_coordinate()
             "declares a document type",
         ),
         ('<!DOCTYPE kml SYSTEM "file:///etc/passwd"><kml/>', "declares a document type"),
-        (f"<kml>{' ' * LARGEST}</kml>", "expected at most 1048576"),
+        (f"<kml>{' ' * MAX_KML_BYTES}</kml>", "expected at most 1048576"),
     ],
 )
 def test_a_kml_that_tells_no_place_is_told_and_its_images_come_without_a_tag(
@@ -99,7 +99,7 @@ def test_a_kml_that_tells_no_place_is_told_and_its_images_come_without_a_tag(
 
 def test_a_document_type_is_refused_in_other_encodings_too() -> None:
     with pytest.raises(Unreadable, match="declares a document type"):
-        place_of_kml('<?xml version="1.0" encoding="UTF-16"?><!DOCTYPE kml><kml/>'.encode("utf-16"))
+        parse_kml('<?xml version="1.0" encoding="UTF-16"?><!DOCTYPE kml><kml/>'.encode("utf-16"))
 
 
 def test_a_folder_without_kml_is_a_wrong_setting(tmp_path: Path) -> None:

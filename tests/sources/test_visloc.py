@@ -16,7 +16,7 @@ from PIL import Image
 
 from pipeline.core.errors import InputError
 from pipeline.core.records import GeoTag, ImageRecord, Rejection
-from pipeline.sources.maps.tiles import window_of
+from pipeline.sources.maps.tiles import parse_window
 from pipeline.sources.visloc import VisLoc
 
 RANGES = "mapname,LT_lat_map,LT_lon_map,RB_lat_map,RB_lon_map,region\n"
@@ -129,7 +129,7 @@ def test_a_tile_is_the_maps_pixels_and_knows_its_centre_and_corners(tmp_path: Pa
         found.geotag.footprint, [(30.02, 120.04), (30.02, 120.06), (30.0, 120.06), (30.0, 120.04)]
     )
     for record in tiles.values():
-        window = window_of(record.part)
+        window = parse_window(record.part)
         expected = MAP_HWC[window.y : window.y + 20, window.x : window.x + 20]
         assert np.array_equal(pixels(source.read(record)), expected)
         assert source.ending(record) == "png"
@@ -352,7 +352,7 @@ def test_a_source_that_has_read_can_still_be_sent_to_workers_and_read_in_threads
     sent = pickle.loads(pickle.dumps(source))
     with ThreadPoolExecutor(4) as pool:
         for record, data in zip(tiles, pool.map(sent.read, tiles), strict=True):
-            window = window_of(record.part)
+            window = parse_window(record.part)
             expected = MAP_HWC[
                 window.y : window.y + window.height, window.x : window.x + window.width
             ]

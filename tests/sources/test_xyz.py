@@ -19,7 +19,7 @@ from PIL import Image
 
 from pipeline.core.errors import InputError
 from pipeline.core.records import ImageRecord, Rejection
-from pipeline.sources.maps.web_mercator import degrees, geotag, is_on_grid
+from pipeline.sources.maps.web_mercator import is_on_grid, tile_geotag, tile_to_degrees
 from pipeline.sources.xyz import Xyz
 
 EDGE = 85.0511287798066  # degrees: atan(sinh(pi)), where the square map ends
@@ -66,7 +66,7 @@ def records(root: str, **settings: Any) -> dict[str, ImageRecord]:
 
 
 def test_the_whole_world_is_the_tile_of_zoom_0() -> None:
-    tag = geotag(0, 0, 0)
+    tag = tile_geotag(0, 0, 0)
     assert (tag.lat, tag.lon) == (0, 0)
     assert tag.footprint is not None
     assert np.allclose(
@@ -79,7 +79,7 @@ def test_the_whole_world_is_the_tile_of_zoom_0() -> None:
     ("x", "y", "lat", "lon"), [(0, 0, 1, -90), (1, 0, 1, 90), (0, 1, -1, -90), (1, 1, -1, 90)]
 )
 def test_the_four_tiles_of_zoom_1(x: int, y: int, lat: int, lon: int) -> None:
-    tag = geotag(1, x, y)
+    tag = tile_geotag(1, x, y)
     assert tag.lon == lon
     # The middle on the map, a quarter of the way round: atan(sinh(pi / 2)); the middle in degrees
     # would be 42.5.
@@ -89,7 +89,7 @@ def test_the_four_tiles_of_zoom_1(x: int, y: int, lat: int, lon: int) -> None:
 
 
 def test_a_tile_worked_by_hand_over_the_brandenburg_gate() -> None:
-    corners = geotag(15, 17601, 10746).footprint
+    corners = tile_geotag(15, 17601, 10746).footprint
     assert corners is not None
     (north, west), _, (south, east), _ = corners
     assert (west, east) == (
@@ -107,7 +107,7 @@ def test_places_are_those_of_web_mercator(zoom: int, x: float, y: float) -> None
     half = math.pi * 6378137
     to_wgs84 = pyproj.Transformer.from_crs("EPSG:3857", "EPSG:4326", always_xy=True)
     lon, lat = to_wgs84.transform((2 * x - 1) * half, (1 - 2 * y) * half)
-    said = degrees(zoom, x * 2**zoom, y * 2**zoom)
+    said = tile_to_degrees(zoom, x * 2**zoom, y * 2**zoom)
     assert said[0] == pytest.approx(lat, abs=1e-9)
     assert (said[1] - lon) % 360 == pytest.approx(0, abs=1e-9) or abs(
         (said[1] - lon) % 360 - 360
@@ -137,7 +137,7 @@ def test_a_folders_tiles_are_found_with_their_places(tmp_path: Path) -> None:
     assert list(found) == ["3-4-2", "3-5-2", "3-5-3", "3-6-2"]
     for location, record in found.items():
         _, x, y = map(int, location.split("-"))
-        assert record.geotag == geotag(3, x, y)
+        assert record.geotag == tile_geotag(3, x, y)
         assert record.bytes == len(Xyz().read(record))
     assert [Xyz().ending(record) for record in found.values()] == ["png", "jpg", "jpg", "webp"]
     assert Xyz().read(found["3-4-2"]) == (tmp_path / "3/4/2.png").read_bytes()
@@ -147,7 +147,7 @@ def test_a_folders_tiles_are_found_with_their_places(tmp_path: Path) -> None:
 def test_rows_counted_from_the_south_are_turned_round(tmp_path: Path) -> None:
     root = folder(tmp_path, "2/1/0.png")
     assert list(records(root, tms=True)) == ["2-1-3"]
-    assert records(root, tms=True)["2-1-3"].geotag == geotag(2, 1, 3)
+    assert records(root, tms=True)["2-1-3"].geotag == tile_geotag(2, 1, 3)
 
 
 def test_of_many_zooms_the_deepest_is_taken_and_said(
@@ -210,7 +210,7 @@ def test_an_mbtiles_file_is_read_with_its_rows_turned_round(tmp_path: Path) -> N
     root = mbtiles(tmp_path / "town #1?.mbtiles", stored, format="png")
     found = records(root)
     assert sorted(found) == ["3-4-6", "3-4-7", "3-5-7"]
-    assert found["3-4-7"].geotag == geotag(3, 4, 7)
+    assert found["3-4-7"].geotag == tile_geotag(3, 4, 7)
     assert [Xyz().read(found[name]) for name in ("3-4-7", "3-4-6", "3-5-7")] == [
         tile(1),
         tile(2, "JPEG"),

@@ -12,19 +12,19 @@ from math import pi
 import numpy as np
 
 from pipeline.simulation.canvas import GROUND, PAVED
-from pipeline.simulation.palette import ASPHALT, EARTH, FLAT_ROOFS, METAL_ROOFS, PAVING, pick
+from pipeline.simulation.palette import ASPHALT, EARTH, FLAT_ROOFS, METAL_ROOFS, PAVING, pick_colour
 from pipeline.simulation.town import grounds
-from pipeline.simulation.town.buildings import Part, Roof, raise_part
-from pipeline.simulation.town.houses import houses
+from pipeline.simulation.town.buildings import BuildingPart, Roof, raise_part
+from pipeline.simulation.town.houses import fill_houses
 from pipeline.simulation.town.plot import Plot
 
 
-def slabs(plot: Plot) -> None:
+def fill_slabs(plot: Plot) -> None:
     """Long blocks of flats in rows on a lawn, with a strip of parking."""
     b, rng = plot.block.inset(5), plot.rng
-    roof, pitched = pick(rng, FLAT_ROOFS), rng.random() < 0.4
+    roof, pitched = pick_colour(rng, FLAT_ROOFS), rng.random() < 0.4
     half_deep, gap = float(rng.uniform(5.5, 7.5)), float(rng.uniform(11, 17))
-    eave, tiles = float(rng.uniform(8, 17)), pick(rng, plot.roofs)
+    eave, tiles = float(rng.uniform(8, 17)), pick_colour(rng, plot.roofs)
     rows = max(1, int((b.size_q + gap) // (2 * half_deep + gap)))
     for row in range(rows):
         q = b.q0 + (row + 0.5) * b.size_q / rows
@@ -36,7 +36,7 @@ def slabs(plot: Plot) -> None:
             x, y, angle = plot.at(p, q)
             raise_part(
                 plot.canvas,
-                Part(
+                BuildingPart(
                     x=x,
                     y=y,
                     angle=angle,
@@ -51,18 +51,18 @@ def slabs(plot: Plot) -> None:
             plot.flat_building(p, q, hp, half_deep, eave, roof)
         if row and rng.random() < 0.5:
             x, y, angle = plot.at(p, q - half_deep - gap / 2)
-            grounds.car_park(plot.canvas, rng, x, y, angle, hp * 0.8, min(4.4, gap / 2 - 1))
+            grounds.draw_car_park(plot.canvas, rng, x, y, angle, hp * 0.8, min(4.4, gap / 2 - 1))
     plot.plant(0.8)
 
 
-def shops(plot: Plot) -> None:
+def fill_shops(plot: Plot) -> None:
     """One or two low boxes with their car park."""
     b, rng = plot.block.inset(3), plot.rng
     split = float(rng.uniform(0.38, 0.6))
     mid_q = b.q0 + b.size_q * split
     p_mid = (b.p0 + b.p1) / 2
     x, y, angle = plot.at(p_mid, (mid_q + b.q1) / 2)
-    grounds.car_park(plot.canvas, rng, x, y, angle, b.size_p / 2, (b.q1 - mid_q) / 2)
+    grounds.draw_car_park(plot.canvas, rng, x, y, angle, b.size_p / 2, (b.q1 - mid_q) / 2)
     count = int(rng.integers(1, 4))
     edges = np.linspace(b.p0, b.p1, count + 1)
     for low, high in pairwise(edges):
@@ -73,42 +73,42 @@ def shops(plot: Plot) -> None:
             float(high - low) / 2 - float(rng.uniform(0, 2.5)),
             depth / 2,
             float(rng.uniform(5, 9)),
-            pick(rng, FLAT_ROOFS),
+            pick_colour(rng, FLAT_ROOFS),
         )
     plot.plant(0.25)
 
 
-def parking(plot: Plot) -> None:
+def fill_parking(plot: Plot) -> None:
     """A car park."""
     b = plot.block.inset(2)
     x, y, angle = plot.at((b.p0 + b.p1) / 2, (b.q0 + b.q1) / 2)
     turn = plot.rng.random() < 0.5
     half = (b.size_q / 2, b.size_p / 2) if turn else (b.size_p / 2, b.size_q / 2)
-    grounds.car_park(plot.canvas, plot.rng, x, y, angle + (pi / 2 if turn else 0), *half)
+    grounds.draw_car_park(plot.canvas, plot.rng, x, y, angle + (pi / 2 if turn else 0), *half)
     plot.plant(0.2)
 
 
-def park(plot: Plot) -> None:
+def fill_park(plot: Plot) -> None:
     """Lawn, winding paths, perhaps a pond, and trees."""
     b, rng = plot.block, plot.rng
     if rng.random() < 0.5:
         x, y = plot.spot(12)
-        grounds.water(plot.canvas, rng, x, y, float(rng.uniform(0, pi)), float(rng.uniform(8, 20)),
+        grounds.draw_water(plot.canvas, rng, x, y, float(rng.uniform(0, pi)), float(rng.uniform(8, 20)),
                       float(rng.uniform(6, 13)))  # fmt: skip
-    gravel = pick(rng, PAVING)
+    gravel = pick_colour(rng, PAVING)
     for _ in range(int(rng.integers(2, 5))):
         start, end, via = plot.spot(0), plot.spot(0), plot.spot(6)
         bend = [((1 - t) ** 2 * start[0] + 2 * t * (1 - t) * via[0] + t * t * end[0],
                  (1 - t) ** 2 * start[1] + 2 * t * (1 - t) * via[1] + t * t * end[1])
                 for t in np.linspace(0, 1, 9)]  # fmt: skip
-        grounds.path(plot.canvas, bend, float(rng.uniform(1.6, 3.0)), gravel)
+        grounds.draw_path(plot.canvas, bend, float(rng.uniform(1.6, 3.0)), gravel)
     plot.plant(float(rng.uniform(0.8, 2.2)), radius=(2.2, 5.4))
     if rng.random() < 0.3 and b.size_p > 30:
         x, y = plot.spot(10)
         plot.canvas.disc(x, y, float(rng.uniform(4, 8)), gravel, cover=PAVED)
 
 
-def sports(plot: Plot) -> None:
+def fill_sports(plot: Plot) -> None:
     """A pitch, tennis courts or a baseball diamond, as the block allows."""
     b, rng = plot.block.inset(4), plot.rng
     p, q = (b.p0 + b.p1) / 2, (b.q0 + b.q1) / 2
@@ -118,9 +118,9 @@ def sports(plot: Plot) -> None:
     long, short = max(b.size_p, b.size_q) / 2, min(b.size_p, b.size_q) / 2
     cut = rng.random()
     if cut < 0.5 and short > 16:
-        grounds.pitch(plot.canvas, rng, x, y, angle, min(long, 54), min(short, 36))
+        grounds.draw_pitch(plot.canvas, rng, x, y, angle, min(long, 54), min(short, 36))
     elif cut < 0.7 and short > 20:
-        grounds.diamond(
+        grounds.draw_diamond(
             plot.canvas,
             rng,
             x,
@@ -129,14 +129,14 @@ def sports(plot: Plot) -> None:
             min(short, 42),
         )
     else:
-        grounds.courts(plot.canvas, rng, x, y, angle, min(long, 38), min(short, 19))
+        grounds.draw_courts(plot.canvas, rng, x, y, angle, min(long, 38), min(short, 19))
     plot.plant(0.5)
 
 
-def sheds(plot: Plot) -> None:
+def fill_sheds(plot: Plot) -> None:
     """Metal halls, tanks and yards on concrete or bare earth."""
     b, rng = plot.block.inset(3), plot.rng
-    ground = pick(rng, EARTH) if rng.random() < 0.5 else pick(rng, ASPHALT)
+    ground = pick_colour(rng, EARTH) if rng.random() < 0.5 else pick_colour(rng, ASPHALT)
     plot.box((b.p0 + b.p1) / 2, (b.q0 + b.q1) / 2, b.size_p / 2, b.size_q / 2, ground, cover=PAVED)
     columns, rows = max(1, int(b.size_p // 34)), max(1, int(b.size_q // 28))
     for i in range(columns):
@@ -146,10 +146,10 @@ def sheds(plot: Plot) -> None:
             cut = rng.random()
             if cut < 0.25:
                 radius = min(hp, hq) * float(rng.uniform(0.5, 0.85))
-                tank = Roof(kind="dome", colour=pick(rng, METAL_ROOFS), rise_m=1.2)
+                tank = Roof(kind="dome", colour=pick_colour(rng, METAL_ROOFS), rise_m=1.2)
                 raise_part(
                     plot.canvas,
-                    Part(
+                    BuildingPart(
                         x=x,
                         y=y,
                         angle=angle,
@@ -166,13 +166,13 @@ def sheds(plot: Plot) -> None:
                 kind = rng.random()
                 roof = Roof(
                     kind="gable" if kind < 0.5 else "sawtooth" if kind < 0.75 else "barrel",
-                    colour=pick(rng, METAL_ROOFS),
+                    colour=pick_colour(rng, METAL_ROOFS),
                     rise_m=min(3.0, min(hu, hv) * 0.3),
                     seam_m=1.8,
                 )
                 raise_part(
                     plot.canvas,
-                    Part(
+                    BuildingPart(
                         x=x,
                         y=y,
                         angle=angle,
@@ -185,15 +185,15 @@ def sheds(plot: Plot) -> None:
                 )
     for _ in range(int(rng.integers(3, 12))):
         x, y = plot.spot(6)
-        grounds.car(plot.canvas, rng, x, y, float(rng.uniform(0, pi)))
+        grounds.draw_car(plot.canvas, rng, x, y, float(rng.uniform(0, pi)))
 
 
-def woods(plot: Plot) -> None:
+def fill_woods(plot: Plot) -> None:
     """Trees, close together, with a clearing or two."""
     plot.plant(min(5.0, 1.6 / max(0.2, plot.tree_density)), radius=(2.4, 5.0))
 
 
-def old_centre(plot: Plot) -> None:
+def fill_old_centre(plot: Plot) -> None:
     """Narrow houses wall to wall around courtyards."""
     b, rng = plot.block.inset(1), plot.rng
     plot.box(
@@ -201,7 +201,7 @@ def old_centre(plot: Plot) -> None:
         (b.q0 + b.q1) / 2,
         b.size_p / 2,
         b.size_q / 2,
-        pick(rng, PAVING),
+        pick_colour(rng, PAVING),
         cover=PAVED,
     )
     deep = float(rng.uniform(9, 13))
@@ -224,13 +224,13 @@ def old_centre(plot: Plot) -> None:
                 # Ridges follow the street: give the long side to it.
                 roof = Roof(
                     kind="gable",
-                    colour=pick(rng, plot.roofs, spread=9),
+                    colour=pick_colour(rng, plot.roofs, spread=9),
                     rise_m=min(hu, hv) * 0.6,
                     seam_m=0.9,
                 )
                 raise_part(
                     plot.canvas,
-                    Part(
+                    BuildingPart(
                         x=x,
                         y=y,
                         angle=angle,
@@ -243,7 +243,7 @@ def old_centre(plot: Plot) -> None:
                 )
             else:
                 hp, hq = (wide / 2, depth) if along_p else (depth, wide / 2)
-                plot.flat_building(p, q, hp, hq, eave, pick(rng, FLAT_ROOFS))
+                plot.flat_building(p, q, hp, hq, eave, pick_colour(rng, FLAT_ROOFS))
     inner = b.inset(deep + 2)
     if inner.size_p > 10 and inner.size_q > 10:
         plot.box(
@@ -259,13 +259,13 @@ def old_centre(plot: Plot) -> None:
 
 
 FILLERS: dict[str, Callable[[Plot], None]] = {
-    "houses": houses,
-    "slabs": slabs,
-    "shops": shops,
-    "parking": parking,
-    "park": park,
-    "sports": sports,
-    "sheds": sheds,
-    "woods": woods,
-    "old centre": old_centre,
+    "houses": fill_houses,
+    "slabs": fill_slabs,
+    "shops": fill_shops,
+    "parking": fill_parking,
+    "park": fill_park,
+    "sports": fill_sports,
+    "sheds": fill_sheds,
+    "woods": fill_woods,
+    "old centre": fill_old_centre,
 }

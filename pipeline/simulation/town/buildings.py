@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.simulation.canvas import BUILDING, Canvas, Colour, Stamp
-from pipeline.simulation.palette import pick, shade
+from pipeline.simulation.palette import pick_colour, scale_brightness
 from pipeline.simulation.world import Facade, FloatMap
 
 RoofKind = Literal["flat", "gable", "hip", "barrel", "sawtooth", "dome"]
@@ -32,7 +32,7 @@ class Roof:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Part:
+class BuildingPart:
     """A box, or an ellipse, of a building: centre (x, y), u axis at `angle`, half sizes, height of
     the eaves.
     """
@@ -57,13 +57,13 @@ def add_facade(canvas: Canvas, facade: Facade) -> int:
     return 1 + len(canvas.facades) // 2
 
 
-def place(part: Part, u: float, v: float) -> tuple[float, float]:
+def to_map(part: BuildingPart, u: float, v: float) -> tuple[float, float]:
     """World coordinates of a point in the part's own frame."""
     c, s = cos(part.angle), sin(part.angle)
     return part.x + c * u - s * v, part.y + s * u + c * v
 
 
-def raise_part(canvas: Canvas, part: Part) -> None:
+def raise_part(canvas: Canvas, part: BuildingPart) -> None:
     """Build the part wherever it is higher than what is there."""
     stamp = canvas.stamp(part.x, part.y, part.angle, part.half_u, part.half_v)
     if stamp is None:
@@ -90,7 +90,7 @@ def raise_part(canvas: Canvas, part: Part) -> None:
     canvas.facing_HW[at][built] = facing[built]
 
 
-def _roof_heights(part: Part, stamp: Stamp, inside: FloatMap) -> FloatMap:
+def _roof_heights(part: BuildingPart, stamp: Stamp, inside: FloatMap) -> FloatMap:
     """Height of the roof over the window, metres; ridges run along the longer side."""
     roof, eave = part.roof, np.float32(part.eave_m)
     long, short = (
@@ -117,7 +117,7 @@ def _roof_heights(part: Part, stamp: Stamp, inside: FloatMap) -> FloatMap:
     return heights
 
 
-def _roof_colours(canvas: Canvas, part: Part, stamp: Stamp, inside: FloatMap) -> FloatMap:
+def _roof_colours(canvas: Canvas, part: BuildingPart, stamp: Stamp, inside: FloatMap) -> FloatMap:
     """Colours of the roof over the window (h, w, 3): seams, stains, ridges and rims."""
     roof = part.roof
     at = (stamp.rows, stamp.cols)
@@ -150,7 +150,7 @@ def _roof_colours(canvas: Canvas, part: Part, stamp: Stamp, inside: FloatMap) ->
     return colours
 
 
-def _walls(part: Part, stamp: Stamp, nearest_is_u: np.ndarray) -> tuple[FloatMap, FloatMap]:
+def _walls(part: BuildingPart, stamp: Stamp, nearest_is_u: np.ndarray) -> tuple[FloatMap, FloatMap]:
     """Metres along the nearest wall, and the compass direction in radians that it faces."""
     if part.round:
         turn = np.arctan2(stamp.v_hw, stamp.u_hw)
@@ -172,7 +172,7 @@ def _compass(turn: np.ndarray) -> FloatMap:
 
 
 def furnish_flat_roof(
-    canvas: Canvas, part: Part, rng: np.random.Generator, *, richness: float = 1.0
+    canvas: Canvas, part: BuildingPart, rng: np.random.Generator, *, richness: float = 1.0
 ) -> None:
     """Stand machines, skylights, a stair house, vents, walkways or solar panels on a flat roof."""
     half_u, half_v = part.half_u - 2.0, part.half_v - 2.0
@@ -185,10 +185,10 @@ def furnish_flat_roof(
     )
 
     def stand(u: float, v: float, hu: float, hv: float, rise: float, colour: Colour) -> None:
-        x, y = place(part, u, v)
+        x, y = to_map(part, u, v)
         raise_part(
             canvas,
-            Part(
+            BuildingPart(
                 x=x,
                 y=y,
                 angle=part.angle,
@@ -214,7 +214,7 @@ def furnish_flat_roof(
             for u in np.arange(-half_u + 1, half_u - 1, step):
                 stand(float(u), v, step * 0.28, min(1.1, half_v * 0.5), 0.5, (206, 218, 222))
     elif look < 0.58 and area > 250:  # a roof garden
-        x, y = place(part, 0, 0)
+        x, y = to_map(part, 0, 0)
         canvas.box(
             x, y, part.angle, half_u * 0.85, half_v * 0.8, (104, 118, 74), cover=BUILDING, grass=0.8
         )
@@ -222,7 +222,7 @@ def furnish_flat_roof(
         size_u, size_v = rng.uniform(0.6, 2.2), rng.uniform(0.6, 1.6)
         u, v = rng.uniform(-1, 1) * (half_u - size_u), rng.uniform(-1, 1) * (half_v - size_v)
         stand(float(u), float(v), float(size_u), float(size_v), float(rng.uniform(0.8, 2.2)),
-              shade((190, 190, 188), float(rng.uniform(0.6, 1.2))))  # fmt: skip
+              scale_brightness((190, 190, 188), float(rng.uniform(0.6, 1.2))))  # fmt: skip
     if area > 300 and rng.random() < 0.75:  # the stair house, and the lifts
         u, v = rng.uniform(-0.6, 0.6) * half_u, rng.uniform(-0.6, 0.6) * half_v
         stand(
@@ -231,5 +231,5 @@ def furnish_flat_roof(
             float(rng.uniform(2.0, 4.5)),
             float(rng.uniform(1.8, 3.2)),
             3.2,
-            pick(rng, (part.roof.colour,), spread=16),
+            pick_colour(rng, (part.roof.colour,), spread=16),
         )

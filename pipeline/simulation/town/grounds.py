@@ -10,13 +10,13 @@ from math import cos, hypot, pi, sin
 import numpy as np
 
 from pipeline.simulation.canvas import GROUND, PAVED, ROAD, WATER, Canvas, Colour
-from pipeline.simulation.palette import ASPHALT, CARS, COURTS, EARTH, pick, shade
-from pipeline.simulation.palette import WATER as WATERS
+from pipeline.simulation.palette import ASPHALT, CARS, COURTS, EARTH, pick_colour, scale_brightness
+from pipeline.simulation.palette import WATER_COLOURS as WATERS
 
 WHITE: Colour = (222, 222, 214)
 
 
-def tree(
+def draw_tree(
     canvas: Canvas, rng: np.random.Generator, x: float, y: float, radius: float, colour: Colour
 ) -> None:
     """A crown of lumpy height over whatever is lower; leaves turn and fall unless it is a conifer."""
@@ -33,7 +33,11 @@ def tree(
     grown = (reach < 1) & (top > canvas.height_HW[at])
     canvas.height_HW[at][grown] = top[grown]
     tone = (0.82 + 0.24 * crown + 0.24 * lumps)[..., None].astype(np.float32)
-    leaf = shade(colour, 0.78) if conifer else shade(colour, float(rng.uniform(0.85, 1.15)))
+    leaf = (
+        scale_brightness(colour, 0.78)
+        if conifer
+        else scale_brightness(colour, float(rng.uniform(0.85, 1.15)))
+    )
     canvas.colour_HW3[at][grown] = (tone * np.asarray(leaf, np.float32))[grown]
     canvas.grass_HW[at][grown] = 0
     canvas.trees_HW[at][grown] = 0.08 if conifer else float(rng.uniform(0.75, 1.0))
@@ -53,16 +57,16 @@ def scatter_trees(
     for x, y in spots:
         r = float(rng.uniform(*radius))
         if canvas.covered_by(x, y) in on:
-            tree(canvas, rng, x, y, r, colour)
+            draw_tree(canvas, rng, x, y, r, colour)
 
 
-def car(canvas: Canvas, rng: np.random.Generator, x: float, y: float, angle: float) -> None:
+def draw_car(canvas: Canvas, rng: np.random.Generator, x: float, y: float, angle: float) -> None:
     """A car, van or truck whose long side is along `angle`; never on what is not road or paving."""
     size = rng.random()
     half_u, half_v, rise = (
         (2.2, 0.95, 1.3) if size < 0.85 else (2.7, 1.05, 2.0) if size < 0.97 else (4.6, 1.25, 3.0)
     )
-    colour = pick(rng, CARS, spread=5)
+    colour = pick_colour(rng, CARS, spread=5)
     if canvas.covered_by(x, y) not in (ROAD, PAVED):
         return
     stamp = canvas.stamp(x, y, angle, half_u, half_v)
@@ -79,7 +83,7 @@ def car(canvas: Canvas, rng: np.random.Generator, x: float, y: float, angle: flo
     )[body]
 
 
-def car_park(
+def draw_car_park(
     canvas: Canvas,
     rng: np.random.Generator,
     x: float,
@@ -90,7 +94,7 @@ def car_park(
 ) -> None:
     """Asphalt with rows of bays along u, more or less full, perhaps with trees between the rows."""
     canvas.box(
-        x, y, angle, half_u, half_v, pick(rng, ASPHALT, spread=10), cover=PAVED, corner_m=1.5
+        x, y, angle, half_u, half_v, pick_colour(rng, ASPHALT, spread=10), cover=PAVED, corner_m=1.5
     )
     fullness, bay = float(rng.beta(2, 2)), 2.7
     c, s = cos(angle), sin(angle)
@@ -120,7 +124,7 @@ def car_park(
             if rng.random() < fullness:
                 jitter = rng.normal(0, 0.15, 2)
                 at_u, at_v = float(u + jitter[0]), float(v + jitter[1])
-                car(
+                draw_car(
                     canvas,
                     rng,
                     x + c * at_u - s * at_v,
@@ -129,7 +133,7 @@ def car_park(
                 )
 
 
-def path(
+def draw_path(
     canvas: Canvas,
     points: list[tuple[float, float]],
     width: float,
@@ -152,7 +156,7 @@ def path(
         )
 
 
-def pitch(
+def draw_pitch(
     canvas: Canvas,
     rng: np.random.Generator,
     x: float,
@@ -186,7 +190,9 @@ def pitch(
     if stamp is not None:
         inside = np.minimum(half_u - np.abs(stamp.u_hw), half_v - np.abs(stamp.v_hw))
         stripes = 1 + 0.045 * np.where(np.mod(stamp.u_hw, 11) < 5.5, 1, -1)[..., None]
-        turf = np.asarray(pick(rng, ((94, 124, 66), (84, 116, 64), (104, 126, 74))), np.float32)
+        turf = np.asarray(
+            pick_colour(rng, ((94, 124, 66), (84, 116, 64), (104, 126, 74))), np.float32
+        )
         canvas.paint(stamp, canvas.coverage(inside), stripes * turf, cover=PAVED, grass=0.85)
     _outline(canvas, x, y, angle, half_u - 1.5, half_v - 1.5, 0.0)
     canvas.box(x, y, angle, 0.14, half_v - 1.5, WHITE, opacity=0.8)
@@ -211,7 +217,7 @@ def _outline(
     canvas.paint(stamp, canvas.coverage(np.float32(0.14) - np.abs(edge)) * np.float32(0.85), WHITE)
 
 
-def courts(
+def draw_courts(
     canvas: Canvas,
     rng: np.random.Generator,
     x: float,
@@ -234,14 +240,14 @@ def courts(
             canvas.box(cx, cy, angle, hu + 0.6, hv + 0.6, inner)
             _outline(canvas, cx, cy, angle, hu, hv, 0.0)
             _outline(canvas, cx, cy, angle, hu * 0.75, hv * 0.54, 0.0)
-            canvas.box(cx, cy, angle, hu, 0.2, shade(outer, 0.6))
+            canvas.box(cx, cy, angle, hu, 0.2, scale_brightness(outer, 0.6))
 
 
-def diamond(
+def draw_diamond(
     canvas: Canvas, rng: np.random.Generator, x: float, y: float, angle: float, radius: float
 ) -> None:
     """A baseball diamond: infield, bases, mound, mown outfield."""
-    earth = pick(rng, EARTH)
+    earth = pick_colour(rng, EARTH)
     c, s = cos(angle), sin(angle)
     canvas.disc(x, y, radius, (98, 122, 68), grass=0.9, cover=PAVED)
     home_x, home_y = x - c * radius * 0.55, y - s * radius * 0.55
@@ -260,7 +266,7 @@ def diamond(
     canvas.disc(home_x + c * side * 1.5, home_y + s * side * 1.5, radius * 0.06, earth)
 
 
-def water(canvas: Canvas, rng: np.random.Generator, x: float, y: float, angle: float, half_u: float, half_v: float,
+def draw_water(canvas: Canvas, rng: np.random.Generator, x: float, y: float, angle: float, half_u: float, half_v: float,
           *, wobble: float = 0.25) -> None:  # fmt: skip
     """A pond with a wandering shore and a darker middle."""
     stamp = canvas.stamp(x, y, angle, half_u * 1.3, half_v * 1.3)
@@ -274,13 +280,13 @@ def water(canvas: Canvas, rng: np.random.Generator, x: float, y: float, angle: f
     inside = (shore - np.hypot(stamp.u_hw / half_u, stamp.v_hw / half_v)) * np.float32(
         min(half_u, half_v)
     )
-    colour = np.asarray(pick(rng, WATERS), np.float32)
+    colour = np.asarray(pick_colour(rng, WATERS), np.float32)
     deep = (1.12 - 0.12 * np.clip(inside / 4, 0, 1) + 0.02 * canvas.lumps_HW[at])[..., None]
     canvas.paint(stamp, canvas.coverage(inside + 1.2), (142, 132, 104), grass=0.4)
     canvas.paint(stamp, canvas.coverage(inside), (deep * colour).astype(np.float32), cover=WATER)
 
 
-def pool(canvas: Canvas, rng: np.random.Generator, x: float, y: float, angle: float) -> None:
+def draw_pool(canvas: Canvas, rng: np.random.Generator, x: float, y: float, angle: float) -> None:
     """A swimming pool in its terrace."""
     hu, hv = float(rng.uniform(2.6, 5)), float(rng.uniform(1.6, 2.6))
     canvas.box(x, y, angle, hu + 1.4, hv + 1.4, (190, 182, 166), cover=PAVED, corner_m=0.8)

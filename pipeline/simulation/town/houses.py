@@ -3,13 +3,13 @@
 from math import cos, pi, sin
 
 from pipeline.simulation.canvas import PAVED, Colour
-from pipeline.simulation.palette import PAVING, pick
+from pipeline.simulation.palette import PAVING, pick_colour
 from pipeline.simulation.town import grounds
-from pipeline.simulation.town.buildings import Part, Roof, raise_part
+from pipeline.simulation.town.buildings import BuildingPart, Roof, raise_part
 from pipeline.simulation.town.plot import Plot
 
 
-def houses(plot: Plot) -> None:
+def fill_houses(plot: Plot) -> None:
     """Lots along the block's long sides, each with a house, a drive, a yard, perhaps a pool or a
     shed.
     """
@@ -19,7 +19,7 @@ def houses(plot: Plot) -> None:
     rows = 2 if depth > 34 else 1
     lot = float(rng.uniform(13, 21))
     setback = float(rng.uniform(5, 8))
-    drive = pick(rng, PAVING)
+    drive = pick_colour(rng, PAVING)
     for row in range(rows):
         side = -1 if row == 0 else 1
         for k in range(int(length // lot)):
@@ -45,7 +45,7 @@ def houses(plot: Plot) -> None:
                         else (p - side * (half_d + 6), where + b.q0 / 2 + b.q1 / 2)
                     )
                 )[:2]
-                grounds.pool(plot.canvas, rng, px, py, angle)
+                grounds.draw_pool(plot.canvas, rng, px, py, angle)
     plot.plant(1.0)
 
 
@@ -58,12 +58,12 @@ def _drive(plot: Plot, x: float, y: float, angle: float, half_w: float, half_d: 
     bx, by = x + c * u - s * side * reach, y + s * u + c * side * reach
     plot.canvas.box(bx, by, angle, 1.7, setback / 2 + 1.5, colour, cover=PAVED)
     if plot.rng.random() < 0.5:
-        grounds.car(plot.canvas, plot.rng, bx, by, angle + pi / 2)
+        grounds.draw_car(plot.canvas, plot.rng, bx, by, angle + pi / 2)
 
 
 def _house(plot: Plot, x: float, y: float, angle: float, half_w: float, half_d: float) -> None:
     rng = plot.rng
-    colour = pick(rng, plot.roofs, spread=9)
+    colour = pick_colour(rng, plot.roofs, spread=9)
     eave = float(rng.choice([3.0, 5.6], p=[0.6, 0.4])) + float(rng.uniform(0, 0.5))
     kind = "hip" if rng.random() < 0.45 else "gable"
     walls = int(rng.choice(plot.house_walls))
@@ -77,7 +77,7 @@ def _house(plot: Plot, x: float, y: float, angle: float, half_w: float, half_d: 
                     rise_m=min(hu, hv) * float(rng.uniform(0.45, 0.65)), seam_m=0.9)  # fmt: skip
         raise_part(
             plot.canvas,
-            Part(
+            BuildingPart(
                 x=x + c * u - s * v,
                 y=y + s * u + c * v,
                 angle=angle,

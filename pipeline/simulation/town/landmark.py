@@ -11,8 +11,21 @@ from math import cos, pi, sin
 import numpy as np
 
 from pipeline.simulation.canvas import Canvas, Colour
-from pipeline.simulation.palette import FLAT_ROOFS, METAL_ROOFS, PITCHED_ROOFS, facade, pick, shade
-from pipeline.simulation.town.buildings import Part, Roof, add_facade, furnish_flat_roof, raise_part
+from pipeline.simulation.palette import (
+    FLAT_ROOFS,
+    METAL_ROOFS,
+    PITCHED_ROOFS,
+    pick_colour,
+    random_facade,
+    scale_brightness,
+)
+from pipeline.simulation.town.buildings import (
+    BuildingPart,
+    Roof,
+    add_facade,
+    furnish_flat_roof,
+    raise_part,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +41,7 @@ class Wing:
     round: bool = False
 
 
-def footprint(rng: np.random.Generator) -> list[Wing]:
+def random_footprint(rng: np.random.Generator) -> list[Wing]:
     """Wings of one of a dozen families, in random proportions, perhaps mirrored."""
     t, s = float(rng.uniform(0.16, 0.30)), float(rng.uniform(0.6, 1.0))
     high = rng.uniform(0.55, 1.15, 8)
@@ -141,26 +154,28 @@ def footprint(rng: np.random.Generator) -> list[Wing]:
     return wings
 
 
-def build(canvas: Canvas, rng: np.random.Generator, *, angle: float, radius_m: float) -> None:
+def build_landmark(
+    canvas: Canvas, rng: np.random.Generator, *, angle: float, radius_m: float
+) -> None:
     """Raise the building around (0, 0), its longer axis at `angle`."""
     storeys = float(rng.uniform(8.0, 22.0))
-    walls = add_facade(canvas, facade(rng, kind="block"))
-    second = add_facade(canvas, facade(rng, kind="block"))
-    main, other = _skin(rng), _skin(rng)
+    walls = add_facade(canvas, random_facade(rng, kind="block"))
+    second = add_facade(canvas, random_facade(rng, kind="block"))
+    main, other = _random_roof_material(rng), _random_roof_material(rng)
     mixed = rng.random() < 0.45
     flip = -1.0 if rng.random() < 0.5 else 1.0
     scale = radius_m * 0.94
-    for index, wing in enumerate(sorted(footprint(rng), key=lambda w: -w.hu * w.hv)):
+    for index, wing in enumerate(sorted(random_footprint(rng), key=lambda w: -w.hu * w.hv)):
         skin = other if mixed and index % 2 else main
         c, s = cos(angle), sin(angle)
         u, v = wing.u * scale, wing.v * scale * flip
         hu, hv = wing.hu * scale, wing.hv * scale
         short = min(hu, hv)
-        roof = _roof(rng, skin, short=short, round_=wing.round)
+        roof = _random_roof(rng, skin, short=short, round_=wing.round)
         eave = max(4.0, storeys * wing.high) * (
             0.75 if roof.kind in ("barrel", "dome", "sawtooth") else 1.0
         )
-        part = Part(
+        part = BuildingPart(
             x=c * u - s * v,
             y=s * u + c * v,
             angle=angle + wing.turn * flip,
@@ -175,39 +190,43 @@ def build(canvas: Canvas, rng: np.random.Generator, *, angle: float, radius_m: f
         if roof.kind == "flat":
             furnish_flat_roof(canvas, part, rng)
         if wing.round and roof.kind == "flat":
-            lantern = Part(
+            lantern = BuildingPart(
                 x=part.x,
                 y=part.y,
                 angle=part.angle,
                 half_u=hu * 0.45,
                 half_v=hv * 0.45,
                 eave_m=eave + 2.5,
-                roof=Roof(kind="dome", colour=pick(rng, METAL_ROOFS), rise_m=hv * 0.3),
+                roof=Roof(kind="dome", colour=pick_colour(rng, METAL_ROOFS), rise_m=hv * 0.3),
                 facade=second,
                 round=True,
             )
             raise_part(canvas, lantern)
 
 
-Skin = tuple[str, Colour]
+RoofMaterial = tuple[str, Colour]
 
 
-def _skin(rng: np.random.Generator) -> Skin:
+def _random_roof_material(rng: np.random.Generator) -> RoofMaterial:
     """What a roof is made of: ("flat" | "pitched" | "metal", colour)."""
     cut = rng.random()
     if cut < 0.62:
-        return "flat", pick(rng, FLAT_ROOFS)
+        return "flat", pick_colour(rng, FLAT_ROOFS)
     if cut < 0.87:
-        return "pitched", pick(rng, PITCHED_ROOFS)
-    return "metal", pick(rng, METAL_ROOFS)
+        return "pitched", pick_colour(rng, PITCHED_ROOFS)
+    return "metal", pick_colour(rng, METAL_ROOFS)
 
 
-def _roof(rng: np.random.Generator, skin: Skin, *, short: float, round_: bool) -> Roof:
+def _random_roof(
+    rng: np.random.Generator, skin: RoofMaterial, *, short: float, round_: bool
+) -> Roof:
     kind, colour = skin
     cut = rng.random()
     if round_:
         if kind == "flat" and cut < 0.6:
-            return Roof(kind="flat", colour=colour, seam_m=5.0, parapet=shade(colour, 1.12))
+            return Roof(
+                kind="flat", colour=colour, seam_m=5.0, parapet=scale_brightness(colour, 1.12)
+            )
         return Roof(
             kind="dome", colour=colour, rise_m=short * float(rng.uniform(0.25, 0.5)), seam_m=1.6
         )
@@ -230,5 +249,5 @@ def _roof(rng: np.random.Generator, skin: Skin, *, short: float, round_: bool) -
         kind="flat",
         colour=colour,
         seam_m=float(rng.choice([0.0, 4.0, 7.0])),
-        parapet=shade(colour, float(rng.uniform(0.8, 1.25))),
+        parapet=scale_brightness(colour, float(rng.uniform(0.8, 1.25))),
     )

@@ -7,9 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.simulation.canvas import Canvas, Colour
-from pipeline.simulation.palette import PITCHED_ROOFS, facade, pick, shade
+from pipeline.simulation.palette import PITCHED_ROOFS, pick_colour, random_facade, scale_brightness
 from pipeline.simulation.town import grounds
-from pipeline.simulation.town.buildings import Part, Roof, add_facade, furnish_flat_roof, raise_part
+from pipeline.simulation.town.buildings import (
+    BuildingPart,
+    Roof,
+    add_facade,
+    furnish_flat_roof,
+    raise_part,
+)
 from pipeline.simulation.town.streets import Block, StreetGrid
 
 
@@ -70,19 +76,19 @@ class Plot:
     ) -> None:
         x, y, angle = self.at(p, q)
         rng = self.rng
-        part = Part(x=x, y=y, angle=angle, half_u=hp, half_v=hq, eave_m=eave,
+        part = BuildingPart(x=x, y=y, angle=angle, half_u=hp, half_v=hq, eave_m=eave,
                     roof=Roof(kind="flat", colour=colour, seam_m=float(rng.choice([0.0, 5.0])),
-                              parapet=shade(colour, float(rng.uniform(0.85, 1.2)))),
+                              parapet=scale_brightness(colour, float(rng.uniform(0.85, 1.2)))),
                     facade=int(rng.choice(self.block_walls)))  # fmt: skip
         raise_part(self.canvas, part)
         furnish_flat_roof(self.canvas, part, rng, richness=0.7)
 
 
-def neighbourhood(
+def neighbourhood_style(
     canvas: Canvas, rng: np.random.Generator
 ) -> tuple[tuple[Colour, ...], tuple[int, ...], tuple[int, ...]]:
     """(roof colours, house facades, block facades) that a town's plots share."""
-    roofs = tuple(pick(rng, PITCHED_ROOFS) for _ in range(int(rng.integers(2, 5))))
-    house_walls = tuple(add_facade(canvas, facade(rng, kind="house")) for _ in range(3))
-    block_walls = tuple(add_facade(canvas, facade(rng, kind="block")) for _ in range(3))
-    return roofs, house_walls, (*block_walls, add_facade(canvas, facade(rng, kind="hall")))
+    roofs = tuple(pick_colour(rng, PITCHED_ROOFS) for _ in range(int(rng.integers(2, 5))))
+    house_walls = tuple(add_facade(canvas, random_facade(rng, kind="house")) for _ in range(3))
+    block_walls = tuple(add_facade(canvas, random_facade(rng, kind="block")) for _ in range(3))
+    return roofs, house_walls, (*block_walls, add_facade(canvas, random_facade(rng, kind="hall")))

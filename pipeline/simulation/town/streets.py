@@ -14,7 +14,7 @@ from math import atan, cos, hypot, pi, sin
 import numpy as np
 
 from pipeline.simulation.canvas import PAVED, ROAD, Canvas, Colour
-from pipeline.simulation.palette import ASPHALT, PAVING, pick
+from pipeline.simulation.palette import ASPHALT, PAVING, pick_colour
 from pipeline.simulation.world import FloatMap
 
 
@@ -107,7 +107,7 @@ class StreetGrid:
         return sorted(found, key=lambda block: not block.central)
 
 
-def lay_out(rng: np.random.Generator, *, extent_m: float, central_m: float) -> StreetGrid:
+def plan_streets(rng: np.random.Generator, *, extent_m: float, central_m: float) -> StreetGrid:
     """A street grid whose central block is at least 2 * `central_m` wide; everything else is drawn
     from `rng`.
     """
@@ -118,12 +118,12 @@ def lay_out(rng: np.random.Generator, *, extent_m: float, central_m: float) -> S
         bend_m=float(rng.uniform(6, 16)) if bent else 0.0,
         bend_length_m=float(rng.uniform(38, 70)),
         bend_phase=float(rng.uniform(0, 2 * pi)),
-        avenues=_lines(rng, reach, central_m, spacing=(48, 105)),
-        crosses=_lines(rng, reach, central_m, spacing=(44, 95)),
+        avenues=_plan_lines(rng, reach, central_m, spacing=(48, 105)),
+        crosses=_plan_lines(rng, reach, central_m, spacing=(44, 95)),
     )
 
 
-def _lines(
+def _plan_lines(
     rng: np.random.Generator, reach: float, central_m: float, *, spacing: tuple[float, float]
 ) -> tuple[Street, ...]:
     low, high = -central_m - float(rng.uniform(4, 22)), central_m + float(rng.uniform(4, 22))
@@ -143,10 +143,10 @@ def _lines(
     return tuple(streets)
 
 
-def paint(canvas: Canvas, grid: StreetGrid, rng: np.random.Generator) -> None:
+def paint_streets(canvas: Canvas, grid: StreetGrid, rng: np.random.Generator) -> None:
     """Lay pavements, asphalt, markings and crossings."""
     p_HW, q_HW = grid.fields(canvas)
-    asphalt, kerb = pick(rng, ASPHALT), pick(rng, PAVING)
+    asphalt, kerb = pick_colour(rng, ASPHALT), pick_colour(rng, PAVING)
     walk_m = float(rng.choice([0.0, 1.6, 2.4], p=[0.15, 0.45, 0.4]))
     painted: Colour = (226, 224, 214)
     middle: Colour = (214, 184, 92) if rng.random() < 0.5 else painted
@@ -163,7 +163,7 @@ def paint(canvas: Canvas, grid: StreetGrid, rng: np.random.Generator) -> None:
                                 np.minimum(along_HW - np.float32(street.start - extra),
                                            np.float32(street.end + extra) - along_HW))  # fmt: skip
             np.maximum(inside_HW, inside, out=inside_HW)
-        _paint_where(canvas, inside_HW, colour, cover)
+        _paint_mask(canvas, inside_HW, colour, cover)
     mark = max(0.16, 0.30 * canvas.metres_per_pixel)
     for index, (street, across_HW, along_HW) in enumerate(lines):
         others = grid.crosses if index < len(grid.avenues) else grid.avenues
@@ -200,7 +200,7 @@ def paint(canvas: Canvas, grid: StreetGrid, rng: np.random.Generator) -> None:
         canvas.colour_HW3[rows, cols] = under + amount * (tint - under)
 
 
-def _paint_where(canvas: Canvas, inside_HW: FloatMap, colour: Colour, cover: int) -> None:
+def _paint_mask(canvas: Canvas, inside_HW: FloatMap, colour: Colour, cover: int) -> None:
     coverage_HW = canvas.coverage(inside_HW)
     canvas.colour_HW3 += coverage_HW[..., None] * (
         np.asarray(colour, np.float32) - canvas.colour_HW3

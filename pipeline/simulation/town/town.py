@@ -10,10 +10,10 @@ from math import cos, pi, sin
 import numpy as np
 
 from pipeline.simulation.canvas import GROUND, PAVED, Canvas
-from pipeline.simulation.palette import GRASS, PAVING, TREES, pick
+from pipeline.simulation.palette import GRASS, PAVING, TREES, pick_colour
 from pipeline.simulation.town import grounds, landmark, streets
 from pipeline.simulation.town.blocks import FILLERS
-from pipeline.simulation.town.plot import Plot, neighbourhood
+from pipeline.simulation.town.plot import Plot, neighbourhood_style
 from pipeline.simulation.world import World
 
 EXTENT_IN_RADII = 6.8
@@ -26,7 +26,7 @@ pixel per pixel.
 """
 
 
-def town(rng: np.random.Generator, *, frame_pixels: int = 256) -> World:
+def make_town(rng: np.random.Generator, *, frame_pixels: int = 256) -> World:
     """A town, as fine as frames of `frame_pixels` need: the same plan at every size, with finer
     paint on it.
     """
@@ -37,13 +37,13 @@ def town(rng: np.random.Generator, *, frame_pixels: int = 256) -> World:
     canvas = Canvas(
         extent_m=EXTENT_IN_RADII * radius_m,
         metres_per_pixel=metres_per_pixel,
-        ground=pick(plan, GRASS),
+        ground=pick_colour(plan, GRASS),
         rng=plan,
     )
-    grid = streets.lay_out(plan, extent_m=canvas.extent_m, central_m=radius_m * 1.08)
-    streets.paint(canvas, grid, plan)
-    roofs, house_walls, block_walls = neighbourhood(canvas, plan)
-    leaves, density = pick(plan, TREES), float(plan.gamma(3.0, 0.13))
+    grid = streets.plan_streets(plan, extent_m=canvas.extent_m, central_m=radius_m * 1.08)
+    streets.paint_streets(canvas, grid, plan)
+    roofs, house_walls, block_walls = neighbourhood_style(canvas, plan)
+    leaves, density = pick_colour(plan, TREES), float(plan.gamma(3.0, 0.13))
     # A town has a character: some fillers are common in it, some absent.
     names = list(FILLERS)
     weights = plan.dirichlet(np.asarray([2.2, 1.0, 0.9, 0.5, 0.7, 0.7, 0.6, 0.3, 0.7]) * 0.9)
@@ -66,18 +66,18 @@ def town(rng: np.random.Generator, *, frame_pixels: int = 256) -> World:
         if max(abs(x), abs(y)) > half + reach:
             continue
         if block.central:
-            _campus(plot, radius_m)
+            _build_campus(plot, radius_m)
         else:
             FILLERS[names[int(seed.choice(len(names), p=weights))]](plot)
-    _street_life(canvas, grid, plan, leaves)
+    _add_street_details(canvas, grid, plan, leaves)
     return canvas.finish(target_radius_m=radius_m, rng=grain)
 
 
-def _campus(plot: Plot, radius_m: float) -> None:
+def _build_campus(plot: Plot, radius_m: float) -> None:
     """The grounds of the building in the middle, and the building."""
     canvas, rng, b = plot.canvas, plot.rng, plot.block
     x, y, angle = plot.at(0, 0)
-    paving = pick(rng, PAVING)
+    paving = pick_colour(rng, PAVING)
     if rng.random() < 0.35:  # a plaza instead of a lawn
         canvas.box(
             x,
@@ -97,7 +97,7 @@ def _campus(plot: Plot, radius_m: float) -> None:
         )
         reach = radius_m * 1.6
         away = float(rng.uniform(-0.4, 0.4)) * radius_m
-        grounds.path(
+        grounds.draw_path(
             canvas,
             [
                 (x - sin(turn) * away, y + cos(turn) * away),
@@ -114,21 +114,21 @@ def _campus(plot: Plot, radius_m: float) -> None:
         room = abs(edge) - radius_m * 0.8
         if room > 9 and rng.random() < 0.5:
             px, py, turn = plot.at(0, edge - side * room / 2)
-            grounds.car_park(
+            grounds.draw_car_park(
                 canvas, rng, px, py, turn, b.size_p / 2 * float(rng.uniform(0.4, 0.9)), room / 2 - 1
             )
     if rng.random() < 0.25:
         px, py = plot.spot(14)
-        grounds.water(canvas, rng, px, py, float(rng.uniform(0, pi)), float(rng.uniform(6, 12)),
+        grounds.draw_water(canvas, rng, px, py, float(rng.uniform(0, pi)), float(rng.uniform(6, 12)),
                       float(rng.uniform(4, 8)))  # fmt: skip
     skew = float(rng.choice([0.0, 0.0, 0.0, pi / 4])) + float(rng.normal(0, 0.04))
-    landmark.build(
+    landmark.build_landmark(
         canvas, rng, angle=angle + skew + float(rng.choice([0, pi / 2])), radius_m=radius_m
     )
     plot.plant(1.2)
 
 
-def _street_life(canvas: Canvas, grid: streets.StreetGrid, rng: np.random.Generator, leaves: tuple[float, float, float],
+def _add_street_details(canvas: Canvas, grid: streets.StreetGrid, rng: np.random.Generator, leaves: tuple[float, float, float],
                  ) -> None:  # fmt: skip
     """Cars on the roads and along the kerbs, trees in rows beside them."""
     half = canvas.extent_m / 2
@@ -149,9 +149,9 @@ def _street_life(canvas: Canvas, grid: streets.StreetGrid, rng: np.random.Genera
             for side in (-1, 1):
                 lane = side * street.width / 4
                 if draws[0 if side < 0 else 1] < busy:
-                    grounds.car(canvas, rng, *at(lane))
+                    grounds.draw_car(canvas, rng, *at(lane))
                 elif draws[2 if side < 0 else 3] < parked and street.width >= 8:
-                    grounds.car(canvas, rng, *at(side * (street.width / 2 - 1.2)))
+                    grounds.draw_car(canvas, rng, *at(side * (street.width / 2 - 1.2)))
                 if draws[4 if side < 0 else 5] < rows:
                     x, y, _ = at(side * (street.width / 2 + 3.4))
                     grounds.scatter_trees(

@@ -16,11 +16,11 @@ from rasterio.windows import Window as RasterWindow
 from pipeline.images.decode import Pixels
 
 PERCENTILES = (2.0, 98.0)  # of the whole mosaic: what a stretch shows from black to white
-WHOLE = (
+MAX_WHOLE_PIXELS = (
     4096  # pixels: a mosaic, or its coarsest overview, no longer than this is sampled as a whole
 )
-SAMPLED = 1024  # pixels: longer side of that sample
-GRID, PATCH = (
+SAMPLE_PIXELS = 1024  # pixels: longer side of that sample
+PATCH_GRID, PATCH_PIXELS = (
     16,
     64,
 )  # else: patches of 64 pixels, 16 by 16 of them evenly spread, at full resolution
@@ -114,7 +114,7 @@ def _percentiles(dataset: Any, bands: tuple[int, ...]) -> tuple[float, float]:
     """The stretch of a mosaic without one; wide enough to divide by, and 0..1 where it is all
     nodata.
     """
-    values = np.concatenate(list(sample(dataset, bands)))
+    values = np.concatenate(list(sample_values(dataset, bands)))
     if not len(values):
         return 0.0, 1.0
     low, high = (float(value) for value in np.percentile(values, PERCENTILES))
@@ -123,14 +123,14 @@ def _percentiles(dataset: Any, bands: tuple[int, ...]) -> tuple[float, float]:
     )
 
 
-def sample(dataset: Any, bands: tuple[int, ...]) -> Iterator[npt.NDArray[Any]]:
+def sample_values(dataset: Any, bands: tuple[int, ...]) -> Iterator[npt.NDArray[Any]]:
     """Valid values of bands, flat arrays: the mosaic thinned out, or patches of it where that would
     read it all.
     """
     width, height = dataset.width, dataset.height
     coarsest = max(dataset.overviews(bands[0]), default=1)
-    if max(width, height) <= WHOLE * coarsest:
-        scale = min(1.0, SAMPLED / max(width, height))
+    if max(width, height) <= MAX_WHOLE_PIXELS * coarsest:
+        scale = min(1.0, SAMPLE_PIXELS / max(width, height))
         wanted = [
             (
                 RasterWindow(0, 0, width, height),
@@ -139,10 +139,13 @@ def sample(dataset: Any, bands: tuple[int, ...]) -> Iterator[npt.NDArray[Any]]:
         ]
     else:
         lefts, tops = (
-            [round(spot * max(0, length - PATCH) / (GRID - 1)) for spot in range(GRID)]
+            [
+                round(spot * max(0, length - PATCH_PIXELS) / (PATCH_GRID - 1))
+                for spot in range(PATCH_GRID)
+            ]
             for length in (width, height)
         )
-        shape = (min(PATCH, height), min(PATCH, width))
+        shape = (min(PATCH_PIXELS, height), min(PATCH_PIXELS, width))
         wanted = [(RasterWindow(x, y, shape[1], shape[0]), shape) for y in tops for x in lefts]
     for window, shape in wanted:
         for band in bands:

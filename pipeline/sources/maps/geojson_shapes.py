@@ -8,23 +8,23 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-Place = tuple[float, float]
+LatLon = tuple[float, float]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
     """What a geometry says of a place; coordinates may still lie off the globe."""
 
-    middle: Place | None
+    middle: LatLon | None
     """Latitude and longitude of a point or of a polygon's centroid; None where the geometry cannot
     be read."""
-    corners: tuple[Place, ...] = ()
+    corners: tuple[LatLon, ...] = ()
     "Of a polygon with four corners, in the order of the file."
     found: str
     "What was there, for an error's sentence."
 
 
-def shape_of(geometry: Any) -> Shape | None:
+def parse_geometry(geometry: Any) -> Shape | None:
     """None where there is no geometry. A polygon's holes are left out, and it may not cross the
     180th meridian.
     """
@@ -33,10 +33,10 @@ def shape_of(geometry: Any) -> Shape | None:
     kind = geometry.get("type") if isinstance(geometry, dict) else None
     try:
         if kind == "Point":
-            place = _place(geometry["coordinates"])
+            place = _lat_lon(geometry["coordinates"])
             return Shape(middle=place, found=f"Point {place[1]}, {place[0]}")
         if kind == "Polygon":
-            ring = [_place(pair) for pair in geometry["coordinates"][0]]
+            ring = [_lat_lon(pair) for pair in geometry["coordinates"][0]]
             corners = tuple(ring[:-1] if len(ring) > 1 and ring[0] == ring[-1] else ring)
             middle = centroid(corners)
             return Shape(
@@ -49,14 +49,14 @@ def shape_of(geometry: Any) -> Shape | None:
     return Shape(middle=None, found=f"geometry of type {kind}, not Point or Polygon")
 
 
-def _place(pair: Any) -> Place:
+def _lat_lon(pair: Any) -> LatLon:
     lon, lat = pair[0], pair[1]
     if any(type(value) not in (int, float) or not math.isfinite(value) for value in (lon, lat)):
         raise ValueError
     return float(lat), float(lon)
 
 
-def centroid(corners: tuple[Place, ...]) -> Place:
+def centroid(corners: tuple[LatLon, ...]) -> LatLon:
     """Middle of a polygon's area, in the plane of latitude and longitude; of one without area, the
     mean of its corners.
 
@@ -80,7 +80,7 @@ def centroid(corners: tuple[Place, ...]) -> Place:
     return lat_0 + lat_sum / (3 * twice_area), lon_0 + lon_sum / (3 * twice_area)
 
 
-def as_footprint(corners: tuple[Place, ...], heading_deg: float) -> tuple[Place, ...]:
+def order_footprint(corners: tuple[LatLon, ...], heading_deg: float) -> tuple[LatLon, ...]:
     """Corners clockwise from the image's upper left, where the image's top looks in the direction
     `heading_deg`.
 
@@ -89,7 +89,7 @@ def as_footprint(corners: tuple[Place, ...], heading_deg: float) -> tuple[Place,
     lat_0, lon_0 = centroid(corners)
     turn = math.radians(heading_deg)
 
-    def seen(place: Place) -> Place:
+    def seen(place: LatLon) -> LatLon:
         """Right and up in the image, degrees of latitude."""
         north, east = place[0] - lat_0, (place[1] - lon_0) * math.cos(math.radians(lat_0))
         return east * math.cos(turn) - north * math.sin(turn), east * math.sin(

@@ -23,8 +23,8 @@ WGS84 = CRS.from_epsg(4326)
 EQUATOR_M, POLE_M = 6378137.0, 6356752.314245  # the ellipsoid's half axes [WGS84]
 # pixels either side of the place measured: enough against rounding, little against the map's
 # distortion
-BASELINE = 10.0
-FARTHEST = 1e12
+BASELINE_PIXELS = 10.0
+MAX_COORDINATE = 1e12
 """In any unit: beyond it nothing is on Earth, and PROJ goes round Web Mercator's equator turn by
 turn to find out."""
 
@@ -47,7 +47,7 @@ class Georeference:
         x, y = places_N2.T
         a, b, c, d, e, f = self.affine[:6]
         xs, ys = a * x + b * y + c, d * x + e * y + f
-        near = (np.abs(xs) < FARTHEST) & (np.abs(ys) < FARTHEST)  # false of a NaN
+        near = (np.abs(xs) < MAX_COORDINATE) & (np.abs(ys) < MAX_COORDINATE)  # false of a NaN
         lon, lat = _to_wgs84(self.crs, np.where(near, xs, 0.0), np.where(near, ys, 0.0))
         lon, lat = np.where(near, lon, np.nan), np.where(near, lat, np.nan)
         lon = np.where(
@@ -74,7 +74,7 @@ class Georeference:
         return tags
 
     def ground_pixel(self, place: tuple[float, float]) -> tuple[float, float]:
-        """Width and height in metres, on the ground, of the pixel at a place; NaN where `degrees`
+        """Width and height in metres, on the ground, of the pixel at a place; NaN where `tile_to_degrees`
         is.
 
         Measured between places a few pixels apart on the ellipsoid: true metres whatever the map's
@@ -82,11 +82,16 @@ class Georeference:
         """
         x, y = place
         around = np.array(
-            [(x - BASELINE, y), (x + BASELINE, y), (x, y - BASELINE), (x, y + BASELINE)]
+            [
+                (x - BASELINE_PIXELS, y),
+                (x + BASELINE_PIXELS, y),
+                (x, y - BASELINE_PIXELS),
+                (x, y + BASELINE_PIXELS),
+            ]
         )
         west, east, north, south = on_ellipsoid(self.degrees(around))
         across, down = np.linalg.norm(east - west), np.linalg.norm(south - north)
-        return float(across / (2 * BASELINE)), float(down / (2 * BASELINE))
+        return float(across / (2 * BASELINE_PIXELS)), float(down / (2 * BASELINE_PIXELS))
 
     @property
     def name(self) -> str:
@@ -109,7 +114,7 @@ def on_ellipsoid(degrees_N2: Array) -> Array:
     )
 
 
-def named_crs(name: str) -> CRS | None:
+def parse_crs(name: str) -> CRS | None:
     """The coordinate system of a name such as EPSG:32633; None where there is none of it."""
     with rasterio.Env():  # outside of one, GDAL prints its errors
         try:

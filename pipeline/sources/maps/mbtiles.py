@@ -15,19 +15,19 @@ from urllib.parse import quote
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import Rejection
-from pipeline.sources.maps.web_mercator import DEEPEST, flipped
+from pipeline.sources.maps.web_mercator import MAX_ZOOM, flip_row
 
-VECTOR = ("pbf", "mvt")
-MAGIC = 12  # bytes from which `kind_of` knows an image
-TILE = "FROM tiles WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
-LARGEST = 1 << 26
+VECTOR_FORMATS = ("pbf", "mvt")
+MAGIC_BYTES = 12  # bytes from which `kind_of` knows an image
+FROM_TILE = "FROM tiles WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
+MAX_VALUE_BYTES = 1 << 26
 "Bytes of any value: what SQLite would make of `zeroblob(1e9)` in a view is no tile."
-PATIENCE_S = 600.0
+QUERY_TIMEOUT_S = 600.0
 """Seconds without a row until a query is given up: `tiles` may be a view, and a view may have no
 end."""
-STEPS = 1_000_000
+STEPS_PER_CHECK = 1_000_000
 "Of SQLite's machine between two looks at the clock (and at Ctrl-C): some milliseconds."
-READING = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION)
+ALLOWED_ACTIONS = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION)
 """What a query of ours, and the views behind it, may do. Recursion is not among it: it may go on
 for ever."""
 
@@ -45,7 +45,7 @@ class StoredTile:
     "Those first bytes."
 
 
-def zooms(path: str) -> list[int]:
+def list_zooms(path: str) -> list[int]:
     """Zooms that the file holds, ascending.
 
     Raises InputError when it is no MBTiles file of images on this machine.
@@ -54,9 +54,9 @@ def zooms(path: str) -> list[int]:
         raise InputError(
             f"{path} is not on this machine; SQLite reads local files alone: copy it to a disk here"
         )
-    with _connected(path) as database:
+    with _connect(path) as database:
         form = _metadata(database).get("format", "")
-        if form in VECTOR:
+        if form in VECTOR_FORMATS:
             raise InputError(
                 f"{path} holds vector tiles ({form}), which show no pixels; expected png, jpg or webp tiles"
             )
@@ -66,17 +66,17 @@ def zooms(path: str) -> list[int]:
                 "SELECT DISTINCT zoom_level FROM tiles ORDER BY zoom_level"
             )
         ]
-        return [zoom for zoom in found if isinstance(zoom, int) and 0 <= zoom <= DEEPEST]
+        return [zoom for zoom in found if isinstance(zoom, int) and 0 <= zoom <= MAX_ZOOM]
 
 
-def stored(path: str, zoom: int) -> Iterator[StoredTile | Rejection]:
+def list_tiles(path: str, zoom: int) -> Iterator[StoredTile | Rejection]:
     """Every tile of one zoom, by column and row; a Rejection for one whose column or row is no
     whole number.
 
     Raises InputError when it finds vector tiles, or the file is damaged.
     """
-    query = f"SELECT tile_column, tile_row, substr(tile_data, 1, {MAGIC}) FROM tiles WHERE zoom_level = ? ORDER BY 1, 2"
-    with _connected(path) as database:
+    query = f"SELECT tile_column, tile_row, substr(tile_data, 1, {MAGIC_BYTES}) FROM tiles WHERE zoom_level = ? ORDER BY 1, 2"
+    with _connect(path) as database:
         from_north = _metadata(database).get("scheme") == "xyz"
         for x, row, start in database.execute(query, (zoom,)):
             database.waits_since = time.monotonic()
@@ -93,21 +93,24 @@ def stored(path: str, zoom: int) -> Iterator[StoredTile | Rejection]:
                     f"{path} holds vector tiles (gzip), which show no pixels; expected png, jpg or webp tiles"
                 )
             yield StoredTile(
-                x=x, y=row if from_north else flipped(zoom, row), kind=kind_of(start), start=start
+                x=x,
+                y=row if from_north else flip_row(zoom, row),
+                kind=image_format(start),
+                start=start,
             )
 
 
-def tile_bytes(path: str, zoom: int, x: int, y: int) -> bytes:
+def read_tile(path: str, zoom: int, x: int, y: int) -> bytes:
     """A tile's own bytes; `y` from the north. Raises OSError when it is not there."""
-    return _one(path, "tile_data", zoom, x, y)
+    return _read_value(path, "tile_data", zoom, x, y)
 
 
-def tile_kind(path: str, zoom: int, x: int, y: int) -> str:
+def read_tile_format(path: str, zoom: int, x: int, y: int) -> str:
     """A tile's ending by its first bytes; `y` from the north. Raises OSError when it is not there."""
-    return kind_of(_one(path, f"substr(tile_data, 1, {MAGIC})", zoom, x, y))
+    return image_format(_read_value(path, f"substr(tile_data, 1, {MAGIC_BYTES})", zoom, x, y))
 
 
-def kind_of(start: bytes) -> str:
+def image_format(start: bytes) -> str:
     """png, jpg or webp by an image's first 12 bytes; else empty."""
     if start.startswith(b"\x89PNG"):
         return "png"
@@ -116,12 +119,12 @@ def kind_of(start: bytes) -> str:
     return "webp" if start[:4] == b"RIFF" and start[8:12] == b"WEBP" else ""
 
 
-def _one(path: str, what: str, zoom: int, x: int, y: int) -> bytes:
+def _read_value(path: str, what: str, zoom: int, x: int, y: int) -> bytes:
     try:
-        with _connected(path) as database:
+        with _connect(path) as database:
             from_north = _metadata(database).get("scheme") == "xyz"
             row = database.execute(
-                f"SELECT {what} {TILE}", (zoom, x, y if from_north else flipped(zoom, y))
+                f"SELECT {what} {FROM_TILE}", (zoom, x, y if from_north else flip_row(zoom, y))
             ).fetchone()
     except InputError as error:  # it could be read when it was scanned
         raise OSError(str(error)) from None
@@ -130,7 +133,7 @@ def _one(path: str, what: str, zoom: int, x: int, y: int) -> bytes:
     return row[0]
 
 
-class _Connection(sqlite3.Connection):
+class _BoundedConnection(sqlite3.Connection):
     """Of a file that anybody may have written: it reads, in bounded time and memory."""
 
     waits_since: float
@@ -138,22 +141,26 @@ class _Connection(sqlite3.Connection):
 
     def bound(self) -> None:
         self.waits_since = time.monotonic()
-        self.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST)
+        self.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
         self.set_authorizer(
-            lambda action, *_: sqlite3.SQLITE_OK if action in READING else sqlite3.SQLITE_DENY
+            lambda action, *_: (
+                sqlite3.SQLITE_OK if action in ALLOWED_ACTIONS else sqlite3.SQLITE_DENY
+            )
         )
-        self.set_progress_handler(lambda: time.monotonic() - self.waits_since > PATIENCE_S, STEPS)
+        self.set_progress_handler(
+            lambda: time.monotonic() - self.waits_since > QUERY_TIMEOUT_S, STEPS_PER_CHECK
+        )
 
 
 @contextmanager
-def _connected(path: str) -> Iterator[_Connection]:
+def _connect(path: str) -> Iterator[_BoundedConnection]:
     """A connection that cannot write. Raises InputError when the file is no MBTiles, whenever that
     shows.
     """
-    inner = storage.locate(path)[1]
+    inner = storage.resolve(path)[1]
     try:
         with closing(
-            sqlite3.connect(f"file:{quote(inner)}?mode=ro", uri=True, factory=_Connection)
+            sqlite3.connect(f"file:{quote(inner)}?mode=ro", uri=True, factory=_BoundedConnection)
         ) as database:
             database.bound()
             yield database

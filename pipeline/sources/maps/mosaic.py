@@ -32,41 +32,41 @@ Encoding = Literal["jpg", "png"]
 JPEG_QUALITY = 95  # with full colour resolution: what is lost cannot be seen, a tenth of PNG's size
 # data sets kept open per thread: tiles come in the order of their keys' hashes, from all mosaics in
 # turn
-HELD = 8
-PILLOW = {
+MAX_OPEN_DATASETS = 8
+PILLOW_RESAMPLING = {
     Resampling.average: Image.Resampling.BOX,
     Resampling.bilinear: Image.Resampling.BILINEAR,
     Resampling.cubic: Image.Resampling.BICUBIC,
 }
-_held = threading.local()
-_opening = threading.Lock()  # the filters of warnings belong to the whole process
+_open_datasets = threading.local()
+_open_lock = threading.Lock()  # the filters of warnings belong to the whole process
 
 
-def opened(path: str) -> Any:
+def open_mosaic(path: str) -> Any:
     """This process's and thread's data set of a GeoTIFF; do not close it.
 
     Raises rasterio.errors.RasterioIOError when the file is none.
     """
-    key = (os.getpid(), path, _version(path))
-    if not hasattr(_held, "datasets"):
-        _held.datasets = OrderedDict()
-    datasets: OrderedDict[Any, Any] = _held.datasets
+    key = (os.getpid(), path, _file_version(path))
+    if not hasattr(_open_datasets, "datasets"):
+        _open_datasets.datasets = OrderedDict()
+    datasets: OrderedDict[Any, Any] = _open_datasets.datasets
     if key not in datasets:
         datasets[key] = _open(path)
     datasets.move_to_end(key)
-    while len(datasets) > HELD:
+    while len(datasets) > MAX_OPEN_DATASETS:
         datasets.popitem(last=False)[1].close()
     return datasets[key]
 
 
-def _version(path: str) -> tuple[int, ...]:
+def _file_version(path: str) -> tuple[int, ...]:
     """What changes when a local file is written again: a kept data set of it would show a mixture
     of both.
     """
     if not storage.is_local(path):
         return ()
     try:
-        said = os.stat(storage.locate(path)[1])
+        said = os.stat(storage.resolve(path)[1])
     except OSError:
         return ()  # opening it says what is wrong
     return said.st_mtime_ns, said.st_size
@@ -75,22 +75,22 @@ def _version(path: str) -> tuple[int, ...]:
 def _open(path: str) -> Any:
     # One driver: what a file's content would have others read (URLs, other files) is not for
     # imagery from elsewhere.
-    filesystem, inner = storage.locate(path)
-    with _opening, warnings.catch_warnings():  # whoever needs coordinates looks for them
+    filesystem, inner = storage.resolve(path)
+    with _open_lock, warnings.catch_warnings():  # whoever needs coordinates looks for them
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         if storage.is_local(path):
             return rasterio.open(Path(inner), driver="GTiff")
         return rasterio.open(path, driver="GTiff", opener=filesystem)
 
 
-def colours(path: str, stretch: tuple[float, float] | None) -> Colours:
+def colours_for(path: str, stretch: tuple[float, float] | None) -> Colours:
     """How a mosaic's bands become RGB; found once per process, the same in all."""
-    return _colours(path, _version(path), stretch)
+    return _colours(path, _file_version(path), stretch)
 
 
 @lru_cache(maxsize=256)
 def _colours(path: str, version: tuple[int, ...], stretch: tuple[float, float] | None) -> Colours:
-    return colours_of(opened(path), stretch)
+    return colours_of(open_mosaic(path), stretch)
 
 
 def nodata_share(path: str, window: Window, shown: Colours) -> float:
@@ -98,13 +98,17 @@ def nodata_share(path: str, window: Window, shown: Colours) -> float:
     full resolution.
     """
     with rasterio.Env():  # outside of one, GDAL prints its errors
-        valid_HW = _valid(
-            opened(path), _raster(window), shown, (window.height, window.width), Resampling.nearest
+        valid_HW = _valid_mask(
+            open_mosaic(path),
+            _raster_window(window),
+            shown,
+            (window.height, window.width),
+            Resampling.nearest,
         )
     return 1 - float(valid_HW.mean())
 
 
-def picture(
+def read_window(
     path: str, window: Window, size: tuple[int, int], resampling: Resampling, shown: Colours
 ) -> Pixels:
     """A window as (H, W, 3) RGB of `size` (width, height), black where it holds no image.
@@ -114,7 +118,7 @@ def picture(
     """
     width, height = size
     with rasterio.Env():
-        dataset, where = opened(path), _raster(window)
+        dataset, where = open_mosaic(path), _raster_window(window)
         if (
             shown.palette_N3 is not None
         ):  # the mean of two indices is no colour: full resolution, shrunk as colours
@@ -123,7 +127,7 @@ def picture(
             )
             image = Image.fromarray(shown.palette_N3[index_HW])
             if image.size != size:
-                image = image.resize(size, PILLOW[resampling])
+                image = image.resize(size, PILLOW_RESAMPLING[resampling])
             rgb_HW3 = np.array(image)
         else:
             shape = (len(shown.bands), height, width)
@@ -133,11 +137,11 @@ def picture(
             grey_or_rgb_HWB = np.moveaxis(to_8bit(values_BHW, shown.stretch), 0, -1)
             rgb_HW3 = np.array(np.broadcast_to(grey_or_rgb_HWB, (height, width, 3)), order="C")
         if shown.gaps:
-            rgb_HW3[~_valid(dataset, where, shown, (height, width), resampling)] = 0
+            rgb_HW3[~_valid_mask(dataset, where, shown, (height, width), resampling)] = 0
     return rgb_HW3
 
 
-def encoded(
+def encode_window(
     path: str,
     window: Window,
     encoding: Encoding,
@@ -151,14 +155,14 @@ def encoded(
     """
     try:
         own = (window.width, window.height)
-        return encode(
-            picture(path, window, size or own, resampling, colours(path, stretch)), encoding
+        return encode_image(
+            read_window(path, window, size or own, resampling, colours_for(path, stretch)), encoding
         )
     except RasterioError as error:
-        raise DecodeError("damaged image", first_cause(error)) from None
+        raise DecodeError("damaged image", root_cause(error)) from None
 
 
-def encode(image_HW3: Pixels, encoding: Encoding) -> bytes:
+def encode_image(image_HW3: Pixels, encoding: Encoding) -> bytes:
     """RGB as an image file; the same pixels give the same bytes."""
     if encoding == "jpg":
         jpeg: bytes = simplejpeg.encode_jpeg(
@@ -170,14 +174,14 @@ def encode(image_HW3: Pixels, encoding: Encoding) -> bytes:
     return stream.getvalue()
 
 
-def first_cause(error: BaseException) -> str:
+def root_cause(error: BaseException) -> str:
     """What GDAL said first; rasterio's own words above it say that something was said."""
     while error.__cause__ is not None:
         error = error.__cause__
     return str(error)
 
 
-def _valid(
+def _valid_mask(
     dataset: Any,
     where: RasterWindow,
     shown: Colours,
@@ -201,5 +205,5 @@ def _valid(
     return valid_HW
 
 
-def _raster(window: Window) -> RasterWindow:
+def _raster_window(window: Window) -> RasterWindow:
     return RasterWindow(window.x, window.y, window.width, window.height)

@@ -9,7 +9,7 @@ tile, as long as that side.
 import re
 from dataclasses import dataclass
 
-PART = re.compile(r"x(\d+)-y(\d+)-w(\d+)-h(\d+)")
+WINDOW_PATTERN = re.compile(r"x(\d+)-y(\d+)-w(\d+)-h(\d+)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,9 @@ def plan_tiles(size: tuple[int, int], tile: tuple[int, int], overlap: float) -> 
     column may share more.
     """
     width, height = min(tile[0], size[0]), min(tile[1], size[1])
-    columns, rows = (starts(length, side, overlap) for length, side in zip(size, tile, strict=True))
+    columns, rows = (
+        tile_starts(length, side, overlap) for length, side in zip(size, tile, strict=True)
+    )
     return [
         Tile(row=row, column=column, window=Window(x=x, y=y, width=width, height=height))
         for row, y in enumerate(rows)
@@ -69,29 +71,29 @@ def plan_tiles(size: tuple[int, int], tile: tuple[int, int], overlap: float) -> 
 def count_tiles(size: tuple[int, int], tile: tuple[int, int], overlap: float) -> int:
     """How many `plan_tiles` gives, known at once whatever the sizes are."""
     columns, rows = (
-        1 + len(_before_last(length, side, overlap))
+        1 + len(_starts_before_last(length, side, overlap))
         for length, side in zip(size, tile, strict=True)
     )
     return columns * rows
 
 
-def starts(length: int, side: int, overlap: float) -> list[int]:
+def tile_starts(length: int, side: int, overlap: float) -> list[int]:
     """Where tiles of `side` pixels begin along `length` pixels: ascending, and the last one ends at
     the border.
     """
-    return [*_before_last(length, side, overlap), max(0, length - side)]
+    return [*_starts_before_last(length, side, overlap), max(0, length - side)]
 
 
-def _before_last(length: int, side: int, overlap: float) -> range:
+def _starts_before_last(length: int, side: int, overlap: float) -> range:
     return range(0, length - side, max(1, round(side * (1 - overlap))))
 
 
-def window_of(part: str) -> Window:
-    """The window that `part` says.
+def parse_window(part: str) -> Window:
+    """The window that `part_path` says.
 
     Raises ValueError where it says none.
     """
-    said = PART.fullmatch(part)
+    said = WINDOW_PATTERN.fullmatch(part)
     if said is None:
         raise ValueError(f"{part!r} is no window; expected x<left>-y<upper>-w<width>-h<height>")
     x, y, width, height = map(int, said.groups())

@@ -8,11 +8,11 @@ import math
 
 from pipeline.core.records import GeoTag
 
-DEEPEST = 30
+MAX_ZOOM = 30
 "Tiles of this zoom are 4 cm wide; larger numbers are no zooms."
 
 
-def degrees(zoom: int, x: float, y: float) -> tuple[float, float]:
+def tile_to_degrees(zoom: int, x: float, y: float) -> tuple[float, float]:
     """(lat, lon) of a place in units of tiles from the grid's upper left corner: the inverse of Web
     Mercator on a sphere.
 
@@ -26,13 +26,15 @@ def is_on_grid(zoom: int, x: int, y: int) -> bool:
     return max(x, y) < 1 << zoom and min(x, y) >= 0
 
 
-def flipped(zoom: int, y: int) -> int:
+def flip_row(zoom: int, y: int) -> int:
     """A row counted from the other end: XYZ to TMS and back."""
     return (1 << zoom) - 1 - y
 
 
-def geotag(zoom: int, x: int, y: int) -> GeoTag:
+def tile_geotag(zoom: int, x: int, y: int) -> GeoTag:
     """The middle of a tile on the map, and its corners from the upper left clockwise."""
-    lat, lon = degrees(zoom, x + 0.5, y + 0.5)
+    lat, lon = tile_to_degrees(zoom, x + 0.5, y + 0.5)
     corners = ((x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1))
-    return GeoTag(lat=lat, lon=lon, footprint=tuple(degrees(zoom, *corner) for corner in corners))
+    return GeoTag(
+        lat=lat, lon=lon, footprint=tuple(tile_to_degrees(zoom, *corner) for corner in corners)
+    )
