@@ -33,8 +33,8 @@ from model.inference.embed import embed
 from model.schedule import phase
 from model.training import Optimisation, Training
 from model.weights.load import load_backbone
-from pipeline.batches.ordered import decoded
-from pipeline.batches.training import Reading, TrainingStream
+from pipeline.batches.ordered import decode_samples
+from pipeline.batches.training import StreamConfig, TrainingStream
 from pipeline.core.records import Split, View
 from pipeline.images.transforms import Augmentation
 from pipeline.retrieval.metrics import summarise
@@ -124,7 +124,7 @@ class TestSet:
                 samples = [
                     pair
                     for shard in read_manifest(shards).of(split, view)
-                    for pair in decoded(read_shard(shards, shard.name), IMAGE, 2, 64)
+                    for pair in decode_samples(read_shard(shards, shard.name), IMAGE, 2, 64)
                 ]
                 pixels = np.stack([image for _, image in samples if isinstance(image, np.ndarray)])
                 self.images[split, view] = torch.from_numpy(pixels.transpose(0, 3, 1, 2))
@@ -179,7 +179,7 @@ class TestSet:
 def run(recipe: Recipe, shards: str, backbone: dict[str, Tensor] | None, watch: Watch) -> Training:
     """Train a recipe in this process."""
     torch.manual_seed(recipe.seed)
-    reading = Reading(
+    reading = StreamConfig(
         batch_size=recipe.batch_size,
         image_size=IMAGE,
         augmentation=recipe.augmentation,

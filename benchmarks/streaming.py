@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from pipeline.batches.ordered import decoded
+from pipeline.batches.ordered import decode_samples
 from pipeline.core.records import Split, View
 from pipeline.images.decode import decode
 from pipeline.images.inspect import inspect
@@ -111,7 +111,7 @@ def stream(folder: str, count: int) -> Iterator[float]:
     left = count
     for path in sorted(Path(folder).glob("*.tar")):
         samples = read_shard(folder, path.stem, Split.GALLERY, View.SATELLITE)
-        for _, image in decoded(samples, 128, 2, 64):
+        for _, image in decode_samples(samples, 128, 2, 64):
             assert isinstance(image, np.ndarray)
             yield float(image[0, 0, 0])
             left -= 1

@@ -30,7 +30,7 @@ from pipeline.locate.confidence import (
 from pipeline.locate.gallery_map import read_gallery_map
 from pipeline.locate.reliability import reliability_diagram
 from pipeline.shards.external import open_manifest
-from pipeline.shards.manifest import refuse_missing
+from pipeline.shards.manifest import require_tars
 from pipeline.shards.samples import read_shard
 
 ENCODE_BATCH = 256
@@ -127,7 +127,7 @@ def embed_view(
     Shards are in the order of hashes, so the first ones are a fair sample.
     """
     shards = open_manifest(settings.shards, settings.split, view).of(settings.split, view)
-    refuse_missing(settings.shards, shards)
+    require_tars(settings.shards, shards)
     samples = (
         sample
         for shard in shards

@@ -35,8 +35,8 @@ from pipeline.core.lock import locks_output
 from pipeline.core.progress import Meter, console, progress
 from pipeline.core.errors import InputError, Incomplete
 from pipeline.core.records import Split
-from pipeline.shards.manifest import read_manifest, refuse_missing
-from pipeline.shards.verify import refuse_damaged
+from pipeline.shards.manifest import read_manifest, require_tars
+from pipeline.shards.verify import require_intact
 
 if TYPE_CHECKING:
     RecipeChoice = Recipe
@@ -106,9 +106,9 @@ def train(settings: Settings) -> str:
         )
         return path
     if settings.verify:
-        refuse_damaged(this.shards, None if settings.workers else 0)
+        require_intact(this.shards, None if settings.workers else 0)
     else:
-        refuse_missing(this.shards, read_manifest(this.shards).of(Split.TRAIN))
+        require_tars(this.shards, read_manifest(this.shards).of(Split.TRAIN))
     steps = open_stream(this, Place(world=max(1, settings.workers))).steps
     if this.weights is not None and found is None:
         load_backbone(

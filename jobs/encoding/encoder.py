@@ -19,7 +19,7 @@ from model.checkpoint import build_encoder, fingerprint, loads
 from model.inference.embed import InEffect, Precision, effective_precision, with_precision
 from model.inference.int8 import PrecisionError, calibration_digest, require_int8
 from model.inference.optimise import make_fast
-from pipeline.batches.ordered import CHANGED, decoded, stack
+from pipeline.batches.ordered import CHANGED, decode_samples, stack
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.features.embed import EmbeddingSettings, EncoderSpec
@@ -27,7 +27,7 @@ from pipeline.features.table import Floats
 from pipeline.images.decode import DecodeError, Pixels
 from pipeline.images.transforms import Resizer, preprocessing_name
 from pipeline.shards.external import open_manifest
-from pipeline.shards.manifest import Manifest, mending, refuse_missing
+from pipeline.shards.manifest import Manifest, repair_hint, require_tars
 from pipeline.shards.samples import Sample, read_shard
 
 PROBE_IMAGES, CALIBRATION_IMAGES = 16, 128
@@ -168,11 +168,12 @@ def first_images(shards: str, manifest: Manifest, size: int, resizer: Resizer, c
         (shard.split, shard.view): shard for shard in reversed(manifest.shards) if shard.samples
     }
     found = []
-    refuse_missing(shards, first.values())
+    require_tars(shards, first.values())
     for shard in first.values():
         samples = read_shard(shards, shard.name, shard.split, shard.view)
         images = (
-            usable_pixels(shards, *opened) for opened in decoded(samples, size, 1, 4, resizer)
+            usable_pixels(shards, *opened)
+            for opened in decode_samples(samples, size, 1, 4, resizer)
         )
         found.append(
             list(islice((image for image in images if image is not None), -(-count // len(first))))
@@ -195,6 +196,6 @@ def usable_pixels(shards: str, sample: Sample, image: Pixels | DecodeError) -> P
     if isinstance(image, DecodeError) and image.reason == CHANGED:
         raise InputError(
             f"image {sample.key} of {shards} is not the one that was packed, expected it to check the encoder by; "
-            f"{mending(shards)}"
+            f"{repair_hint(shards)}"
         )
     return None if isinstance(image, DecodeError) else image

@@ -21,7 +21,7 @@ from model.checkpoint import Checkpoint, CheckpointError, dumps
 from model.schedule import phase
 from model.training import Training
 from model.weights.load import load_backbone, read_state_dict
-from pipeline.batches.training import Batch, Reading, TrainingStream
+from pipeline.batches.training import Batch, StreamConfig, TrainingStream
 from pipeline.core import storage
 from pipeline.core.errors import Incomplete
 from pipeline.core.prefetch import prefetch
@@ -225,7 +225,7 @@ def open_stream(run: Run, place: Place) -> TrainingStream:
     Raises InputError when the shards cannot be trained on.
     """
     recipe = run.recipe
-    reading = Reading(
+    reading = StreamConfig(
         batch_size=recipe.batch_size,
         image_size=recipe.network.image_size,
         resizer=recipe.resizer,

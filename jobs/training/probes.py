@@ -17,7 +17,7 @@ import torch
 
 from model.inference.embed import unit_embedding
 from model.pvda import FeatureEncoder
-from pipeline.batches.ordered import Opened, decoded, sound, stack
+from pipeline.batches.ordered import Decoded, decode_samples, split_failed, stack
 from pipeline.batches.training import TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
@@ -71,7 +71,7 @@ def see(encoder: FeatureEncoder, stream: TrainingStream, view: View) -> Seen:
     encoder.eval()
     with torch.no_grad():
         while group := list(islice(images, BATCH)):
-            whole, _ = sound(group)
+            whole, _ = split_failed(group)
             if not whole:
                 continue
             maps_BCHW, g_BPD = encoder(
@@ -92,7 +92,7 @@ def see(encoder: FeatureEncoder, stream: TrainingStream, view: View) -> Seen:
     )
 
 
-def pictures(stream: TrainingStream, view: View) -> Iterator[Opened]:
+def pictures(stream: TrainingStream, view: View) -> Iterator[Decoded]:
     """The images that are looked at, as they are when tested: resized and nothing else."""
     reading, held_out = stream.reading, stream.held_out
     samples = (
@@ -105,7 +105,7 @@ def pictures(stream: TrainingStream, view: View) -> Iterator[Opened]:
         if held_out
         else islice(samples, GAP_IMAGES)
     )
-    return decoded(chosen, reading.image_size, reading.threads, 2 * BATCH, reading.resizer)
+    return decode_samples(chosen, reading.image_size, reading.threads, 2 * BATCH, reading.resizer)
 
 
 def side(seen: Seen) -> Side:

@@ -14,7 +14,7 @@ from pipeline.shards.manifest import Shard
 from pipeline.shards.samples import read_locations
 
 
-def held_out(locations: Sequence[str], share: float) -> frozenset[str]:
+def holdout_locations(locations: Sequence[str], share: float) -> frozenset[str]:
     """About `share` of the locations.
 
     Raises InputError when fewer than two are held out or left to train on, unless the share is 0.
@@ -33,7 +33,9 @@ def _place_in_line(location: str) -> float:
     return int.from_bytes(hashlib.sha256(location.encode()).digest()[:6]) / 2**48
 
 
-def without(shards: str, described: Iterable[Shard], locations: frozenset[str]) -> list[Shard]:
+def exclude_locations(
+    shards: str, described: Iterable[Shard], locations: frozenset[str]
+) -> list[Shard]:
     """The shards as if they did not hold these locations: their samples counted without them.
 
     Reads every shard's JSON files once; nothing where no location is left out.

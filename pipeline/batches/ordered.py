@@ -11,12 +11,12 @@ from pipeline.images.decode import DecodeError, Pixels, decode
 from pipeline.images.transforms import Resizer, resize
 from pipeline.shards.samples import Sample
 
-Opened = tuple[Sample, Pixels | DecodeError]
+Decoded = tuple[Sample, Pixels | DecodeError]
 "A sample and its pixels, or why there are none."
 CHANGED = "changed since it was packed"
 
 
-def refuse_changed(sample: Sample) -> None:
+def check_unchanged(sample: Sample) -> None:
     """Raise DecodeError where an image is not the one that was packed: 25 us, where decoding takes
     a millisecond or more.
     """
@@ -32,25 +32,27 @@ def stack(images_HW3: Sequence[Pixels]) -> npt.NDArray[np.uint8]:
     return np.stack(images_HW3).transpose(0, 3, 1, 2)
 
 
-def decoded(
+def decode_samples(
     samples: Iterable[Sample], image_size: int, threads: int, depth: int, resizer: Resizer = "torch"
-) -> Iterator[Opened]:
+) -> Iterator[Decoded]:
     """The samples' images in order, decoded and resized by threads; what cannot be decoded comes as
     its error.
     """
-    return prefetch_map(lambda sample: opened(sample, image_size, resizer), samples, threads, depth)
+    return prefetch_map(
+        lambda sample: decode_sample(sample, image_size, resizer), samples, threads, depth
+    )
 
 
-def opened(sample: Sample, image_size: int, resizer: Resizer = "torch") -> Opened:
+def decode_sample(sample: Sample, image_size: int, resizer: Resizer = "torch") -> Decoded:
     """One sample's image, decoded and resized, or why it cannot be."""
     try:
-        refuse_changed(sample)
+        check_unchanged(sample)
         return sample, resize(decode(sample.data), image_size, resizer)
     except DecodeError as error:
         return sample, error
 
 
-def sound(images: Iterable[Opened]) -> tuple[list[tuple[Sample, Pixels]], list[str]]:
+def split_failed(images: Iterable[Decoded]) -> tuple[list[tuple[Sample, Pixels]], list[str]]:
     """The images that could be decoded, and the keys of the others."""
     whole: list[tuple[Sample, Pixels]] = []
     damaged: list[str] = []

@@ -13,15 +13,15 @@ from itertools import islice
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.batches.holdout import held_out, without
-from pipeline.batches.ordered import Opened, refuse_changed, sound, stack
+from pipeline.batches.holdout import exclude_locations, holdout_locations
+from pipeline.batches.ordered import Decoded, check_unchanged, split_failed, stack
 from pipeline.batches.sampler import plan_pass, read_spans, shuffled
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import Split, View, key_matches
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.transforms import Augmentation, Resizer, augment
-from pipeline.shards.manifest import Manifest, mending, read_manifest
+from pipeline.shards.manifest import Manifest, read_manifest, repair_hint
 from pipeline.shards.samples import Sample
 
 
@@ -40,7 +40,7 @@ class Batch:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reading:
+class StreamConfig:
     """How training images are read."""
 
     batch_size: int = 8
@@ -56,7 +56,7 @@ class Reading:
     threads: int = 2
     "That decode and augment ahead of the network."
     hold_out: float = 0.0
-    "Share of the locations that is left out: `held_out` of the stream."
+    "Share of the locations that is left out: `holdout_locations` of the stream."
 
 
 class TrainingStream:
@@ -68,14 +68,14 @@ class TrainingStream:
     Raises InputError when the set cannot be trained on.
     """
 
-    def __init__(self, shards: str, reading: Reading, rank: int = 0, world: int = 1) -> None:
+    def __init__(self, shards: str, reading: StreamConfig, rank: int = 0, world: int = 1) -> None:
         self.shards, self.reading, self.rank, self.world = shards, reading, rank, world
         self.manifest: Manifest = read_manifest(shards)
-        self.held_out = held_out(self.manifest.classes, reading.hold_out)
+        self.held_out = holdout_locations(self.manifest.classes, reading.hold_out)
         kept = [location for location in self.manifest.classes if location not in self.held_out]
         self.classes = {location: number for number, location in enumerate(kept)}
         self._shards = {
-            view: without(shards, self.manifest.of(Split.TRAIN, view), self.held_out)
+            view: exclude_locations(shards, self.manifest.of(Split.TRAIN, view), self.held_out)
             for view in (View.DRONE, View.SATELLITE)
         }
         counts = {
@@ -114,12 +114,12 @@ class TrainingStream:
             read_spans(self.shards, spans, self.held_out), reading.shuffle_buffer, order_rng
         )
 
-        def prepare(numbered: tuple[int, Sample]) -> Opened:
+        def prepare(numbered: tuple[int, Sample]) -> Decoded:
             position, sample = numbered
             # A generator for each image: what becomes of it does not depend on which thread had it.
             rng = np.random.default_rng([reading.seed, epoch, number, self.rank, position])
             try:
-                refuse_changed(sample)
+                check_unchanged(sample)
                 image_HW3 = decode(sample.data)
             except DecodeError as error:
                 return sample, error
@@ -130,7 +130,7 @@ class TrainingStream:
         numbered = islice(enumerate(samples), skip * reading.batch_size, None)
         prepared = prefetch_map(prepare, numbered, reading.threads, 4 * reading.batch_size)
         while group := list(islice(prepared, reading.batch_size)):
-            whole, damaged = sound(group)
+            whole, damaged = split_failed(group)
             if not whole:
                 raise InputError(
                     f"not one of {len(group)} {view} images of a batch from {self.shards} can be decoded ({damaged[0]} and "
@@ -157,6 +157,6 @@ class TrainingStream:
         if location not in self.classes or not key_matches(sample.key, Split.TRAIN, view, location):
             raise InputError(
                 f"image {sample.key} of {self.shards} is of location {location!r}, expected the one of its key and of "
-                f"the manifest's {len(self.classes)}; {mending(self.shards)}"
+                f"the manifest's {len(self.classes)}; {repair_hint(self.shards)}"
             )
         return self.classes[location]

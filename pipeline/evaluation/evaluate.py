@@ -51,7 +51,7 @@ from pipeline.retrieval.tasks import (
 )
 from pipeline.shards.manifest import read_manifest
 from pipeline.shards.samples import fetch
-from pipeline.shards.verify import refuse_damaged
+from pipeline.shards.verify import require_intact
 
 ViewName = Literal["drone", "satellite", "street", "google"]
 SHOWN = ("title", "shards", "panels", "views", "parts", "by", "exports", "figures", "answer_order")
@@ -162,7 +162,7 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
     }  # fmt: skip
     if settings.shards:
         if settings.verify:
-            refuse_damaged(settings.shards)
+            require_intact(settings.shards)
         read_manifest(
             settings.shards
         )  # that there are none is better said before the ranking than after it

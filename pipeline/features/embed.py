@@ -42,8 +42,8 @@ from pipeline.features.part import (
     write_rejected,
 )
 from pipeline.shards.external import open_manifest
-from pipeline.shards.manifest import MANIFEST, Manifest, Shard, mending, missing_tars
-from pipeline.shards.verify import refuse_damaged
+from pipeline.shards.manifest import MANIFEST, Manifest, Shard, missing_tars, repair_hint
+from pipeline.shards.verify import require_intact
 
 __all__ = ["EmbeddingSettings", "Encoder", "EncoderSpec", "IncompleteEmbedding", "embed_gallery"]
 
@@ -105,12 +105,12 @@ def embed_gallery(settings: EmbeddingSettings, network: EncoderSpec) -> int:
     where shards are unreadable or kill their workers, the others being done.
     """
     if settings.verify and storage.exists(storage.join(settings.shards, MANIFEST)):
-        refuse_damaged(settings.shards)
+        require_intact(settings.shards)
     wanted = requested_shards(settings)
     missing = pending_shards(settings, network, wanted)
     expected_parts.add_expected(settings.out, [f"{shard.name}.parquet" for shard in wanted])
     absent = missing_tars(settings.shards, missing)  # said now, and not when their turn comes
-    asked = mending(settings.shards)
+    asked = repair_hint(settings.shards)
     lost = {
         name: Skipped(reason="unusable", found=f"{said}; {asked}") for name, said in absent.items()
     }

@@ -20,7 +20,7 @@ from queue import SimpleQueue
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.batches.ordered import Opened, opened, stack
+from pipeline.batches.ordered import Decoded, decode_sample, stack
 from pipeline.core import storage
 from pipeline.core.arrays import Floats, Halves
 from pipeline.core.errors import InputError
@@ -174,9 +174,9 @@ class ShardEmbedder:
         if images:
             yield stack(images)
 
-    def _open(self, sample: Sample) -> tuple[Opened, float]:
+    def _open(self, sample: Sample) -> tuple[Decoded, float]:
         start = time.perf_counter()
-        found = opened(sample, self._network.image_size, self._network.resizer)
+        found = decode_sample(sample, self._network.image_size, self._network.resizer)
         return found, time.perf_counter() - start
 
     def _infer(

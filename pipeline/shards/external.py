@@ -15,7 +15,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import console, progress
 from pipeline.core.records import Split, View, escape_non_utf8, is_position, make_key
 from pipeline.shards.manifest import MANIFEST, Manifest, Shard, read_manifest
-from pipeline.shards.tar_reader import IMAGES, HashedStream, read_members
+from pipeline.shards.tar_reader import IMAGE_SUFFIXES, HashedStream, read_members
 
 LOCATIONS = ("location", "label", "class", "class_name", "class_id", "place", "place_id", "id")
 "Fields of a sample's JSON that may name what the image shows, the surest first."
@@ -44,10 +44,10 @@ def open_manifest(shards: str, split: Split | None = None, view: View | None = N
             f"{shards} holds {len(tars)} tars and no {MANIFEST}: a packing that was interrupted, to be finished with "
             "jobs/make_shards.py, or shards that others made, of which expected both --split and --view; give them"
         )
-    return describe(shards, tars, split, view)
+    return scan_tars(shards, tars, split, view)
 
 
-def describe(shards: str, tars: list[str], split: Split, view: View) -> Manifest:
+def scan_tars(shards: str, tars: list[str], split: Split, view: View) -> Manifest:
     """A manifest of tars that are all of this split and view but for those whose names say another.
 
     Raises InputError where two samples have one key, and as `read_tar` does.
@@ -64,7 +64,7 @@ def describe(shards: str, tars: list[str], split: Split, view: View) -> Manifest
             path, samples = storage.join(shards, f"{name}.tar"), 0
             with storage.open_read(path) as stream:
                 hashed = HashedStream(stream)
-                for key, _ in read_members(cast(IO[bytes], hashed), path, IMAGES):
+                for key, _ in read_members(cast(IO[bytes], hashed), path, IMAGE_SUFFIXES):
                     samples += 1
                     if key in seen:
                         raise InputError(
@@ -88,7 +88,7 @@ def describe(shards: str, tars: list[str], split: Split, view: View) -> Manifest
     return Manifest(shards=tuple(found), classes=(), packing={"source": "others"}, rejected=0)
 
 
-def facts_of(
+def external_metadata(
     key: str, said: Mapping[str, Any], label: bytes | None, split: Split, view: View
 ) -> dict[str, Any]:
     """What a JSON of ours would say of a sample, by its key, its JSON and its `.cls`.

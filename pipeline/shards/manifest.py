@@ -15,7 +15,7 @@ from pipeline.core.records import Split, View, excerpt
 
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
-NOTE = "damaged.json"
+DAMAGED_FILE = "damaged.json"
 """Names of the shards that verification found damaged: packing makes them anew, and takes the note
 away."""
 
@@ -91,21 +91,21 @@ def read_manifest(shards: str) -> Manifest:
         ) from None
 
 
-def note_damaged(shards: str, names: Iterable[str]) -> None:
+def write_damaged(shards: str, names: Iterable[str]) -> None:
     """Leave a note of the shards that are damaged, for packing; with none, take it away."""
-    path, listed = storage.join(shards, NOTE), sorted(set(names))
+    path, listed = storage.join(shards, DAMAGED_FILE), sorted(set(names))
     if listed:
         json_files.write_checksummed(path, {"shards": listed})
     elif storage.exists(path):
         storage.remove(path)
 
 
-def noted_damaged(shards: str) -> frozenset[str]:
+def read_damaged(shards: str) -> frozenset[str]:
     """The shards that the note names; none where there is no note.
 
     Raises InputError where it cannot be read.
     """
-    path = storage.join(shards, NOTE)
+    path = storage.join(shards, DAMAGED_FILE)
     try:
         return (
             frozenset(json_files.read_checksummed(path)["shards"])
@@ -133,15 +133,15 @@ def missing_tars(shards: str, described: Iterable[Shard]) -> dict[str, str]:
     return wrong
 
 
-def refuse_missing(shards: str, described: Iterable[Shard]) -> None:
+def require_tars(shards: str, described: Iterable[Shard]) -> None:
     """Raise InputError where tars are not there or have another size than the manifest says."""
     if wrong := missing_tars(shards, described):
         raise InputError(
-            f"{len(wrong)} shards cannot be used: {some(wrong.values())}; {mending(shards)}"
+            f"{len(wrong)} shards cannot be used: {first_three(wrong.values())}; {repair_hint(shards)}"
         )
 
 
-def mending(shards: str) -> str:
+def repair_hint(shards: str) -> str:
     """What to do about damaged shards."""
     return (
         f"run jobs/make_shards.py --verify --out {shards} and then the command that packed them again, which makes anew what "
@@ -149,7 +149,7 @@ def mending(shards: str) -> str:
     )
 
 
-def some(sentences: Collection[str]) -> str:
+def first_three(sentences: Collection[str]) -> str:
     """The first three."""
     told = list(sentences)
     return "; ".join(told[:3]) + (f"; and {len(told) - 3} more" if len(told) > 3 else "")

@@ -25,13 +25,13 @@ from pipeline.shards.manifest import (
     MANIFEST,
     Manifest,
     Shard,
-    note_damaged,
-    noted_damaged,
+    read_damaged,
     read_manifest,
+    write_damaged,
 )
 from pipeline.shards.plan import ShardPlan, ShardSize, plan_shards
-from pipeline.shards.record_table import FOLDER, Packed, read_packed, read_part, whole_part
-from pipeline.shards.repair import damaged_shards, mend
+from pipeline.shards.record_table import FOLDER, Packed, part_intact, read_packed, read_part
+from pipeline.shards.repair import find_damaged, repair
 from pipeline.shards.writer import UNREADABLE, Check, write_shard
 from pipeline.sources import name_of
 from pipeline.sources.base import Source
@@ -82,7 +82,7 @@ class TooManyRejected(Incomplete):
 
 
 @dataclass
-class Haul:
+class ScanResult:
     """What a source gave, and what has been refused of it so far."""
 
     records: list[ImageRecord]
@@ -100,14 +100,18 @@ def pack(source: Source, settings: PackingSettings) -> Manifest:
     Raises InputError on unusable input, TooManyRejected when more than `max_bad_fraction` of the
     images are refused.
     """
-    began, out, said = time.monotonic(), storage.absolute(settings.out), describe(source, settings)
-    before, damaged = finished(settings, said)
+    began, out, said = (
+        time.monotonic(),
+        storage.absolute(settings.out),
+        pack_config(source, settings),
+    )
+    before, damaged = find_finished(settings, said)
     if before is not None and not settings.extend and not damaged:
         console.print(f"{settings.out} is complete: {len(before.shards)} shards; nothing to do")
         return before
-    haul = gather(source, storage.absolute(settings.root))  # workers may stand in another folder
+    haul = scan(source, storage.absolute(settings.root))  # workers may stand in another folder
     if before is not None and damaged:
-        mend(source, out, before, damaged, haul.records)
+        repair(source, out, before, damaged, haul.records)
         console.print(f"{settings.out}: {len(damaged)} damaged shards were made anew")
         if not settings.extend:
             return before
@@ -122,7 +126,7 @@ def pack(source: Source, settings: PackingSettings) -> Manifest:
     plans, refused = plan_shards(haul.records, size)
     haul.rejected += refused
     old = frozenset() if before is None else frozenset(shard.name for shard in before.shards)
-    clear(out, old.union(plan.name for plan in plans))
+    remove_stale(out, old.union(plan.name for plan in plans))
     scanned = time.monotonic()
     packed = pack_plans(plans, source, settings, said, haul)
     # Whether two images are the same is known when all have been read: the tars of the second ones
@@ -133,18 +137,18 @@ def pack(source: Source, settings: PackingSettings) -> Manifest:
     if again:
         packed |= pack_plans(again, source, settings, said, haul, doubles)
     haul.rejected += [rejection for done in packed.values() for rejection in done.rejected]
-    judge(settings, haul.rejected, haul.found)
+    check_rejections(settings, haul.rejected, haul.found)
     refusals = rejections.write_rejections(out, haul.rejected, keep=before is not None)
     full = {name: done for name, done in packed.items() if done.shard.samples}
-    clear(out, old.union(full))
-    manifest = compose(before, said, full, haul, refusals)
+    remove_stale(out, old.union(full))
+    manifest = compose_manifest(before, said, full, haul, refusals)
     json_files.write_checksummed(storage.join(out, MANIFEST), asdict(manifest))
-    note_damaged(out, ())
-    sum_up(settings, full, haul, scanned - began, time.monotonic() - scanned)
+    write_damaged(out, ())
+    log_summary(settings, full, haul, scanned - began, time.monotonic() - scanned)
     return manifest
 
 
-def describe(source: Source, settings: PackingSettings) -> dict[str, Any]:
+def pack_config(source: Source, settings: PackingSettings) -> dict[str, Any]:
     """What of the settings decides what is packed."""
     flags = json.loads(json.dumps(asdict(source)))
     packing = {
@@ -154,7 +158,7 @@ def describe(source: Source, settings: PackingSettings) -> dict[str, Any]:
     return {"source": name_of(source), **flags, "root": storage.absolute(settings.root), **packing}
 
 
-def finished(
+def find_finished(
     settings: PackingSettings, said: dict[str, Any]
 ) -> tuple[Manifest | None, list[Shard]]:
     """The manifest of the set in `out`, where there is one to be left, extended or mended, and its
@@ -176,7 +180,7 @@ def finished(
         raise InputError(
             f"{out} holds shards packed with another {changed}; choose another --out, delete it, or add to it with --extend"
         )
-    damaged = damaged_shards(out, manifest)
+    damaged = find_damaged(out, manifest)
     if (
         settings.extend
         or manifest.added
@@ -188,7 +192,7 @@ def finished(
     return None, []
 
 
-def gather(source: Source, root: str) -> Haul:
+def scan(source: Source, root: str) -> ScanResult:
     """All that a source finds; what has a name that cannot be written down is refused here."""
     records: list[ImageRecord] = []
     rejected: list[Rejection] = []
@@ -203,10 +207,10 @@ def gather(source: Source, root: str) -> Haul:
             rejected.append(found)
         else:
             records.append(found)
-    return Haul(records=records, rejected=rejected, found=len(records) + len(rejected))
+    return ScanResult(records=records, rejected=rejected, found=len(records) + len(rejected))
 
 
-def clear(out: str, wanted: frozenset[str]) -> None:
+def remove_stale(out: str, wanted: frozenset[str]) -> None:
     """Take away our other tars, known by their record parts: empty ones, and those that other
     settings left.
     """
@@ -224,7 +228,7 @@ def pack_plans(
     source: Source,
     settings: PackingSettings,
     said: dict[str, Any],
-    haul: Haul,
+    haul: ScanResult,
     doubles: Mapping[str, dict[str, str]] | None = None,
 ) -> dict[str, Packed]:
     """Each plan's tar, by name: as it is there already, or else packed now. With `doubles`, without
@@ -236,12 +240,12 @@ def pack_plans(
     digests = {plan.name: plan.digest(said) for plan in plans}
     if doubles is None:
         sizes = storage.walk(out) if storage.is_folder(out) else {}
-        for name in noted_damaged(out):
+        for name in read_damaged(out):
             sizes.pop(f"{name}.tar", None)
         packed = {
             name: done
             for name in digests
-            if (done := already(out, name, digests[name], sizes)) is not None
+            if (done := load_if_done(out, name, digests[name], sizes)) is not None
         }
         if packed:
             console.print(f"{len(packed)} of {len(plans)} shards are there already")
@@ -254,7 +258,7 @@ def pack_plans(
         )
         # Starting Ray takes longer than one tar.
         workers = 0 if settings.workers is None and len(todo) <= 1 else settings.workers
-        for done in write_all(arguments, workers):
+        for done in write_shards(arguments, workers):
             packed[done.shard.name] = done
             refused += done.rejected
             megabytes += done.shard.bytes / 1e6
@@ -264,11 +268,11 @@ def pack_plans(
                 refused=len(refused),
                 megabytes_per_second=rate,
             )
-            judge(settings, refused, haul.found)
+            check_rejections(settings, refused, haul.found)
     return packed
 
 
-def already(out: str, name: str, digest: str, sizes: Mapping[str, int]) -> Packed | None:
+def load_if_done(out: str, name: str, digest: str, sizes: Mapping[str, int]) -> Packed | None:
     """What became of this very plan, where it is done; images that could not be read get another
     chance.
     """
@@ -277,10 +281,10 @@ def already(out: str, name: str, digest: str, sizes: Mapping[str, int]) -> Packe
         return None
     if any(rejection.reason == UNREADABLE for rejection in done.rejected):
         return None
-    return done if whole_part(out, name) else None
+    return done if part_intact(out, name) else None
 
 
-def write_all(arguments: Iterable[tuple[Any, ...]], workers: int | None) -> Iterator[Packed]:
+def write_shards(arguments: Iterable[tuple[Any, ...]], workers: int | None) -> Iterator[Packed]:
     """`write_shard` for all arguments, as they are done."""
     if workers == 0:
         yield from (write_shard(*given) for given in arguments)
@@ -294,7 +298,7 @@ def write_all(arguments: Iterable[tuple[Any, ...]], workers: int | None) -> Iter
     )
 
 
-def judge(settings: PackingSettings, refused: Sequence[Rejection], found: int) -> None:
+def check_rejections(settings: PackingSettings, refused: Sequence[Rejection], found: int) -> None:
     """Raise TooManyRejected, with the list written, if that many were refused. A known image is no
     bad one when extending.
     """
@@ -308,11 +312,11 @@ def judge(settings: PackingSettings, refused: Sequence[Rejection], found: int) -
     )
 
 
-def compose(
+def compose_manifest(
     before: Manifest | None,
     said: dict[str, Any],
     packed: Mapping[str, Packed],
-    haul: Haul,
+    haul: ScanResult,
     refusals: int,
 ) -> Manifest:
     """The set as it is now. Classes that were there keep their numbers."""
@@ -331,10 +335,10 @@ def compose(
     )
 
 
-def sum_up(
+def log_summary(
     settings: PackingSettings,
     packed: Mapping[str, Packed],
-    haul: Haul,
+    haul: ScanResult,
     scanning: float,
     packing: float,
 ) -> None:

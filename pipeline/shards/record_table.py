@@ -18,10 +18,10 @@ from pipeline.core import parquet as parquet_files
 from pipeline.core.errors import InputError
 from pipeline.core.json_files import from_json
 from pipeline.core.records import ImageRecord, Rejection
-from pipeline.shards.manifest import Manifest, Shard, mending
+from pipeline.shards.manifest import Manifest, Shard, repair_hint
 
 
-def whole_part(out: str, name: str) -> bool:
+def part_intact(out: str, name: str) -> bool:
     """Whether every byte of a record part is what was written."""
     return parquet.parquet_intact(storage.join(out, FOLDER, f"{name}.parquet"))
 
@@ -83,7 +83,7 @@ def read_part(out: str, name: str, columns: list[str] | None = None) -> pa.Table
         return parquet_files.read_table(path, columns)
     except parquet_files.DAMAGE_ERRORS as error:
         raise InputError(
-            f"{path} cannot be read ({error}), expected the record table that packing wrote beside the tars; {mending(out)}"
+            f"{path} cannot be read ({error}), expected the record table that packing wrote beside the tars; {repair_hint(out)}"
         ) from None
 
 

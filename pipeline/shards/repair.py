@@ -13,7 +13,7 @@ from typing import Any
 from pipeline.core import rejections, storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import ImageRecord
-from pipeline.shards.manifest import Manifest, Shard, missing_tars, note_damaged, noted_damaged
+from pipeline.shards.manifest import Manifest, Shard, missing_tars, read_damaged, write_damaged
 from pipeline.shards.plan import ShardPlan
 from pipeline.shards.record_table import FOLDER, read_packed, read_part
 from pipeline.shards.writer import write_shard
@@ -22,11 +22,11 @@ from pipeline.sources.base import Source
 SCRATCH = "_mending"
 
 
-def damaged_shards(out: str, manifest: Manifest) -> list[Shard]:
+def find_damaged(out: str, manifest: Manifest) -> list[Shard]:
     """Shards whose tar or record part is not there, has another size, or was found damaged by
     verification.
     """
-    wrong = noted_damaged(out).union(missing_tars(out, manifest.shards))
+    wrong = read_damaged(out).union(missing_tars(out, manifest.shards))
     parts = set(storage.list_names(storage.join(out, FOLDER)))
     return [
         shard
@@ -35,7 +35,7 @@ def damaged_shards(out: str, manifest: Manifest) -> list[Shard]:
     ]
 
 
-def mend(
+def repair(
     source: Source,
     out: str,
     manifest: Manifest,
@@ -51,16 +51,16 @@ def mend(
         if plan is None or not _write(source, out, shard, plan):
             left.append(shard)
     storage.remove_folder(storage.join(out, SCRATCH))
-    note_damaged(out, [shard.name for shard in left])
+    write_damaged(out, [shard.name for shard in left])
     if left:
         raise InputError(
             f"{len(left)} shards of {out} are damaged, {left[0].name} first, and this imagery does not hold what they were "
-            f"packed from; expected that of {commands(manifest)}; run these again as they were run, or put the tars and their "
+            f"packed from; expected that of {packing_commands(manifest)}; run these again as they were run, or put the tars and their "
             "record parts back from a copy"
         )
 
 
-def commands(manifest: Manifest) -> str:
+def packing_commands(manifest: Manifest) -> str:
     """The calls that packed a set, as far as a manifest says."""
     packed: Sequence[Mapping[str, Any]] = (manifest.packing, *manifest.added)
     said = [

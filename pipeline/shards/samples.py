@@ -11,11 +11,17 @@ from typing import IO, Any, cast
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import KEY_PATTERN, Split, View, excerpt, is_position, is_utf8
-from pipeline.shards.external import facts_of
-from pipeline.shards.manifest import mending, read_manifest
-from pipeline.shards.tar_reader import IMAGES, SAID, HashedStream, read_members, read_tar
+from pipeline.shards.external import external_metadata
+from pipeline.shards.manifest import read_manifest, repair_hint
+from pipeline.shards.tar_reader import (
+    IMAGE_SUFFIXES,
+    METADATA_SUFFIXES,
+    HashedStream,
+    read_members,
+    read_tar,
+)
 
-OURS = {"key", "location", "view", "split", "geotag"}
+REQUIRED_FIELDS = {"key", "location", "view", "split", "geotag"}
 "What the JSON of a shard of ours says at least."
 
 
@@ -45,23 +51,23 @@ def read_shard(
     """
     path = storage.join(shards, f"{name}.tar")
     for key, members in read_tar(path) if sha256 is None else _read_whole(shards, path, sha256):
-        data = next((members[ending] for ending in IMAGES if ending in members), None)
+        data = next((members[ending] for ending in IMAGE_SUFFIXES if ending in members), None)
         if data is None:
             continue
         said = _json(members.get("json"))
-        if said.keys() >= OURS:
+        if said.keys() >= REQUIRED_FIELDS:
             if wrong := next(_faults(key, said), None):
                 raise InputError(
-                    f"the JSON of sample {key!r} in {path} has {wrong}; {mending(shards)}"
+                    f"the JSON of sample {key!r} in {path} has {wrong}; {repair_hint(shards)}"
                 )
             yield Sample(key=key, data=data, facts=said)
             continue
         if split is None or view is None:
             raise InputError(
-                f"{path} was not packed by jobs/make_shards.py: sample {key} has no JSON that says {', '.join(sorted(OURS))}; "
+                f"{path} was not packed by jobs/make_shards.py: sample {key} has no JSON that says {', '.join(sorted(REQUIRED_FIELDS))}; "
                 "give its --split and --view, or pack its images with jobs/make_shards.py"
             )
-        facts = facts_of(key, said, members.get("cls"), split, view)
+        facts = external_metadata(key, said, members.get("cls"), split, view)
         yield Sample(key=facts["key"], data=data, facts=facts)
 
 
@@ -69,11 +75,11 @@ def _read_whole(shards: str, path: str, sha256: str) -> Iterator[tuple[str, dict
     """`read_tar`, and behind its end the hash is compared."""
     with storage.open_read(path) as stream:
         hashed = HashedStream(stream)
-        yield from read_members(cast(IO[bytes], hashed), path, IMAGES + SAID)
+        yield from read_members(cast(IO[bytes], hashed), path, IMAGE_SUFFIXES + METADATA_SUFFIXES)
         hashed.drain()
     if hashed.digest.hexdigest() != sha256:
         raise InputError(
-            f"{path} has not the hash that the manifest says, expected what was packed; {mending(shards)}"
+            f"{path} has not the hash that the manifest says, expected what was packed; {repair_hint(shards)}"
         )
 
 
@@ -87,7 +93,7 @@ def read_locations(shards: str, name: str) -> Iterator[str]:
         location = _json(members.get("json")).get("location")
         if not isinstance(location, str):
             raise InputError(
-                f"{path}: the JSON of {key!r} says no location, expected what was packed; {mending(shards)}"
+                f"{path}: the JSON of {key!r} says no location, expected what was packed; {repair_hint(shards)}"
             )
         yield location
 
@@ -126,6 +132,6 @@ def fetch(shards: str, keys: Iterable[str]) -> dict[str, bytes]:
     for shard in read_manifest(shards).shards:
         prefix = f"{shard.split}-{shard.view}-"
         if any(key.startswith(prefix) for key in wanted):
-            members = read_tar(storage.join(shards, f"{shard.name}.tar"), IMAGES)
+            members = read_tar(storage.join(shards, f"{shard.name}.tar"), IMAGE_SUFFIXES)
             found |= {key: next(iter(images.values())) for key, images in members if key in wanted}
     return found

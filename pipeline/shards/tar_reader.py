@@ -13,15 +13,15 @@ from typing import IO, Self
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 
-IMAGES = ("jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp", "gif", "ppm")
+IMAGE_SUFFIXES = ("jpg", "jpeg", "png", "webp", "tif", "tiff", "bmp", "gif", "ppm")
 "Endings of the members that are images."
-SAID = ("json", "cls")
+METADATA_SUFFIXES = ("json", "cls")
 """Endings of the members that say what an image shows. All others are passed over: captions, masks,
 pickles."""
 
-LONGEST_HEADER = 1 << 16
+MAX_HEADER_BYTES = 1 << 16
 "Bytes of a long name, or of a pax header; a path has four thousand at most."
-NAMING = (
+EXTENDED_HEADERS = (
     tarfile.GNUTYPE_LONGNAME,
     tarfile.GNUTYPE_LONGLINK,
     tarfile.XHDTYPE,
@@ -32,7 +32,7 @@ NAMING = (
 
 
 def read_tar(
-    path: str, endings: tuple[str, ...] = IMAGES + SAID
+    path: str, endings: tuple[str, ...] = IMAGE_SUFFIXES + METADATA_SUFFIXES
 ) -> Iterator[tuple[str, dict[str, bytes]]]:
     """Key and members (ending -> bytes) of each sample of a tar, in its order; members of other
     endings are not read.
@@ -56,7 +56,7 @@ def read_members(
         with tarfile.open(fileobj=stream, mode="r|", tarinfo=_Header) as tar:
             while (member := tar.next()) is not None:
                 tar.members = []  # type: ignore[attr-defined]  # it would remember every header
-                refuse_name(member.name, path)
+                check_member_name(member.name, path)
                 folder, _, name = member.name.removeprefix("./").rpartition("/")
                 stem, _, ending = name.partition(".")
                 if not member.isfile() or ending.lower() not in endings:
@@ -80,7 +80,7 @@ def read_members(
         yield key, held
 
 
-def refuse_name(name: str, path: str) -> None:
+def check_member_name(name: str, path: str) -> None:
     """Raise InputError where a member's name leads out of the tar's own folder."""
     if (
         name.startswith(("/", "\\"))
@@ -113,7 +113,7 @@ class _Header(tarfile.TarInfo):
             raise tarfile.ReadError(str(error)) from None
         if said.type == tarfile.GNUTYPE_SPARSE:
             cls._refuse_sparse()
-        if said.size < 0 or (said.type in NAMING and said.size > LONGEST_HEADER):
+        if said.size < 0 or (said.type in EXTENDED_HEADERS and said.size > MAX_HEADER_BYTES):
             raise tarfile.ReadError(f"it has a header of {said.size} bytes")
         return said
 

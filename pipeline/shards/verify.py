@@ -15,19 +15,19 @@ import ray
 from pipeline.core import cluster, storage
 from pipeline.core.errors import InputError
 from pipeline.core.progress import progress
-from pipeline.shards.manifest import Shard, note_damaged, read_manifest, some
-from pipeline.shards.record_table import read_part, whole_part
-from pipeline.shards.tar_reader import IMAGES, SAID, HashedStream, read_members
+from pipeline.shards.manifest import Shard, first_three, read_manifest, write_damaged
+from pipeline.shards.record_table import part_intact, read_part
+from pipeline.shards.tar_reader import IMAGE_SUFFIXES, METADATA_SUFFIXES, HashedStream, read_members
 
 
-def refuse_damaged(shards: str, workers: int | None = None) -> None:
+def require_intact(shards: str, workers: int | None = None) -> None:
     """Look at every byte of a set. Raises InputError where one is not what was packed, as `verify_table`
     does besides.
     """
     _, wrong = verify(shards, workers)
     if wrong:
         raise InputError(
-            f"{shards} is damaged in {len(wrong)} places: {some(wrong)}; run the command that packed it again "
+            f"{shards} is damaged in {len(wrong)} places: {first_three(wrong)}; run the command that packed it again "
             "(jobs/make_shards.py), which makes anew what is damaged"
         )
 
@@ -45,7 +45,7 @@ def verify(shards: str, workers: int | None = None) -> tuple[int, list[str]]:
             found += [(shard.name, sentence) for sentence in wrong]
             meter.advance(shard.samples, damaged=len({name for name, _ in found}))
     with suppress(OSError):  # of a set that cannot be written to, somebody else's, nothing is noted
-        note_damaged(shards, {name for name, _ in found})
+        write_damaged(shards, {name for name, _ in found})
     return len(manifest.shards), [sentence for _, sentence in sorted(found)]
 
 
@@ -72,7 +72,9 @@ def check_shard(root: str, shard: Shard) -> list[str]:
     with storage.open_read(path) as stream:
         hashed = HashedStream(stream)
         try:
-            for key, members in read_members(cast(IO[bytes], hashed), path, IMAGES + SAID):
+            for key, members in read_members(
+                cast(IO[bytes], hashed), path, IMAGE_SUFFIXES + METADATA_SUFFIXES
+            ):
                 said = json.loads(members.pop("json"))["sha256"]
                 [image] = members.values()
                 keys.append((key, said))
@@ -95,7 +97,7 @@ def check_shard(root: str, shard: Shard) -> list[str]:
         part = read_part(root, shard.name, ["key", "sha256"])
         if list(zip(part["key"].to_pylist(), part["sha256"].to_pylist(), strict=True)) != keys:
             wrong.append(f"the record table of {path} lists other images than it holds")
-        if not whole_part(root, shard.name):
+        if not part_intact(root, shard.name):
             wrong.append(f"the record table of {path} has a byte that packing did not write")
     except InputError as error:
         wrong.append(str(error))

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.batches.holdout import held_out, without
-from pipeline.batches.training import Reading, TrainingStream
+from pipeline.batches.holdout import exclude_locations, holdout_locations
+from pipeline.batches.training import StreamConfig, TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.shards.manifest import read_manifest
@@ -16,19 +16,19 @@ NAMES = [f"{number:04d}" for number in range(1000)]
 
 
 def test_about_the_share_that_was_asked_for_is_held_out() -> None:
-    assert held_out(NAMES, 0.0) == frozenset()
-    assert 70 <= len(held_out(NAMES, 0.1)) <= 130
+    assert holdout_locations(NAMES, 0.0) == frozenset()
+    assert 70 <= len(holdout_locations(NAMES, 0.1)) <= 130
 
 
 @given(st.sets(st.sampled_from(NAMES), min_size=200))
 def test_whether_a_place_is_held_out_depends_on_its_name_alone(some: set[str]) -> None:
-    assert held_out(sorted(some), 0.2) == held_out(NAMES, 0.2) & some
+    assert holdout_locations(sorted(some), 0.2) == holdout_locations(NAMES, 0.2) & some
 
 
 @pytest.mark.parametrize("share", [0.0001, 0.9999])
 def test_a_share_that_leaves_nothing_to_look_at_or_to_train_on_is_refused(share: float) -> None:
     with pytest.raises(InputError, match="expected at least two held out and two to train on"):
-        held_out(NAMES[:20], share)
+        holdout_locations(NAMES[:20], share)
 
 
 def test_places_held_out_are_neither_streamed_nor_classes_and_an_epoch_is_a_pass_over_the_others(
@@ -37,7 +37,7 @@ def test_places_held_out_are_neither_streamed_nor_classes_and_an_epoch_is_a_pass
     share = next(
         share for tenth in range(1, 10) if len(chosen(tiny_shards, share := tenth / 10)) == 2
     )
-    stream = TrainingStream(tiny_shards, Reading(batch_size=2, image_size=32, hold_out=share))
+    stream = TrainingStream(tiny_shards, StreamConfig(batch_size=2, image_size=32, hold_out=share))
     assert len(stream.held_out) == 2
     assert set(stream.classes) == set(stream.manifest.classes) - stream.held_out
     assert sorted(stream.classes.values()) == [0, 1, 2, 3]
@@ -54,7 +54,7 @@ def test_places_held_out_are_neither_streamed_nor_classes_and_an_epoch_is_a_pass
 
 def chosen(shards: str, share: float) -> frozenset[str]:
     try:
-        return held_out(read_manifest(shards).classes, share)
+        return holdout_locations(read_manifest(shards).classes, share)
     except InputError:
         return frozenset()
 
@@ -62,8 +62,8 @@ def chosen(shards: str, share: float) -> frozenset[str]:
 def test_shards_are_counted_without_the_places_left_out(tiny_shards: str) -> None:
     manifest = read_manifest(tiny_shards)
     drones = manifest.of(Split.TRAIN, View.DRONE)
-    assert without(tiny_shards, drones, frozenset()) == drones
-    counted = without(tiny_shards, drones, frozenset(manifest.classes[:2]))
+    assert exclude_locations(tiny_shards, drones, frozenset()) == drones
+    counted = exclude_locations(tiny_shards, drones, frozenset(manifest.classes[:2]))
     assert sum(shard.samples for shard in counted) == 3 * (len(manifest.classes) - 2)
     assert [replace(shard, samples=0) for shard in counted] == [
         replace(shard, samples=0) for shard in drones

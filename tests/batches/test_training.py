@@ -20,9 +20,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from pipeline.batches.ordered import decoded  # fmt: skip
+from pipeline.batches.ordered import decode_samples  # fmt: skip
 from pipeline.batches.sampler import plan_pass, read_spans, shuffled  # fmt: skip
-from pipeline.batches.training import Batch, Reading, TrainingStream  # fmt: skip
+from pipeline.batches.training import Batch, StreamConfig, TrainingStream  # fmt: skip
 from pipeline.core import json_files, storage
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch, prefetch_map
@@ -41,7 +41,7 @@ from pipeline.sources.university1652 import University1652
 
 CLASSES = ("0003", "0008", "0839", "Aa")
 SATELLITES, DRONES = 21, 40
-PLAIN = Reading(
+PLAIN = StreamConfig(
     batch_size=4,
     image_size=8,
     augmentation=Augmentation(pad=0, rotation=0, mirror=False),
@@ -85,7 +85,7 @@ def keys(batches: list[tuple[Batch, Batch]], view: View) -> list[str]:
 
 
 def epoch(
-    shards: str, number: int = 0, rank: int = 0, world: int = 1, reading: Reading = PLAIN
+    shards: str, number: int = 0, rank: int = 0, world: int = 1, reading: StreamConfig = PLAIN
 ) -> list[tuple[Batch, Batch]]:
     return list(TrainingStream(shards, reading, rank, world).epoch(number))
 
@@ -459,7 +459,7 @@ def test_images_for_embedding_come_in_the_shards_order_and_an_undecodable_one_as
             if number == 2:  # the second sample's image, cut short
                 member.size -= 30
             new.addfile(member, stream)
-    found = list(decoded(read_shard(str(tmp_path), "x"), 8, threads=2, depth=4))
+    found = list(decode_samples(read_shard(str(tmp_path), "x"), 8, threads=2, depth=4))
     assert [held.key for held, _ in found] == [
         held.key for held in read_shard(shards, "train-drone-000002")
     ]

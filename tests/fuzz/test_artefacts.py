@@ -38,7 +38,7 @@ from pipeline.locate.logistic import LogisticModel
 from pipeline.locate.reliability import ReliabilityBin
 from pipeline.report.inputs import read_findings, read_training
 from pipeline.shards.manifest import Manifest, Shard, read_manifest
-from pipeline.shards.pack import PackingSettings, finished
+from pipeline.shards.pack import PackingSettings, find_finished
 from pipeline.shards.record_table import Packed, read_packed, read_part
 from pipeline.shards.record_table import write_part as write_records
 from pipeline.simulation.simulate import SimulationSettings, simulate
@@ -137,7 +137,7 @@ def test_a_manifest(folder: Path, data: st.DataObject) -> None:
         assert all(isinstance(name, str) for name in found.classes)
     for extend in (False, True):
         with bounded(InputError):
-            finished(
+            find_finished(
                 PackingSettings(root="x", out=str(folder / "set"), extend=extend),
                 {"source": "photos"},
             )

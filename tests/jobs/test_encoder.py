@@ -56,7 +56,7 @@ def test_the_images_to_check_by_are_the_same_each_time_and_of_every_split_and_vi
 def test_a_shard_without_one_image_that_can_be_decoded_is_said_beforehand(
     tiny_shards: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(encoders, "decoded", lambda samples, *given: iter([]))
+    monkeypatch.setattr(encoders, "decode_samples", lambda samples, *given: iter([]))
     with pytest.raises(InputError, match="none of the first images of"):
         images_of(asked(tiny_shards), 32, "torch", PROBE_IMAGES)
 

@@ -10,7 +10,7 @@ import torch
 from jobs.training.probes import look, see, view_gap
 from jobs.training.recipes import smoke
 from model.pvda import FeatureEncoder
-from pipeline.batches.training import Reading, TrainingStream
+from pipeline.batches.training import StreamConfig, TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import View
 from pipeline.features.table import Floats
@@ -59,7 +59,7 @@ def test_a_look_at_training_places_leaves_the_encoder_as_it_was(
     torch.manual_seed(0)
     encoder = FeatureEncoder(replace(smoke().network, part_dim=16)).train()
     before = {name: tensor.clone() for name, tensor in encoder.state_dict().items()}
-    stream = TrainingStream(tiny_shards, Reading(batch_size=2, image_size=64, hold_out=share))
+    stream = TrainingStream(tiny_shards, StreamConfig(batch_size=2, image_size=64, hold_out=share))
     found = look(encoder, stream)
     assert encoder.training
     assert all(torch.equal(before[name], tensor) for name, tensor in encoder.state_dict().items())
@@ -78,7 +78,7 @@ def test_a_look_leaves_out_damaged_images_and_says_where_all_are(
 ) -> None:
     encoder = FeatureEncoder(replace(smoke().network, part_dim=16))
     stream = TrainingStream(
-        tiny_shards, Reading(batch_size=2, image_size=64, hold_out=share, threads=1)
+        tiny_shards, StreamConfig(batch_size=2, image_size=64, hold_out=share, threads=1)
     )
     whole = see(encoder, stream, View.DRONE)
     drawn, every = count(), 2

@@ -13,13 +13,13 @@ from PIL import Image
 
 from jobs.train import Settings, train
 from jobs.training.recipes import smoke
-from pipeline.batches.training import Reading, TrainingStream
+from pipeline.batches.training import StreamConfig, TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.features.embed import EmbeddingSettings, Encoder, pending_shards
 from pipeline.features.embed_worker import EncoderSpec
 from pipeline.features.part import PartFooter, PartRows, write_part
-from pipeline.shards.manifest import NOTE, Shard, read_manifest
+from pipeline.shards.manifest import DAMAGED_FILE, Shard, read_manifest
 from pipeline.shards.pack import PackingSettings, pack
 from pipeline.shards.samples import read_shard
 from pipeline.shards.verify import check_shard, verify
@@ -93,7 +93,7 @@ def test_training_refuses_a_damaged_tar_or_leaves_the_damaged_image_out(out: Pat
     """By default it looks at sizes before it starts, at each image's hash and name as it reads it."""
     _, tar = a_shard(out)
     good, refused, left_out = tar.read_bytes(), 0, 0
-    reading = Reading(batch_size=2, image_size=16, seed=1, threads=1, shuffle_buffer=4)
+    reading = StreamConfig(batch_size=2, image_size=16, seed=1, threads=1, shuffle_buffer=4)
 
     def batches() -> list[Any]:
         return list(TrainingStream(str(out), reading).epoch(0))
@@ -185,7 +185,7 @@ def test_the_command_that_packed_makes_the_damaged_shard_anew(
     assert {name: data for name, data in content(out).items() if name.endswith(".tar")} == {
         name: data for name, data in content(whole).items() if name.endswith(".tar")
     }
-    assert not (out / NOTE).exists()
+    assert not (out / DAMAGED_FILE).exists()
 
 
 @pytest.mark.parametrize("what", SPOILT)

@@ -13,12 +13,12 @@ import pytest
 import webdataset
 from PIL import Image
 
-from pipeline.batches.training import Reading, TrainingStream
+from pipeline.batches.training import StreamConfig, TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.features.embed import EmbeddingSettings, Encoder, EncoderSpec, embed_gallery
 from pipeline.features.table import open_table
-from pipeline.shards.external import facts_of, open_manifest
+from pipeline.shards.external import external_metadata, open_manifest
 from pipeline.shards.manifest import read_manifest
 from pipeline.shards.samples import read_shard
 
@@ -112,7 +112,7 @@ def test_samples_come_with_legal_keys_their_labels_and_their_positions(foreign: 
 def test_the_location_is_what_says_it_surest(
     key: str, said: dict[str, object], label: bytes, location: str
 ) -> None:
-    assert facts_of(key, said, label, *TWO)["location"] == location
+    assert external_metadata(key, said, label, *TWO)["location"] == location
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def test_the_location_is_what_says_it_surest(
 def test_a_position_is_taken_where_it_is_plain(
     said: dict[str, object], geotag: dict[str, float] | None
 ) -> None:
-    assert facts_of("0", said, None, *TWO)["geotag"] == geotag
+    assert external_metadata("0", said, None, *TWO)["geotag"] == geotag
 
 
 def test_without_a_manifest_both_split_and_view_must_be_given(foreign: str, tmp_path: Path) -> None:
@@ -142,7 +142,7 @@ def test_without_a_manifest_both_split_and_view_must_be_given(foreign: str, tmp_
     with pytest.raises(InputError, match="not a finished set of shards"):
         open_manifest(str(tmp_path), *TWO)
     with pytest.raises(InputError, match=r"no manifest\.json"):
-        TrainingStream(foreign, Reading())
+        TrainingStream(foreign, StreamConfig())
 
 
 def test_shards_of_ours_read_as_they_did(tiny_shards: str) -> None:
