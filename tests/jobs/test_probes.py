@@ -88,7 +88,7 @@ def test_a_look_leaves_out_damaged_images_and_says_where_all_are(
             raise DecodeError("damaged image", "here")
         return decode(data)
 
-    monkeypatch.setattr("pipeline.batches.training.decode", failing)
+    monkeypatch.setattr("pipeline.batches.ordered.decode", failing)
     found = see(encoder, stream, View.DRONE)
     assert found.locations == whole.locations[1::2]
     assert np.allclose(found.pooled_NC, whole.pooled_NC[1::2], atol=1e-5)
