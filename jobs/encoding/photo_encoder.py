@@ -110,7 +110,7 @@ class PhotoEncoder:
         """Unit embeddings (Q, D) of the photos that can be decoded, in order, and for each photo
         None or why it has no row.
 
-        `list_names` are what a rejection's path says; by default the photos' numbers, from 1.
+        `names` are what a rejection's path says; by default the photos' numbers, from 1.
         """
         named = names or [f"photo {number}" for number in range(1, len(photos) + 1)]
         opened = (

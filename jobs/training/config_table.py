@@ -14,7 +14,7 @@ from pipeline.core.progress import console
 
 
 def show_config(recipe: Recipe, **run: object) -> None:
-    """Print all settings of a recipe, and those of the `run_pool` besides (shards, out, ...), on
+    """Print all settings of a recipe, and those of the `run` besides (shards, out, ...), on
     standard error.
     """
     # The console's soft wrap, meant for sentences, would let the cells run out of the table.

@@ -60,7 +60,7 @@ def require_int8(device: str) -> None:
 def quantise(encoder: FeatureEncoder, size: int, calibrate: Callable[[], None]) -> None:
     """Put a quantised backbone into a folded `encoder`, for images of `size` x `size` pixels.
 
-    `fit_calibration` runs images through the encoder while the ranges of its activations are watched: per tensor, 8 bits
+    `calibrate` runs images through the encoder while the ranges of its activations are watched: per tensor, 8 bits
     unsigned, from histograms. Weights have a range per output channel, signed. It runs on one thread: sums in another
     order give other ranges in their last digit, and workers would round differently.
     """

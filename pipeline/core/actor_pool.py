@@ -38,9 +38,9 @@ class PoolConfig:
     in_flight: int = 2
     "Items that an actor has at once; its `max_concurrency`."
     refusals: tuple[type[Exception], ...] = ()
-    "What `watch_replicas` raises of an item that is no use trying again: it is set aside at once."
+    "What `work` raises of an item that is no use trying again: it is set aside at once."
     fatal: tuple[type[Exception], ...] = ()
-    "What `watch_replicas` raises when all items would fail alike: it is raised by the crew."
+    "What `work` raises when all items would fail alike: it is raised by the crew."
     patience: float = 600.0
     "Seconds without any worker until NobodyCame."
     say: Callable[[str], None] = lambda text: None

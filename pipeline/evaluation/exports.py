@@ -41,7 +41,7 @@ def answer_text(
 ) -> str:
     """The answer file of one task's per-query rows.
 
-    `list_names`: file name of each key; a gallery image's id is its file's name without ending, or, without `list_names`, its location,
+    `names`: file name of each key; a gallery image's id is its file's name without ending, or, without `names`, its location,
     which in University-1652's satellite gallery is the same. `order`: the queries' file names in the order that the challenge
     asks for (its query_drone_name.txt); without it, the rows' order.
 

@@ -88,7 +88,7 @@ class TableWriteFailed(RuntimeError):
 
 
 class ShardEmbedder:
-    """One worker. `watch_replicas` may be called by two threads at once."""
+    """One worker. `work` may be called by two threads at once."""
 
     def __init__(self, given: EmbedJob, network: EncoderSpec) -> None:
         self._given, self._network = given, network

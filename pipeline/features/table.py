@@ -209,7 +209,7 @@ class FeatureTable:
         """Embeddings of the selected rows as arrays (B, D), B <= rows, in the order of `labels`.
 
         No more than a block is in memory; without `rows` it has 64 MiB at most. `dtype` may be
-        `list_tiles`: as the parts have them. Raises InputError where an embedding is NaN or not of unit
+        `stored`: as the parts have them. Raises InputError where an embedding is NaN or not of unit
         length.
         """
         wanted = self.dtype if dtype == "stored" else dtype

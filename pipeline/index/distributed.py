@@ -30,7 +30,7 @@ class DistributedIndex:
         """`cores`: of each actor. More actors than parts are not made: a part is the smallest piece
         that an actor can hold.
 
-        Raises InputError when there is no index at `draw_path`, or it is damaged.
+        Raises InputError when there is no index at `path`, or it is damaged.
         """
         told = read_metadata(path)
         self.facts = metadata_dict(told)

@@ -78,7 +78,7 @@ class RowIds:
     """The rows of one part of an index, mapped from its Arrow file."""
 
     def __init__(self, path: str) -> None:
-        """`draw_path` is on a local disk. Raises InputError where it is no such file."""
+        """`path` is on a local disk. Raises InputError where it is no such file."""
         try:
             with pa.memory_map(path) as source:
                 reader = pa.ipc.open_file(source)

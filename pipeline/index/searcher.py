@@ -70,10 +70,10 @@ class Index:
         whole: bool | None = None,
     ) -> None:
         """`parts`: numbers of those to open; all by default. `threads`: of FAISS; by default one
-        per core. `summary`: what index.json says, where it is not written yet. `whole`: whether every
+        per core. `told`: what index.json says, where it is not written yet. `whole`: whether every
         byte is looked at, by default of small parts.
 
-        Raises InputError when there is no index at `draw_path`, or it is damaged.
+        Raises InputError when there is no index at `path`, or it is damaged.
         """
         self.path, self.told = path, told or read_metadata(path)
         self.facts = metadata_dict(self.told)
@@ -183,7 +183,7 @@ def merge_results(found: Sequence[tuple[Floats, Ints]], k: int) -> tuple[Floats,
 
 
 def make_hits(scores_QK: Floats, rows_QK: Ints, names: pa.Table) -> list[list[Hit]]:
-    """Hits of each query from what `search_rows` and `list_names` give."""
+    """Hits of each query from what `search_rows` and `names` give."""
     said, found, begin = names.to_pylist(), [], 0
     for scores_K, count in zip(
         scores_QK, np.count_nonzero(rows_QK != NO_ROW, axis=1).tolist(), strict=True

@@ -95,7 +95,7 @@ def make_panel(
     row: Mapping[str, Any], album: ThumbnailCache, vectors: Mapping[str, Floats] | None = None, parts: int = 1,
     merged: Sequence[str] = (),
 ) -> Panel:  # fmt: skip
-    """One query's panel. `vectors`: embeddings (D,) by key, of `parts` parts; `merge_results`: keys of the
+    """One query's panel. `vectors`: embeddings (D,) by key, of `parts` parts; `merged`: keys of the
     images that the query is the mean of."""
 
     def answer(rank: int, key: str, location: str, score: float) -> Answer:

@@ -46,7 +46,7 @@ class Table:
 def group_tables(
     groups: Sequence[Mapping[str, Any]], names: Mapping[str, str], r1: Mapping[str, float]
 ) -> list[Table]:
-    """One table for each task and column of groups.json. `list_names`, `r1`: of each task, as the page
+    """One table for each task and column of groups.json. `names`, `r1`: of each task, as the page
     calls it, and its R@1.
     """
     found: dict[tuple[str, str], list[Line]] = {}

@@ -159,7 +159,7 @@ def _settle_few(
     scores_QB: Floats, flat_C: Ints, owner_P: Ints, score_P: Floats, bounds_P: tuple[Floats, Floats], floor_Q: Floats,
     exact: Callable[[Ints], Floats],
 ) -> tuple[Ints, Floats, Ints]:  # fmt: skip
-    """`apply_track` from the C entries alone that reach their query's lowest bound."""
+    """`settle` from the C entries alone that reach their query's lowest bound."""
     score_C, query_C = scores_QB.reshape(-1)[flat_C], flat_C // scores_QB.shape[1]
     doubt_C = score_C >= floor_Q[query_C]
     for low_Q1, high_Q1 in zip(

@@ -27,10 +27,10 @@ class PoisonedItem(Exception):
 
 
 class Batcher(Generic[Item, Result]):
-    """Asks `watch_replicas` for the results of up to `largest` items at once, with `concurrency` batches at work
+    """Asks `work` for the results of up to `largest` items at once, with `concurrency` batches at work
     at a time.
 
-    `watch_replicas` gives one result per item, in order. A batch that raises Gone is tried again item by item, so that one that kills
+    `work` gives one result per item, in order. A batch that raises Gone is tried again item by item, so that one that kills
     is told from those beside it.
     """
 
@@ -71,7 +71,7 @@ class Batcher(Generic[Item, Result]):
     async def ask(self, item: Item) -> Result:
         """The result of one item. Cancelled, it leaves the queue.
 
-        Raises what `watch_replicas` raises, and Alone.
+        Raises what `work` raises, and Alone.
         """
         future: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
         self._waiting[future] = item

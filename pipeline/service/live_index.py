@@ -43,7 +43,7 @@ class OpenedIndex:
 
 
 def open_verified(path: str) -> OpenedIndex:
-    """Raises InputError when there is no index at `draw_path`, or a calibration that is another's."""
+    """Raises InputError when there is no index at `path`, or a calibration that is another's."""
     index = Index(path, whole=True)  # a damaged list is met by few searches, and late
     calibration = find_calibration(path, index.facts)
     spacing_m = None if calibration else read_gallery_map(index).spacing_m
@@ -56,7 +56,7 @@ class LiveIndex:
     """
 
     def __init__(self, path: str) -> None:
-        """Raises InputError when there is no index at `draw_path` that can be used."""
+        """Raises InputError when there is no index at `path` that can be used."""
         self._path = path
         self._taken = self._seen = (
             self._said()

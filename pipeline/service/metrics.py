@@ -47,7 +47,7 @@ class ServiceMetrics:
         queue.set_function(waiting)
 
     def request(self, path: str, status: int, seconds: float) -> None:
-        """One request was answered. `draw_path` is one of the service's, or `other`."""
+        """One request was answered. `path` is one of the service's, or `other`."""
         self._requests.labels(path, str(status)).inc()
         self._seconds.labels(path).observe(seconds)
 

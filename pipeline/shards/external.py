@@ -95,7 +95,7 @@ def external_metadata(
 
     The location is the JSON's first field of LOCATIONS, else the label, else the key's folder, else
     the key: then every image is a place of its own. A position comes from plain numbers, at the top
-    or in `tile_geotag`.
+    or in `geotag`.
     """
     folder, _, _ = key.rpartition("/")
     named = next(

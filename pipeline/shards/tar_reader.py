@@ -48,7 +48,7 @@ def read_tar(
 def read_members(
     stream: IO[bytes], path: str, endings: tuple[str, ...]
 ) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """`read_tar` of an open stream, which is read from its start to its end; `draw_path` stands in the
+    """`read_tar` of an open stream, which is read from its start to its end; `path` stands in the
     messages.
     """
     key, held, samples = "", dict[str, bytes](), 0

@@ -21,7 +21,7 @@ from pipeline.shards.tar_reader import IMAGE_SUFFIXES, METADATA_SUFFIXES, Hashed
 
 
 def require_intact(shards: str, workers: int | None = None) -> None:
-    """Look at every byte of a set. Raises InputError where one is not what was packed, as `verify_table`
+    """Look at every byte of a set. Raises InputError where one is not what was packed, as `verify`
     does besides.
     """
     _, wrong = verify(shards, workers)

@@ -37,7 +37,7 @@ class Stamp:
 
 
 class Canvas:
-    """Maps under construction; `finish_index` turns them into a World. Resolution never changes what is
+    """Maps under construction; `finish` turns them into a World. Resolution never changes what is
     drawn where.
     """
 

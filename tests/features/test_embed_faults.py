@@ -40,7 +40,7 @@ def network_of_colours(
     at_start: Callable[[], None] = lambda: None,
     spoil: str = "",
 ) -> EncoderSpec:
-    """An encoder that needs no weights: the mean colour's unit vector. It takes `parse_time` a batch,
+    """An encoder that needs no weights: the mean colour's unit vector. It takes `seconds` a batch,
     and its worker leaves its process id in the folder `pids`; what `spoil` names happens to a black
     image."""
 

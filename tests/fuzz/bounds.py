@@ -33,7 +33,7 @@ def examples(quick: int, share: float = 1.0) -> settings:
         max_examples=max(1, round(EXAMPLES * share)) if EXAMPLES else quick,
         derandomize=not EXAMPLES,
         database=None,
-        deadline=None,  # `bounded_map` stops what takes too long while it runs
+        deadline=None,  # `bounded` stops what takes too long while it runs
         suppress_health_check=list(HealthCheck),
         print_blob=True,
     )

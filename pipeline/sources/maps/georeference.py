@@ -74,7 +74,7 @@ class Georeference:
         return tags
 
     def ground_pixel(self, place: tuple[float, float]) -> tuple[float, float]:
-        """Width and height in metres, on the ground, of the pixel at a place; NaN where `tile_to_degrees`
+        """Width and height in metres, on the ground, of the pixel at a place; NaN where `degrees`
         is.
 
         Measured between places a few pixels apart on the ellipsoid: true metres whatever the map's

@@ -89,7 +89,7 @@ def _starts_before_last(length: int, side: int, overlap: float) -> range:
 
 
 def parse_window(part: str) -> Window:
-    """The window that `part_path` says.
+    """The window that `part` says.
 
     Raises ValueError where it says none.
     """
