@@ -1,12 +1,12 @@
-"""What embedding loses between the tar and the Parquet part: the stage's speed over that of the
-encoder alone, and its memory.
+"""Embedding speed from tar to Parquet, as a ratio to the encoder alone, and its memory.
 
-Prints one line per figure: images per second from tar to Parquet by one worker as a ratio to the
-same encoder, in the same worker and by turns, on tensors that are there already (goal: at least
-0.95); and a worker's peak memory over many images to that over a quarter of them (goal: 1).
+Prints one line per figure: images per second of one worker from tar to Parquet as a ratio to the
+same encoder in the same worker, alternating, on tensors in memory (goal: at least 0.95); and a
+worker's peak memory over many images as a ratio to a quarter of them (goal: 1).
 """
 
 import argparse
+import hashlib
 import io
 import json
 import os
@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import ray
-from PIL import Image
+from synthetic import jpegs
 
 from jobs.encoding.encoder import (
     CALIBRATION_IMAGES,
@@ -38,15 +38,15 @@ from pipeline.features.embed_worker import IN_FLIGHT, EmbedJob, EncoderSpec, Sha
 from pipeline.shards.manifest import Shard
 
 SOURCE_SIDE = 512
-"Of the images in the tars: University-1652's."
+"Side of the images in the tars, pixels: University-1652's."
 DISTINCT = 100
-"Images; more are the same again."
+"Distinct images; the tars repeat them."
 SHARDS = 6
 "Tars of a measured run."
 
 
-class Measured(ShardEmbedder):
-    """The worker, with a look at its encoder and its memory."""
+class MeasuredEmbedder(ShardEmbedder):
+    """The worker, plus measurements of its encoder and its memory."""
 
     def resident(self, images: int) -> float:
         """Images per second of the encoder alone."""
@@ -55,10 +55,10 @@ class Measured(ShardEmbedder):
     def _resident(self, images: int) -> float:
         size, batch = self._network.image_size, self._given.batch_size
         bytes_BHW3 = np.random.default_rng(0).integers(0, 256, (batch, size, size, 3), np.uint8)
-        began = time.perf_counter()
+        begin = time.perf_counter()
         for start in range(0, images, batch):
             self._encoder(bytes_BHW3[: images - start].transpose(0, 3, 1, 2))
-        return images / (time.perf_counter() - began)
+        return images / (time.perf_counter() - begin)
 
     def peak(self) -> float:
         """Peak memory in MB."""
@@ -66,74 +66,66 @@ class Measured(ShardEmbedder):
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale
 
 
-def photo(rng: np.random.Generator) -> bytes:
-    """A JPEG with the detail of a photo: noise at several scales, the finer the fainter; some 50
-    kB.
-    """
-    image = np.zeros((SOURCE_SIDE, SOURCE_SIDE, 3))
-    for cells, share in ((4, 0.45), (16, 0.3), (64, 0.15), (256, 0.1)):
-        coarse = Image.fromarray(rng.integers(0, 256, (cells, cells, 3), np.uint8))
-        image += share * np.asarray(
-            coarse.resize((SOURCE_SIDE, SOURCE_SIDE), Image.Resampling.BICUBIC)
-        )
-    buffer = io.BytesIO()
-    Image.fromarray(image.astype(np.uint8)).save(buffer, "JPEG", quality=90)
-    return buffer.getvalue()
-
-
 def write_shard(folder: str, number: int, images: list[bytes], count: int) -> Shard:
-    """A tar as jobs/make_shards.py writes it."""
+    """Write a tar of `count` images like those of jobs/make_shards.py; its manifest entry."""
     name = f"gallery-drone-{number:06d}"
-    with tarfile.open(Path(folder) / f"{name}.tar", "w") as tar:
+    path = Path(folder) / f"{name}.tar"
+    with tarfile.open(path, "w") as tar:
         for position in range(count):
             key = f"{name}-{position:06d}"
-            said = {
-                "key": key,
-                "location": key,
-                "view": "drone",
-                "split": "gallery",
-                "geotag": None,
+            metadata = {"key": key, "location": key, "view": "drone", "split": "gallery"}
+            members = {
+                "jpg": images[position % len(images)],
+                "json": json.dumps(metadata | {"geotag": None}).encode(),
             }
-            for ending, data in (
-                ("jpg", images[position % len(images)]),
-                ("json", json.dumps(said).encode()),
-            ):
-                member = tarfile.TarInfo(f"{key}.{ending}")
+            for suffix, data in members.items():
+                member = tarfile.TarInfo(f"{key}.{suffix}")
                 member.size = len(data)
                 tar.addfile(member, io.BytesIO(data))
+    data = path.read_bytes()
     return Shard(
-        name=name, split=Split.GALLERY, view=View.DRONE, samples=count, bytes=0, sha256="s"
+        name=name,
+        split=Split.GALLERY,
+        view=View.DRONE,
+        samples=count,
+        bytes=len(data),
+        sha256=hashlib.sha256(data).hexdigest(),
     )
 
 
-def checkpoint(depth: Any, size: int) -> bytes:
-    """A network with the weights that chance gave it."""
-    config = PVDAConfig(depth=depth, image_size=size)
-    weights = {"modules": {"encoder": FeatureEncoder(config).state_dict()}}
+def checkpoint(depth: Any, size: int, **config: Any) -> bytes:
+    """A checkpoint of random weights; `config` overrides the network's other settings."""
+    network = PVDAConfig(depth=depth, image_size=size, **config)
+    weights = {"modules": {"encoder": FeatureEncoder(network).state_dict()}}
     return dumps(
-        Checkpoint(network=config, recipe={}, locations=[], epoch=0, history=[], state=weights)
+        Checkpoint(network=network, recipe={}, locations=[], epoch=0, history=[], state=weights)
     )
 
 
-def network(
-    made: bytes,
+def encoder_spec(
+    weights: bytes,
     batch: int,
     folder: str,
     images: list[bytes],
     settings: EncoderSettings | None = None,
 ) -> EncoderSpec:
-    """The network as a worker builds it, checked by images of a shard of its own."""
-    apart = Path(folder) / "probe"
-    apart.mkdir(exist_ok=True)
-    write_shard(str(apart), 0, images, PROBE_IMAGES + CALIBRATION_IMAGES)
+    """The encoder as a worker builds it; its probe images come from a separate shard."""
+    probe_folder = Path(folder) / "probe"
+    probe_folder.mkdir(exist_ok=True)
+    write_shard(str(probe_folder), 0, images, PROBE_IMAGES + CALIBRATION_IMAGES)
     embedding = EmbeddingSettings(
-        shards=str(apart), out="none", split=Split.GALLERY, view=View.DRONE, batch_size=batch
+        shards=str(probe_folder),
+        out="none",
+        split=Split.GALLERY,
+        view=View.DRONE,
+        batch_size=batch,
     )
-    return make_encoder_spec(made, "the benchmark's", embedding, settings)
+    return make_encoder_spec(weights, "the benchmark's", embedding, settings)
 
 
-def worker(folder: str, made: EncoderSpec, batch: int, threads: int, decoders: int) -> Any:
-    given = EmbedJob(
+def start_worker(folder: str, spec: EncoderSpec, batch: int, threads: int, decoders: int) -> Any:
+    """A worker that has built its encoder; it writes its parts to `folder`/table."""
+    job = EmbedJob(
         shards=folder,
         out=f"{folder}/table",
         batch_size=batch,
@@ -142,94 +134,92 @@ def worker(folder: str, made: EncoderSpec, batch: int, threads: int, decoders: i
         decode_threads=decoders,
     )
     actor: Any = (
-        ray.remote(num_cpus=threads)(Measured)
+        ray.remote(num_cpus=threads)(MeasuredEmbedder)
         .options(max_concurrency=IN_FLIGHT)
-        .remote(given, made)
+        .remote(job, spec)
     )
     ray.get(actor.start.remote())
     return actor
 
 
 def end_to_end(actor: Any, shards: list[Shard]) -> tuple[float, Counter[str]]:
-    """Images per second from tar to part, and where the threads' seconds went."""
-    began, spent = time.perf_counter(), Counter[str]()
+    """Images per second from tar to part, and the seconds that the worker's threads spent."""
+    begin, spent = time.perf_counter(), Counter[str]()
     for _, done in cluster.bounded_map(actor.work.remote, shards, IN_FLIGHT):
         spent.update(done.seconds)
-    seconds = time.perf_counter() - began
+    seconds = time.perf_counter() - begin
     spent["idle"] = seconds - spent["infer"]  # type: ignore[assignment]
     return sum(shard.samples for shard in shards) / seconds, spent
 
 
-def measure_speed(given: argparse.Namespace, images: list[bytes]) -> None:
-    threads = given.threads or os.cpu_count() or 1
+def measure_speed(args: argparse.Namespace, images: list[bytes]) -> None:
+    """Print the stage's images per second over the encoder's, the best of all rounds."""
+    threads = args.threads or os.cpu_count() or 1
     with tempfile.TemporaryDirectory() as folder:
-        actor = worker(
-            folder,
-            network(checkpoint(given.depth, given.size), given.batch, folder, images),
-            given.batch,
-            threads,
-            given.decoders,
+        spec = encoder_spec(
+            checkpoint(args.depth, args.size, width=args.width), args.batch, folder, images
         )
-        ray.get(actor.resident.remote(2 * given.batch))
-        rate = ray.get(actor.resident.remote(4 * given.batch))
-        each = max(2, round(rate * given.seconds / SHARDS / given.batch)) * given.batch
+        actor = start_worker(folder, spec, args.batch, threads, args.decoders)
+        ray.get(actor.resident.remote(2 * args.batch))
+        rate = ray.get(actor.resident.remote(4 * args.batch))
+        each = max(2, round(rate * args.seconds / SHARDS / args.batch)) * args.batch
         shards = [write_shard(folder, number, images, each) for number in range(SHARDS)]
-        through, alone = [], []
-        for _ in range(given.rounds):
-            alone.append(ray.get(actor.resident.remote(SHARDS * each // 2)))
+        stage, resident = list[float](), list[float]()
+        for _ in range(args.rounds):
+            resident.append(ray.get(actor.resident.remote(SHARDS * each // 2)))
             rate, spent = end_to_end(actor, shards)
-            through.append(rate)
-            alone.append(ray.get(actor.resident.remote(SHARDS * each // 2)))
-            told = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.items())
+            stage.append(rate)
+            resident.append(ray.get(actor.resident.remote(SHARDS * each // 2)))
+            shares = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.items())
             print(
-                f"  round: {rate:.1f} images/s through the stage, {max(alone[-2:]):.1f} resident ({told})"
+                f"  round: {rate:.1f} images/s through the stage, {max(resident[-2:]):.1f} "
+                f"resident ({shares})"
             )
-        # Other work on the machine only ever slows: the best of either is what it can do.
+        # Other work on the machine can only slow a round down: compare the best of each.
         print(
-            f"tar -> Parquet, ResNet-{given.depth} at {given.size} px, batches of {given.batch}, {threads} threads, "
-            f"{given.decoders} that decode: {max(through) / max(alone):.3f} x the encoder alone (best of {given.rounds} rounds)"
+            f"tar -> Parquet, ResNet-{args.depth} at {args.size} px, batches of {args.batch}, "
+            f"{threads} threads, {args.decoders} decoding: {max(stage) / max(resident):.3f} x the "
+            f"encoder alone (best of {args.rounds} rounds)"
         )
         ray.kill(actor)
 
 
-def measure_memory(given: argparse.Namespace, images: list[bytes]) -> None:
+def measure_memory(args: argparse.Namespace, images: list[bytes]) -> None:
+    """Print a worker's peak memory over eight shards as a ratio to two."""
     with tempfile.TemporaryDirectory() as folder:
-        shards = [write_shard(folder, number, images, given.few // 2) for number in range(8)]
+        shards = [write_shard(folder, number, images, args.few // 2) for number in range(8)]
         peaks = []
-        made = network(checkpoint(18, 128), 32, folder, images)
+        spec = encoder_spec(checkpoint(18, 128), 32, folder, images)
         for count in (2, 8):
-            actor = worker(folder, made, 32, os.cpu_count() or 1, given.decoders)
+            actor = start_worker(folder, spec, 32, os.cpu_count() or 1, args.decoders)
             end_to_end(actor, shards[:count])
             peaks.append(ray.get(actor.peak.remote()))
             ray.kill(actor)
     low, high = peaks
     print(
-        f"peak memory of a worker over {4 * given.few} images: {high / low:.3f} x that over {given.few} ({high:.0f} MB, "
-        f"{low:.0f} MB)"
+        f"peak memory of a worker over {4 * args.few} images: {high / low:.3f} x that over "
+        f"{args.few} ({high:.0f} MB, {low:.0f} MB)"
     )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--depth", type=int, default=50, choices=(18, 34, 50, 101), help="layers of the ResNet"
-    )
-    parser.add_argument("--size", type=int, default=256, help="side of its images in pixels")
-    parser.add_argument("--batch", type=int, default=8, help="images of a pass")
-    parser.add_argument("--threads", type=int, help="of the encoder; all cores by default")
-    parser.add_argument("--decoders", type=int, default=1, help="threads that decode")
-    parser.add_argument("--seconds", type=float, default=8.0, help="of a measured run, roughly")
-    parser.add_argument("--rounds", type=int, default=3, help="of the two in turn")
-    parser.add_argument(
-        "--few", type=int, default=1000, help="images for the memory to compare with"
-    )
-    given = parser.parse_args()
+    add = parser.add_argument
+    add("--depth", type=int, default=50, choices=(18, 34, 50, 101), help="layers of the ResNet")
+    add("--width", type=float, default=1.0, help="its channels, as a multiple")
+    add("--size", type=int, default=256, help="side of its images, pixels")
+    add("--batch", type=int, default=8, help="images of a batch")
+    add("--threads", type=int, help="threads of the encoder; all cores by default")
+    add("--decoders", type=int, default=1, help="threads that decode")
+    add("--seconds", type=float, default=8.0, help="length of a measured run, roughly")
+    add("--rounds", type=int, default=3, help="alternating rounds")
+    add("--few", type=int, default=1000, help="images of the memory baseline; 0: no memory run")
+    args = parser.parse_args()
     cluster.connect()
-    rng = np.random.default_rng(0)
-    images = [photo(rng) for _ in range(DISTINCT)]
-    measure_speed(given, images)
-    if given.few:
-        measure_memory(given, images)
+    images = jpegs(DISTINCT, SOURCE_SIDE, SOURCE_SIDE)
+    measure_speed(args, images)
+    if args.few:
+        measure_memory(args, images)
     ray.shutdown()
 
 

@@ -1,10 +1,10 @@
-"""Embedding against a plain script that does what the field's test scripts do, in one run; prints
-one line per figure.
+"""Embedding speed as a ratio to a plain script like those of the field, in one run.
 
-The script: PyTorch as it comes (eager, float32, channels first), a DataLoader over image files,
-Pillow to decode and resize, image and mirror image in two passes. Ours: one worker from tar to
-Parquet part, float32 compiled (goal: at least 1.8 x the script) and int8 (goal: at least 5 x).
-Beside each: the cosine of its embeddings with the script's. By turns, the best of each.
+The script: PyTorch's defaults (eager, float32, channels first), a DataLoader over image files,
+decoding and resizing by Pillow, image and mirror image in two passes. Ours: one worker from tar to
+Parquet part, float32 compiled (goal: at least 1.8 x the script) and int8 (goal: at least 5 x),
+each with the cosine of its embeddings to the script's. Both alternate; the best round of each
+counts. Prints one line per figure.
 
     python benchmarks/embed_script.py [--images 96]
 """
@@ -20,15 +20,24 @@ import numpy as np
 import pyarrow.parquet as pq
 import ray
 import torch
-from embed_pipeline import DISTINCT, checkpoint, end_to_end, network, photo, worker, write_shard
+from embed_pipeline import (
+    DISTINCT,
+    SOURCE_SIDE,
+    checkpoint,
+    encoder_spec,
+    end_to_end,
+    start_worker,
+    write_shard,
+)
 from PIL import Image
+from synthetic import jpegs
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from jobs.encoding.encoder import EncoderSettings
 from model.checkpoint import build_encoder, loads
 from pipeline.core import cluster
-from pipeline.features.table import Floats
+from pipeline.core.arrays import Floats
 
 
 class Files(Dataset[Tensor]):
@@ -46,105 +55,101 @@ class Files(Dataset[Tensor]):
         return torch.from_numpy(np.asarray(small).transpose(2, 0, 1).copy())
 
 
-def script(made: bytes, paths: list[Path], size: int, batch: int) -> tuple[float, Floats]:
+def plain_script(weights: bytes, paths: list[Path], size: int, batch: int) -> tuple[float, Floats]:
     """Images per second of the plain script, and its embeddings."""
-    encoder = build_encoder(loads(made)).to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+    encoder = build_encoder(loads(weights)).to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     loader: DataLoader[Tensor] = DataLoader(Files(paths, size), batch_size=batch, num_workers=2)
     found = []
-    began = time.perf_counter()
+    begin = time.perf_counter()
     with torch.no_grad():
         for images_B3HW in loader:
             g_BPD = encoder(images_B3HW)[1] + encoder(images_B3HW.flip(3))[1]
             unit_BPD = torch.nn.functional.normalize(g_BPD, dim=2) / g_BPD.shape[1] ** 0.5
             found.append(unit_BPD.flatten(1).numpy())
-    return len(paths) / (time.perf_counter() - began), np.concatenate(found)
+    return len(paths) / (time.perf_counter() - begin), np.concatenate(found)
 
 
-def ours(
-    made: bytes, images: list[bytes], folder: str, given: argparse.Namespace, precision: str
+def pipeline_runner(
+    weights: bytes, images: list[bytes], folder: str, args: argparse.Namespace, precision: str
 ) -> Callable[[], tuple[float, Floats]]:
-    """A worker that is there already; each call embeds all images from tars to parts."""
-    settings = EncoderSettings(precision=precision, compiling="always")  # type: ignore[arg-type]
-    actor = worker(
-        folder, network(made, given.batch, folder, images, settings), given.batch, given.threads, 1
-    )
-    half = given.images // 2
+    """Start a worker; each call of the result embeds all images from tars to parts."""
+    settings = EncoderSettings(precision=precision, compiling=args.compiling)  # type: ignore[arg-type]
+    spec = encoder_spec(weights, args.batch, folder, images, settings)
+    actor = start_worker(folder, spec, args.batch, args.threads, 1)
+    half = args.images // 2
     shards = [
         write_shard(folder, number, images[number * half :] + images[: number * half], half)
         for number in range(2)
     ]
 
-    def measured() -> tuple[float, Floats]:
+    def run() -> tuple[float, Floats]:
         rate, _ = end_to_end(actor, shards)
         parts = [
             pq.read_table(f"{folder}/table/{shard.name}.parquet", columns=["embedding"])
             for shard in shards
         ]
         flat = [part["embedding"].combine_chunks().flatten().to_numpy() for part in parts]
-        return rate, np.concatenate(flat).reshape(given.images, -1)
+        return rate, np.concatenate(flat).reshape(args.images, -1)
 
-    return measured
+    return run
+
+
+def compare(
+    precision: str,
+    weights: bytes,
+    images: list[bytes],
+    paths: list[Path],
+    folder: str,
+    args: argparse.Namespace,
+) -> str:
+    """Alternate the script and the pipeline; the line to print."""
+    Path(folder).mkdir()
+    run = pipeline_runner(weights, images, folder, args, precision)
+    script_rates, our_rates = [], []
+    for _ in range(args.rounds):
+        rate, expected_NE = plain_script(weights, paths, args.size, args.batch)
+        script_rates.append(rate)
+        rate, found_NE = run()
+        our_rates.append(rate)
+        print(f"  script {script_rates[-1]:.2f} images/s, ours {our_rates[-1]:.2f}", flush=True)
+    cosine_N = (found_NE * expected_NE).sum(1)
+    return (
+        f"  {max(our_rates) / max(script_rates):.2f} x the plain script (best of {args.rounds} "
+        f"each), cosine with it {cosine_N.mean():.6f} in the mean, {cosine_N.min():.6f} at worst"
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
-    parser.add_argument(
-        "--depth", type=int, default=50, choices=(18, 34, 50, 101), help="layers of the ResNet"
-    )
-    parser.add_argument("--size", type=int, default=256, help="side of its images in pixels")
-    parser.add_argument("--batch", type=int, default=16, help="images of a pass")
-    parser.add_argument("--images", type=int, default=64, help="of a measured run; even")
-    parser.add_argument("--rounds", type=int, default=2, help="of all in turn")
-    parser.add_argument("--threads", type=int, default=2, help="of the encoder")
-    given = parser.parse_args()
+    add = parser.add_argument
+    add("--depth", type=int, default=50, choices=(18, 34, 50, 101), help="layers of the ResNet")
+    add("--width", type=float, default=1.0, help="its channels, as a multiple")
+    add("--size", type=int, default=256, help="side of its images, pixels")
+    add("--batch", type=int, default=16, help="images of a batch")
+    add("--images", type=int, default=64, help="images of a measured run; an even number")
+    add("--rounds", type=int, default=2, help="alternating rounds")
+    add("--threads", type=int, default=2, help="threads of the encoder")
+    add("--precisions", nargs="+", default=["float32", "int8"], help="float32, int8")
+    add("--compiling", default="always", help="always or never compile our encoder")
+    args = parser.parse_args()
     cluster.connect()
-    torch.set_num_threads(given.threads)
-    rng = np.random.default_rng(0)
-    images = [photo(rng) for _ in range(min(DISTINCT, given.images))]
-    images = [images[number % len(images)] for number in range(given.images)]
-    made = checkpoint(given.depth, given.size)
+    torch.set_num_threads(args.threads)
+    distinct = jpegs(min(DISTINCT, args.images), SOURCE_SIDE, SOURCE_SIDE)
+    images = [distinct[number % len(distinct)] for number in range(args.images)]
+    weights = checkpoint(args.depth, args.size, width=args.width)
     with tempfile.TemporaryDirectory() as folder:
         paths = []
         for number, data in enumerate(images):
             paths.append(Path(folder) / f"{number:05d}.jpg")
             paths[-1].write_bytes(data)
-        for precision in ("float32", "int8"):  # one worker at a time: two would share the cores
-            print(
-                f"tar -> Parquet in {precision}, ResNet-{given.depth} at {given.size} px, mirrored: ",
-                flush=True,
-            )
-            print(
-                compare(precision, made, images, paths, str(Path(folder) / precision), given),
-                flush=True,
-            )
+        for precision in args.precisions:  # one worker at a time: two would share the cores
+            name = f"ResNet-{args.depth} at {args.size} px, mirrored"
+            print(f"tar -> Parquet in {precision}, {name}:", flush=True)
+            scratch = str(Path(folder) / precision)
+            print(compare(precision, weights, images, paths, scratch, args), flush=True)
             ray.shutdown()
             cluster.connect()
     ray.shutdown()
-
-
-def compare(
-    precision: str,
-    made: bytes,
-    images: list[bytes],
-    paths: list[Path],
-    folder: str,
-    given: argparse.Namespace,
-) -> str:
-    """Ours and the script by turns: what is to be said of them."""
-    Path(folder).mkdir()
-    run = ours(made, images, folder, given, precision)
-    by_script, by_us = [], []
-    for _ in range(given.rounds):
-        rate, expected_NE = script(made, paths, given.size, given.batch)
-        by_script.append(rate)
-        rate, found_NE = run()
-        by_us.append(rate)
-        print(f"  script {by_script[-1]:.2f} images/s, ours {by_us[-1]:.2f}", flush=True)
-    cosine_N = (found_NE * expected_NE).sum(1)
-    return (
-        f"  {max(by_us) / max(by_script):.2f} x the plain script (best of {given.rounds} each), cosine with it "
-        f"{cosine_N.mean():.6f} in the mean, {cosine_N.min():.6f} at worst"
-    )
 
 
 if __name__ == "__main__":
