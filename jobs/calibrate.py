@@ -19,14 +19,14 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import console, progress, results
 from pipeline.core.records import Split, View
 from pipeline.index.searcher import Index
-from pipeline.locate.calibration import CalibrationContext, CalibrationCriteria, fit_calibration
-from pipeline.locate.calibration_data import LabelledImages, make_examples
-from pipeline.locate.confidence import (
+from pipeline.locate.calibrate import CalibrationContext, CalibrationCriteria, fit_calibration
+from pipeline.locate.calibration import (
     CALIBRATION_FILE,
     Calibration,
     read_calibration,
     write_calibration,
 )
+from pipeline.locate.calibration_data import LabelledImages, make_examples
 from pipeline.locate.gallery_map import read_gallery_map
 from pipeline.locate.reliability import reliability_diagram
 from pipeline.shards.external import open_manifest

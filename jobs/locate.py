@@ -29,7 +29,7 @@ from pipeline.images.thumbnails import no_images
 from pipeline.index.filters import Filter
 from pipeline.index.searcher import Index
 from pipeline.locate import geojson
-from pipeline.locate.confidence import Calibration, find_calibration, read_calibration
+from pipeline.locate.calibration import Calibration, find_calibration, read_calibration
 from pipeline.locate.flight import TRACK_THRESHOLD, apply_track, motion_for_gallery
 from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
 from pipeline.locate.geojson import LocatedPhoto

@@ -19,11 +19,11 @@ from pipeline.core.cluster import plan_placement
 from pipeline.core.errors import InputError
 from pipeline.core.progress import console
 from pipeline.index.metadata import METADATA_FILE
-from pipeline.service.answerer import Predictor
 from pipeline.service.app import Service
 from pipeline.service.batcher import ReplicaLost
 from pipeline.service.engine import NotReady
 from pipeline.service.live_index import POLL_INTERVAL_S
+from pipeline.service.predictor import Predictor
 from pipeline.service.replicas import Replicas
 from pipeline.service.settings import ServiceSettings
 

@@ -1,7 +1,7 @@
 """Photos of known places -> what a gallery answers with their places in it, and without.
 
 In: embeddings of photos and of their places' own gallery images, and an index. Out: Examples for
-`pipeline/locate/calibration.py`. The index need not hold the places: their own images are ranked
+`pipeline/locate/calibrate.py`. The index need not hold the places: their own images are ranked
 among its rows as if it did. Shapes: Q photos, N gallery images of their places, D dimensions, K
 candidates.
 """
@@ -16,7 +16,7 @@ from pipeline.core.geo import haversine_m
 from pipeline.core.records import View
 from pipeline.features.table import Floats
 from pipeline.index.searcher import Hit, Searchable
-from pipeline.locate.calibration import CalibrationExample
+from pipeline.locate.calibrate import CalibrationExample
 from pipeline.locate.locate import coordinates
 from pipeline.locate.track import TRACK_CANDIDATES
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.locate.confidence import Calibration
+from pipeline.locate.calibration import Calibration
 from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.locate import Answer, Position, coordinates, relative_scores
 from pipeline.locate.logistic import choice_log_probabilities

@@ -15,7 +15,7 @@ from pipeline.core.arrays import Doubles
 from pipeline.features.table import Floats
 from pipeline.index.filters import Filter
 from pipeline.index.searcher import Hit, Searchable
-from pipeline.locate.confidence import Calibration
+from pipeline.locate.calibration import Calibration
 from pipeline.locate.consensus import Consensus, find_consensus
 
 CONSENSUS_CANDIDATES = 10

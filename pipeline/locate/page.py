@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 
 from pipeline.core.geo import haversine_m
+from pipeline.core.templates import template_environment
 from pipeline.images.thumbnails import ANSWER_PX, QUERY_PX, thumbnail
-from pipeline.locate.confidence import Calibration
+from pipeline.locate.calibration import Calibration
 from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.geojson import LocatedPhoto
 from pipeline.locate.locate import Answer
@@ -71,13 +71,7 @@ def render_page(
     keys |= {hit.key for answer in answered for hit in answer.candidates}
     held, taken = tiles(sorted(keys)), photos([one.photos[0] for one in shown])
     panels = [_panel(one, view, held, taken, around) for one, view in zip(shown, maps, strict=True)]
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parents[1] / "report" / "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = template_environment(Path(__file__).parent / "templates")
     answers = [(one.name, one.answer) for one in located if one.answer]
     on_maps = sorted({tile.key for view in maps if view for tile in view.tiles} & held.keys())
     return environment.get_template("answers.html").render(

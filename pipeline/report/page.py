@@ -11,8 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jinja2
-
+from pipeline.core.templates import template_environment
 from pipeline.features.table import Floats
 from pipeline.images.thumbnails import ImageLoader, ThumbnailCache
 from pipeline.report import charts, map_sheet, svg
@@ -46,13 +45,7 @@ def render(
 
     Raises InputError when the evaluation beside ranked other images.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = template_environment(Path(__file__).parent / "templates")
     environment.filters |= {
         "percent": lambda value: f"{100 * value:.2f}",
         "points": lambda value: f"{100 * value:+.2f}",

@@ -16,12 +16,12 @@ from aiohttp import web
 
 from pipeline.core.progress import console
 from pipeline.core.records import Rejection
-from pipeline.service.answerer import Outcome
 from pipeline.service.batcher import Batcher, PoisonedItem, ReplicaLost
 from pipeline.service.engine import Engine, NotReady
 from pipeline.service.metrics import CONTENT_TYPE, ServiceMetrics
 from pipeline.service.pages import PAGE_PATHS, SECURITY_HEADERS, page_routes
-from pipeline.service.question import LocateRequest, RequestError, parse_request, undecodable_photo
+from pipeline.service.predictor import Outcome
+from pipeline.service.request import LocateRequest, RequestError, parse_request, undecodable_photo
 from pipeline.service.settings import LOOPBACK_HOSTS, ServiceSettings
 from pipeline.service.uploads import check_headers, read_upload
 

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Protocol
 
-from pipeline.service.answerer import Outcome, ServiceStatus
-from pipeline.service.question import LocateRequest
+from pipeline.service.predictor import Outcome, ServiceStatus
+from pipeline.service.request import LocateRequest
 
 
 class NotReady(Exception):

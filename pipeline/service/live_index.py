@@ -15,8 +15,8 @@ from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.index.metadata import METADATA_FILE
 from pipeline.index.searcher import Index
-from pipeline.locate import confidence
-from pipeline.locate.confidence import Calibration, find_calibration
+from pipeline.locate import calibration as confidence
+from pipeline.locate.calibration import Calibration, find_calibration
 from pipeline.locate.gallery_map import read_gallery_map
 
 POLL_INTERVAL_S = 2.0

@@ -2,12 +2,9 @@
 from the settings in force.
 """
 
-from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, StrictUndefined
-
-from pipeline.service.question import DEFAULT_TOP, MAX_TOP
+from pipeline.service.request import DEFAULT_TOP, MAX_TOP
 from pipeline.service.settings import ServiceSettings
 
 NUMBER, TEXT = {"type": "number"}, {"type": "string"}
@@ -183,14 +180,3 @@ def _schemas() -> dict[str, Any]:
         "Health": health,
         "Error": error,
     }
-
-
-def reference_page(settings: ServiceSettings) -> str:
-    """The same as a page."""
-    template = (Path(__file__).parent / "web" / "api.html").read_text()
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.from_string(template).render(
-        api=openapi_document(settings), port=settings.port
-    )

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from aiohttp import web
 
-from pipeline.service.openapi import openapi_document, reference_page
+from pipeline.core.templates import template_environment
+from pipeline.service.openapi import openapi_document
 from pipeline.service.settings import ServiceSettings
 
 WEB_FOLDER = Path(__file__).parent / "web"
@@ -30,7 +31,7 @@ def page_routes(settings: ServiceSettings) -> list[web.RouteDef]:
         ((WEB_FOLDER / "index.html").read_text(), "text/html"),
         ((WEB_FOLDER / "page.js").read_text(), "text/javascript"),
         ((WEB_FOLDER / "style.css").read_text(), "text/css"),
-        (reference_page(settings), "text/html"),
+        (api_page(settings), "text/html"),
         (json.dumps(openapi_document(settings)), "application/json"),
     )
     return [_page(path, text, kind) for path, (text, kind) in zip(PAGE_PATHS, shown, strict=True)]
@@ -41,3 +42,9 @@ def _page(path: str, text: str, kind: str) -> web.RouteDef:
         return web.Response(text=text, content_type=kind)
 
     return web.get(path, answer)
+
+
+def api_page(settings: ServiceSettings) -> str:
+    """The OpenAPI document as a page for people."""
+    template = template_environment(WEB_FOLDER).get_template("api.html")
+    return template.render(api=openapi_document(settings), port=settings.port)

@@ -20,11 +20,11 @@ from ray.serve.exceptions import DeploymentUnavailableError
 from pipeline.core import cluster
 from pipeline.core.cluster import Placement
 from pipeline.core.errors import InputError
-from pipeline.service.answerer import Outcome, Predictor, ServiceStatus
 from pipeline.service.batcher import ReplicaLost
 from pipeline.service.engine import NotReady
 from pipeline.service.live_index import RETRY_S
-from pipeline.service.question import LocateRequest
+from pipeline.service.predictor import Outcome, Predictor, ServiceStatus
+from pipeline.service.request import LocateRequest
 
 BATCH_TIMEOUT_S = 120.0
 "A batch that takes longer will not end: its replica is replaced."

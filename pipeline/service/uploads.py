@@ -12,7 +12,7 @@ from aiohttp import MultipartReader, web
 from aiohttp.http_exceptions import HttpProcessingError
 from aiohttp.multipart import BodyPartReader
 
-from pipeline.service.question import FIELDS, RequestError
+from pipeline.service.request import FIELDS, RequestError
 
 PHOTO_FIELD = "photo"
 MAX_PARTS = 16

@@ -37,7 +37,7 @@ from pipeline.index.metadata import (
     read_metadata,
     write_metadata,
 )
-from pipeline.locate.confidence import Calibration, read_calibration, write_calibration
+from pipeline.locate.calibration import Calibration, read_calibration, write_calibration
 from pipeline.locate.logistic import LogisticModel
 from pipeline.locate.reliability import ReliabilityBin
 from pipeline.retrieval.results import INPUTS, METRICS, VIEWS, read_inputs, read_rows, write_inputs

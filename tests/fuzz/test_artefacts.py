@@ -28,7 +28,7 @@ from pipeline.index.metadata import (
     metadata_dict,
     read_metadata,
 )
-from pipeline.locate.confidence import (
+from pipeline.locate.calibration import (
     FEATURE_NAMES,
     Calibration,
     read_calibration,

@@ -20,7 +20,7 @@ from pipeline.core.errors import InputError
 from pipeline.features.table import PartFooter, PartRows, write_part
 from pipeline.images.transforms import preprocessing_name, resize
 from pipeline.index.build import IndexSettings, build_index
-from pipeline.locate.confidence import find_calibration
+from pipeline.locate.calibration import find_calibration
 from pipeline.shards.pack import PackingSettings, pack
 from pipeline.sources.university1652 import University1652
 

@@ -11,7 +11,7 @@ from pipeline.core.records import View
 from pipeline.features.table import Floats
 from pipeline.index.filters import Filter
 from pipeline.index.searcher import Hit
-from pipeline.locate.confidence import (
+from pipeline.locate.calibration import (
     Calibration,
     confidence_features,
     find_calibration,

@@ -22,7 +22,7 @@ from pipeline.core.geo import Circle
 from pipeline.features.table import PartFooter, PartRows, write_part
 from pipeline.images.transforms import preprocessing_name, resize
 from pipeline.index.build import IndexSettings, build_index
-from pipeline.locate.confidence import Calibration, write_calibration
+from pipeline.locate.calibration import Calibration, write_calibration
 from pipeline.locate.logistic import LogisticModel
 
 PLACES = 12

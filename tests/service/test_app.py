@@ -20,13 +20,13 @@ from pipeline.core.geo import Circle
 from pipeline.core.records import Rejection, View
 from pipeline.index.searcher import Hit
 from pipeline.locate.locate import Answer, Position
-from pipeline.service.answerer import Outcome, ServiceStatus
 from pipeline.service.app import Service
 from pipeline.service.batcher import ReplicaLost
 from pipeline.service.engine import NotReady
-from pipeline.service.question import LocateRequest
+from pipeline.service.predictor import Outcome, ServiceStatus
+from pipeline.service.request import LocateRequest
 from pipeline.service.settings import ServiceSettings
-from tests.service.test_question import bomb, photo
+from tests.service.test_request import bomb, photo
 
 TOKEN = "a-token-of-some-length"
 Client = TestClient[Any, Any]

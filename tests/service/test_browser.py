@@ -16,7 +16,7 @@ from pipeline.service.app import Service
 from pipeline.service.settings import ServiceSettings
 from tests.report.test_browser import ARGUMENTS, CHROMIUM, sync_api
 from tests.service.test_app import TOKEN, Engine
-from tests.service.test_question import photo
+from tests.service.test_request import photo
 
 pytestmark = pytest.mark.skipif(
     CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"

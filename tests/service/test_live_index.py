@@ -22,12 +22,12 @@ from pipeline.features.table import Floats, PartFooter, PartRows, write_part
 from pipeline.index.build import IndexSettings, build_index
 from pipeline.locate.locate import Answer
 from pipeline.service import live_index
-from pipeline.service.answerer import Outcome, Predictor, ServiceStatus
 from pipeline.service.app import Service
 from pipeline.service.live_index import LiveIndex
-from pipeline.service.question import LocateRequest
+from pipeline.service.predictor import Outcome, Predictor, ServiceStatus
+from pipeline.service.request import LocateRequest
 from pipeline.service.settings import ServiceSettings
-from tests.service.test_question import photo
+from tests.service.test_request import photo
 
 DIMENSION = 8
 

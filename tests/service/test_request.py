@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from pipeline.core.geo import Circle
-from pipeline.service.question import MAX_SCANS, RequestError, parse_request
+from pipeline.service.request import MAX_SCANS, RequestError, parse_request
 
 MEGAPIXELS = 1_000_000
 

@@ -14,7 +14,7 @@ from pipeline.features.table import Floats
 from pipeline.index.filters import Filter
 from pipeline.locate.locate import Answer, locate_embeddings
 from pipeline.service.live_index import LiveIndex
-from pipeline.service.question import LocateRequest
+from pipeline.service.request import LocateRequest
 
 Outcome = Answer | Rejection
 

@@ -12,7 +12,7 @@ from pipeline.core.records import View
 from pipeline.features.table import Floats
 from pipeline.index.filters import Filter
 from pipeline.index.searcher import Hit
-from pipeline.locate.calibration import (
+from pipeline.locate.calibrate import (
     CalibrationContext,
     CalibrationCriteria,
     CalibrationExample,
@@ -22,8 +22,8 @@ from pipeline.locate.calibration import (
     is_correct,
     youden_threshold,
 )
+from pipeline.locate.calibration import Calibration
 from pipeline.locate.calibration_data import LabelledImages, make_examples
-from pipeline.locate.confidence import Calibration
 from pipeline.locate.locate import answers_from_hits, consensus_of, consensus_scores
 from pipeline.locate.logistic import sigmoid
 from pipeline.locate.track import TRACK_CANDIDATES
