@@ -2,26 +2,42 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check bench
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-fast check format bench chaos
 
-demo: .venv/installed  ## simulate, pack, train, embed, index, evaluate, report, locate: at most six minutes on two cores
+help:  ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+install: .venv/installed  ## install the project and its pinned dependencies into .venv
+
+demo: .venv/installed  ## the complete road on simulated flights: at most six minutes on two cores
 	$(BIN)/python jobs/demo.py --out runs/demo
 
-test: .venv/installed
+test: .venv/installed  ## all tests: ten minutes on two quiet cores
 	$(BIN)/pytest
 
-check: .venv/installed
+test-fast: .venv/installed  ## the tests without Ray, training and browsers: under a minute
+	$(BIN)/pytest -m "not slow"
+
+check: .venv/installed  ## formatting, lint and types
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-bench: .venv/installed
-	for name in simulate shards streaming evaluate index train_step damage chaos; do $(BIN)/python benchmarks/$$name.py || exit 1; done
+format: .venv/installed  ## format the code and repair what the linter can
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: .venv/installed  ## the benchmarks that need no data: half an hour
+	for name in simulate shards streaming evaluate index train_step damage; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 # benchmarks/ablation.py (hours) and benchmarks/locate.py (minutes) take a folder of imagery, benchmarks/serve.py a trained
 # network and its index: they are called by hand
 
+chaos: .venv/installed  ## the fault campaign over every stage: about an hour
+	$(BIN)/python benchmarks/chaos.py
+
 .venv/installed: pyproject.toml constraints.txt
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and f"found Python {sys.version}; expected 3.11 or later; say make PYTHON=python3.11")'
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and f"found Python {sys.version}; expected 3.11 or later; run make PYTHON=python3.11")'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	touch $@

@@ -33,6 +33,15 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("house")
 
+SLOW_FIXTURES = {"ray_cluster", "prepared", "browser"}
+"Tests that use one of them start Ray, jobs or Chromium: `make test-fast` leaves them out."
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.slow)
+
 
 @pytest.fixture(scope="session")
 def ray_cluster() -> Iterator[None]:
