@@ -1,9 +1,9 @@
-"""Ray actors that work off a list of items: what one leaves undone when it dies, another takes up.
+"""A pool of Ray actors with retries: items of a dead actor are rescheduled on another.
 
-In: how to hire an actor, and items. Out: each item once, with its result, or set aside with the
-reason. Actors that are still waiting for a place in the cluster keep nobody from working. An actor
-has the methods `start()`, called once and first, and `work(item)`, of which `in_flight` run at
-once.
+In: how to create an actor, and items. Out: each item once, with its result, or skipped with the
+reason. Actors that still wait for resources of the cluster do not delay those that have started. An
+actor has the methods `start()`, called once and first, and `work(item)`, of which `in_flight` run
+at once.
 """
 
 import time
@@ -18,16 +18,16 @@ from ray.exceptions import RayError, RayTaskError
 from pipeline.core import cluster
 
 MAX_ATTEMPTS = 3
-"Deaths over one item after which it is not tried again."
+"Deaths of actors over one item after which it is skipped."
 MAX_SKIPPED_BEFORE_SUCCESS = 5
-"Items that may be set aside before any was done; then the fault is not theirs."
+"Items that may be skipped before any succeeded; at this number the fault is not theirs."
 SECONDS_UNTIL_NOTICE = 15.0
-"Without a worker, until it is said that they are waited for."
+"Without any worker, until the user is told that the pool waits for one."
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoolConfig:
-    """How a crew works."""
+    """The settings of an actor pool."""
 
     create_actor: Callable[[], Any]
     "Asks Ray for a new actor."
@@ -37,24 +37,24 @@ class PoolConfig:
     "What an actor asks of the cluster, for messages."
     in_flight: int = 2
     "Items that an actor has at once; its `max_concurrency`."
-    refusals: tuple[type[Exception], ...] = ()
-    "What `work` raises of an item that is no use trying again: it is set aside at once."
+    skip_on: tuple[type[Exception], ...] = ()
+    "Raised by `work` over an item that no retry helps: it is skipped at once."
     fatal: tuple[type[Exception], ...] = ()
-    "What `work` raises when all items would fail alike: it is raised by the crew."
+    "Raised by `work` if every item would fail alike: the pool raises it."
     patience: float = 600.0
-    "Seconds without any worker until NobodyCame."
-    say: Callable[[str], None] = lambda text: None
-    "Told what a person should know meanwhile."
+    "Seconds without any worker until NoWorkerStarted."
+    notify: Callable[[str], None] = lambda text: None
+    "Called with remarks for the user meanwhile."
 
 
 @dataclass(frozen=True, kw_only=True)
 class Skipped:
-    """Why an item was not done."""
+    """Why an item has no result."""
 
     reason: str
     "Short and countable."
     found: str
-    "What was seen last."
+    "The last error."
 
 
 class NoWorkerStarted(RuntimeError):
@@ -69,59 +69,59 @@ class PoolFailed(RuntimeError):
 class _Worker:
     actor: Any
     created: Any
-    "Reference to its first call, which ends as soon as it lives."
+    "Reference to its first call, which ends once the actor exists."
     starting: Any
-    "Reference to the end of `start`; None once it is there."
+    "Reference to the end of `start`; None once it has ended."
     since: float = 0.0
     "When it began to work."
     calls: dict[Any, Any] = field(default_factory=dict)
     "Reference -> item."
-    alone: bool = False
+    exclusive: bool = False
     "Whether the item it has must be the only one."
 
 
 class ActorPool:
-    """So many actors, replaced as they die."""
+    """A fixed number of actors, replaced as they die."""
 
-    def __init__(self, terms: PoolConfig) -> None:
-        self.terms = terms
+    def __init__(self, config: PoolConfig) -> None:
+        self.config = config
         self.seconds = 0.0
-        "That actors stood ready or worked, all together; known when the work is done."
+        "Sum over the actors of the time they were ready or worked; known when the work is done."
         self._workers: list[_Worker] = []
-        self._fresh: deque[Any] = deque()
-        # Items that were in an actor's hands when it died. Each is tried alone, so that it is known
-        # whose fault a death is.
+        self._pending: deque[Any] = deque()
+        # Items that an actor had when it died. Each is retried alone, so that an item that crashes
+        # workers is told apart from its neighbours.
         self._suspects: deque[Any] = deque()
-        self._strikes: Counter[Any] = Counter()
-        self._failed_starts = self._done = self._lost = 0
-        self._told = set[str]()
+        self._failures: Counter[Any] = Counter()
+        self._failed_starts = self._succeeded = self._skipped = 0
+        self._notified = set[str]()
 
     @property
-    def working(self) -> int:
+    def ready_workers(self) -> int:
         """Actors that have started."""
         return sum(worker.starting is None for worker in self._workers)
 
     def work(self, items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
-        """Each item with its result or SetAside, as they are done. Items are hashable.
+        """Each item with its result or Skipped, as they finish. Items are hashable.
 
-        Raises NobodyCame, CannotWork, and what `fatal` names.
+        Raises NoWorkerStarted, PoolFailed, and the errors that `fatal` names.
         """
-        self._fresh.extend(items)
+        self._pending.extend(items)
         try:
-            for _ in range(min(self.terms.size, len(self._fresh))):
-                self._hire()
-            while self._fresh or self._suspects or any(worker.calls for worker in self._workers):
-                self._hand_out()
-                yield from self._settle(*self._next())
+            for _ in range(min(self.config.size, len(self._pending))):
+                self._add_worker()
+            while self._pending or self._suspects or any(worker.calls for worker in self._workers):
+                self._submit()
+                yield from self._handle_result(*self._next_finished())
         finally:
             for worker in list(self._workers):
-                self._dismiss(worker)
+                self._remove_worker(worker)
 
-    def _hire(self) -> None:
-        actor = self.terms.create_actor()
+    def _add_worker(self) -> None:
+        actor = self.config.create_actor()
         self._workers.append(_Worker(actor, actor.__ray_ready__.remote(), actor.start.remote()))
 
-    def _dismiss(self, worker: _Worker) -> None:
+    def _remove_worker(self, worker: _Worker) -> None:
         self._workers.remove(worker)
         if worker.starting is None:
             self.seconds += time.monotonic() - worker.since
@@ -129,105 +129,107 @@ class ActorPool:
         else:
             cluster.stop_actor(worker.actor, worker.created, worker.starting)
 
-    def _hand_out(self) -> None:
-        while self._fresh or self._suspects:
-            room = self.terms.in_flight
-            free = [
-                w
-                for w in self._workers
-                if w.starting is None and not w.alone and len(w.calls) < room
-            ]
+    def _submit(self) -> None:
+        """Give items to the workers that have room: suspects to idle ones, alone; others to the
+        least busy."""
+        while self._pending or self._suspects:
+            free = [worker for worker in self._workers if self._has_room(worker)]
             idle = next((worker for worker in free if not worker.calls), None)
             if self._suspects and idle:
-                worker, item, idle.alone = idle, self._suspects.popleft(), True
-            elif self._fresh and free:
-                worker, item = min(free, key=lambda one: len(one.calls)), self._fresh.popleft()
+                worker, item, idle.exclusive = idle, self._suspects.popleft(), True
+            elif self._pending and free:
+                worker = min(free, key=lambda one: len(one.calls))
+                item = self._pending.popleft()
             else:
                 return
             worker.calls[worker.actor.work.remote(item)] = item
 
-    def _next(self) -> tuple[_Worker, Any]:
-        """The next call that has ended, and whose it was."""
-        began, told = time.monotonic(), False
+    def _has_room(self, worker: _Worker) -> bool:
+        started = worker.starting is None and not worker.exclusive
+        return started and len(worker.calls) < self.config.in_flight
+
+    def _next_finished(self) -> tuple[_Worker, Any]:
+        """The next call that has ended, and the worker that ran it."""
+        began, notified = time.monotonic(), False
         while True:
             owner = {ref: worker for worker in self._workers for ref in worker.calls}
-            owner |= {
-                worker.starting: worker for worker in self._workers if worker.starting is not None
-            }
+            owner |= {w.starting: w for w in self._workers if w.starting is not None}
             ended, _ = ray.wait(list(owner), num_returns=1, timeout=1.0)
             if ended:
                 return owner[ended[0]], ended[0]
             waited = time.monotonic() - began
-            if self.working or waited < min(SECONDS_UNTIL_NOTICE, self.terms.patience):
+            if self.ready_workers or waited < min(SECONDS_UNTIL_NOTICE, self.config.patience):
                 continue
-            words = (
-                f"no worker has started for {waited:.0f} s; each asks for {self.terms.resources}"
-            )
-            if waited > self.terms.patience:
-                raise NoWorkerStarted(words)
-            if not told:
-                self.terms.say(f"{words}; waiting for up to {self.terms.patience:.0f} s")
-                told = True
+            asked = f"each asks for {self.config.resources}"
+            state = f"no worker has started for {waited:.0f} s; {asked}"
+            if waited > self.config.patience:
+                raise NoWorkerStarted(state)
+            if not notified:
+                self.config.notify(f"{state}; waiting for up to {self.config.patience:.0f} s")
+                notified = True
 
-    def _settle(self, worker: _Worker, ref: Any) -> Iterator[tuple[Any, Any]]:
+    def _handle_result(self, worker: _Worker, ref: Any) -> Iterator[tuple[Any, Any]]:
         result, error = _outcome(ref)
         if ref is worker.starting:
-            self._settle_start(worker, result, error)
+            self._handle_start(worker, result, error)
             return
         item = worker.calls.pop(ref)
-        worker.alone = False
+        worker.exclusive = False
         if error is None:
-            self._done += 1
+            self._succeeded += 1
             yield item, result
-        elif isinstance(error, self.terms.fatal):
+        elif isinstance(error, self.config.fatal):
             raise error
-        elif isinstance(error, self.terms.refusals):
+        elif isinstance(error, self.config.skip_on):
             yield item, Skipped(reason="unusable", found=str(error))
         else:
-            # Of an actor that died nobody knows over which item; of one that raised it is known,
-            # and what else it had is begun again elsewhere, because an error nobody foresaw may
-            # have left it in any state.
+            # If the actor died, any of its items may be the cause. If it raised, the item is known;
+            # the others start again elsewhere, because an unforeseen error may have left the actor
+            # in any state.
             others = list(worker.calls.values())
             blamed = [item, *others] if isinstance(error, RayError) else [item]
-            self._fresh.extendleft(other for other in others if other not in blamed)
-            self._dismiss(worker)
-            yield from self._blame(blamed, error)
-            if self._fresh or self._suspects:
-                self._hire()
+            self._pending.extendleft(other for other in others if other not in blamed)
+            self._remove_worker(worker)
+            yield from self._retry_or_skip(blamed, error)
+            if self._pending or self._suspects:
+                self._add_worker()
 
-    def _settle_start(
+    def _handle_start(
         self, worker: _Worker, remarks: list[str] | None, error: BaseException | None
     ) -> None:
         if error is None:
             for remark in remarks or []:
-                if remark not in self._told:  # workers of one kind say the same
-                    self._told.add(remark)
-                    self.terms.say(remark)
+                if remark not in self._notified:  # every worker makes the same remarks
+                    self._notified.add(remark)
+                    self.config.notify(remark)
             worker.starting, worker.since, self._failed_starts = None, time.monotonic(), 0
             return
         self._failed_starts += 1
-        self._dismiss(worker)
+        self._remove_worker(worker)
         hopeless = not isinstance(error, RayError) or getattr(error, "actor_init_failed", False)
         if hopeless or self._failed_starts == MAX_ATTEMPTS:
             raise PoolFailed(f"a worker cannot start: {_error_line(error)}") from error
-        self._hire()
+        self._add_worker()
 
-    def _blame(self, items: list[Any], error: BaseException) -> Iterator[tuple[Any, Skipped]]:
+    def _retry_or_skip(
+        self, items: list[Any], error: BaseException
+    ) -> Iterator[tuple[Any, Skipped]]:
         for item in items:
-            self._strikes[item] += 1
-            if self._strikes[item] < MAX_ATTEMPTS:
+            self._failures[item] += 1
+            if self._failures[item] < MAX_ATTEMPTS:
                 self._suspects.append(item)
                 continue
-            self._lost += 1
+            self._skipped += 1
             yield item, Skipped(reason=f"lost {MAX_ATTEMPTS} workers", found=_error_line(error))
-        if self._lost >= MAX_SKIPPED_BEFORE_SUCCESS and not self._done:
+        if self._skipped >= MAX_SKIPPED_BEFORE_SUCCESS and not self._succeeded:
             raise PoolFailed(
-                f"{self._lost} items lost {MAX_ATTEMPTS} workers each and none was done: {_error_line(error)}"
+                f"{self._skipped} items lost {MAX_ATTEMPTS} workers each and none was done: "
+                f"{_error_line(error)}"
             ) from error
 
 
 def _outcome(ref: Any) -> tuple[Any, BaseException | None]:
-    """What a call gave, or what it raised: its own error, or a RayError where its actor was lost."""
+    """The result of a call, or its error: a RayError if its actor was lost, else the one raised."""
     try:
         return ray.get(ref), None
     except RayTaskError as error:
@@ -237,9 +239,8 @@ def _outcome(ref: Any) -> tuple[Any, BaseException | None]:
 
 
 def _error_line(error: BaseException) -> str:
-    """An error in one line: its first, or the last of the traceback that Ray writes where an actor
-    cannot be made.
-    """
+    """An error in one line: its first, or the last line of the traceback that Ray reports if an
+    actor cannot be created."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     line = lines[-1 if getattr(error, "actor_init_failed", False) else 0] if lines else ""
     return f"{type(error).__name__}: {line}" if line else type(error).__name__

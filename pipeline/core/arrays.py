@@ -1,4 +1,5 @@
-"""Type aliases of NumPy arrays, by the type of their elements. Shapes are in the names of variables."""
+"""Type aliases of NumPy arrays, by the type of their elements. Shapes are in the names of
+variables."""
 
 import numpy as np
 import numpy.typing as npt

@@ -1,21 +1,25 @@
-"""Ray as this project uses it: one way to connect, and one way to spread calls with a bounded
-number in flight.
+"""Ray as this project uses it: one way to connect, bounded parallel calls, and how workers are
+placed.
+
+In: the nodes of a cluster as they are, and what a stage asks for. Out: a `Placement` (a plain
+function of the two; only `nodes` asks Ray), and results of calls with a bounded number in flight.
 """
 
 import logging
 import os
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
 
 import ray
-from ray._private.utils import read_ray_address
 from ray.exceptions import RayTaskError
 
 from pipeline.core.errors import Incomplete
@@ -23,9 +27,8 @@ from pipeline.core.progress import console
 
 Item = TypeVar("Item")
 
-
 CORES_PER_WORKER = 8
-"Of a worker without a GPU, where nothing was said: a network's threads gain little beyond."
+"Of a worker without a GPU, unless the user chooses: a network's threads gain little beyond."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +41,7 @@ class Node:
 
 @dataclass(frozen=True, kw_only=True)
 class Placement:
-    """What is asked of Ray."""
+    """The workers that are asked of Ray."""
 
     workers: int
     cpus: int
@@ -54,15 +57,14 @@ def connect() -> None:
     """Join the cluster that RAY_ADDRESS names (`ray job submit` sets it) or that `ray start` began
     on this machine, else start one for this process. Idempotent.
 
-    Workers' output stays in Ray's session folder: what a worker has to say comes back as a result
-    or an exception. Raises Unfinished where no cluster answers and none can be started.
+    Workers' output stays in Ray's session folder: what a worker reports comes back as a result or
+    an exception. Raises Incomplete if no cluster answers and none can be started.
     """
     if ray.is_initialized():
         return
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault(
-        "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0"
-    )  # Ray's coming default; unset, each init warns
+    # Ray's coming default; unset, each init warns.
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     # A token for a local cluster is what we want, and no news.
     logging.getLogger("ray._private.authentication.authentication_token_setup").setLevel(
         logging.ERROR
@@ -70,24 +72,25 @@ def connect() -> None:
     try:
         with _keep_signal_handlers():
             ray.init(_address(), log_to_driver=False, logging_level=logging.WARNING)
-    except (
-        Exception
-    ) as error:  # Ray raises ConnectionError, RuntimeError, ValueError and plain Exception here
-        asked = f"at {address}" if (address := os.environ.get("RAY_ADDRESS")) else "on this machine"
+    except Exception as error:  # ConnectionError, RuntimeError, ValueError and plain Exception
+        address = os.environ.get("RAY_ADDRESS")
+        asked = f"at {address}" if address else "on this machine"
         why = str(error).strip().partition("\n")[0] or type(error).__name__
         raise Incomplete(
-            f"found no Ray cluster {asked}, and none could be started ({why}); expected one "
-            "that answers; see to it, or unset RAY_ADDRESS so that one is started here, and run the same command again"
+            f"found no Ray cluster {asked}, and none could be started ({why}); expected one that "
+            "answers; see to it, or unset RAY_ADDRESS so that one is started here, and run the "
+            "same command again"
         ) from error
 
 
 def _address() -> str | None:
-    """What to tell Ray: None, so that it looks for itself; "local" where it would find a cluster
-    that is no more.
+    """Address for ray.init: None, so that Ray looks for a cluster itself; "local" if it would find
+    one that is gone.
 
-    `ray start` notes its address in a file, which outlives a cluster that was killed, and Ray waits for that one for ever.
+    `ray start` writes its address to a file, which outlives a cluster that was killed, and Ray
+    waits for that cluster for ever.
     """
-    noted = None if os.environ.get("RAY_ADDRESS") else read_ray_address()
+    noted = None if os.environ.get("RAY_ADDRESS") else _noted_address()
     if not noted:
         return None
     host, _, port = noted.rpartition(":")
@@ -95,31 +98,47 @@ def _address() -> str | None:
         socket.create_connection((host, int(port)), timeout=5).close()
     except (OSError, ValueError):  # the latter: no address
         console.print(
-            f"the Ray cluster at {noted} that `ray start` began is gone; one is started for this run"
+            f"the Ray cluster at {noted} that `ray start` began is gone; one is started for this "
+            "run"
         )
         return "local"
     return None
 
 
+def _noted_address() -> str | None:
+    """The address that `ray start` wrote on this machine; None if there is none.
+
+    Read here, because Ray has no public function for it [Ray 2.60, ray/_common/utils.py]. If a
+    later Ray keeps it elsewhere, None is returned and Ray looks for itself.
+    """
+    scratch = os.environ.get("RAY_TMPDIR")
+    if scratch is None and sys.platform == "linux":
+        scratch = os.environ.get("TMPDIR")
+    try:
+        return Path(scratch or "/tmp", "ray", "ray_current_cluster").read_text().strip()
+    except (OSError, ValueError):
+        return None
+
+
 @contextmanager
 def _keep_signal_handlers() -> Iterator[None]:
-    """Keep Ctrl-C until Ray has started, as half of it cannot be stopped: it crashes. Said twice it
-    is heeded at once.
+    """Hold back Ctrl-C until Ray has started, because a half-started Ray cannot be stopped: it
+    crashes. A second Ctrl-C interrupts at once.
 
-    And keep the handler of SIGTERM: Ray's own would end this process by an abort, with a stack of
-    its C++ on the terminal, or while it starts by a bare exit.
+    Restore the handler of SIGTERM too: Ray's own would end this process by an abort, with a stack
+    of its C++ on the terminal, or, while it starts, by a bare exit.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    came: list[int] = []
+    received: list[int] = []
 
-    def keep(number: int, frame: FrameType | None) -> None:
-        came.append(number)
-        if len(came) > 1:
+    def hold_back(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        if len(received) > 1:
             raise KeyboardInterrupt
 
-    interrupt = signal.signal(signal.SIGINT, keep)
+    interrupt = signal.signal(signal.SIGINT, hold_back)
     terminate = signal.getsignal(signal.SIGTERM)
     try:
         yield
@@ -131,7 +150,7 @@ def _keep_signal_handlers() -> Iterator[None]:
         signal.signal(signal.SIGINT, interrupt)
         if callable(terminate):
             signal.signal(signal.SIGTERM, terminate)
-    if came and callable(interrupt):
+    if received and callable(interrupt):
         interrupt(signal.SIGINT, None)
 
 
@@ -147,7 +166,8 @@ def gpus() -> int:
 
 def nodes() -> list[Node]:
     """The machines of the cluster that are up."""
-    up = [node["Resources"] for node in ray.nodes() if node["Alive"]]  # type: ignore[no-untyped-call]
+    found: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
+    up = [node["Resources"] for node in found if node["Alive"]]
     return [Node(cpus=has.get("CPU", 0.0), gpus=has.get("GPU", 0.0)) for has in up]
 
 
@@ -156,13 +176,46 @@ def _resources() -> dict[str, float]:
     return found
 
 
-def stop_actor(actor: Any, first: "ray.ObjectRef[Any]", *queued: "ray.ObjectRef[Any]") -> None:
-    """End an actor. `first`: its first call, which shows whether it was created; `queued`: calls
-    behind that, given up.
+def plan_placement(
+    nodes: Sequence[Node],
+    items: int,
+    workers: int | None = None,
+    cpus: int | None = None,
+    gpus: float | None = None,
+) -> Placement:
+    """A placement for so many items. None: one worker per GPU if there are any, else one per eight
+    cores of a node; and as many cores each as let all of them fit on the nodes, at least 1."""
+    if gpus is None:
+        gpus = 1.0 if any(node.gpus >= 1 for node in nodes) else 0.0
+    if workers is None:
+        workers = 0
+        for node in nodes:
+            own = cpus or (1 if gpus else min(CORES_PER_WORKER, max(1, int(node.cpus))))
+            workers += _workers_that_fit(node, own, gpus)
+    workers = max(1, min(workers, items))
+    if cpus is None:
+        most = int(max((node.cpus for node in nodes), default=1))
+        fitting = (
+            count
+            for count in range(most, 1, -1)
+            if sum(_workers_that_fit(node, count, gpus) for node in nodes) >= workers
+        )
+        cpus = next(fitting, 1)
+    return Placement(workers=workers, cpus=cpus, gpus=gpus)
 
-    An actor that is just being created is not killed: where the kill overtakes the creation on its
-    way to the worker, the raylet keeps the worker and its CPUs for ever (seen in Ray 2.60, once in
-    some hundred kills at that moment; Ray's issues 13214 and 27743). It is asked to end instead,
+
+def _workers_that_fit(node: Node, cpus: int, gpus: float) -> int:
+    by_cpus = int(node.cpus // cpus)
+    return min(by_cpus, int(node.gpus // gpus)) if gpus else by_cpus
+
+
+def stop_actor(actor: Any, first: "ray.ObjectRef[Any]", *queued: "ray.ObjectRef[Any]") -> None:
+    """Stop an actor. `first`: its first call, which shows whether it was created; `queued`: calls
+    after it, to be cancelled.
+
+    An actor that is just being created is not killed: if the kill overtakes the creation on its way
+    to the worker, the raylet keeps the worker and its CPUs for ever (seen in Ray 2.60, once in some
+    hundred kills at that moment; Ray's issues 13214 and 27743). It is asked to terminate instead,
     which waits behind the creation.
     """
     created, _ = ray.wait([first], timeout=0)
@@ -180,10 +233,10 @@ def bounded_map(
     """Call `submit` on every item with at most `window` calls in flight; yield (item, result) as
     they finish.
 
-    An exception in a call is raised here as it is, after nothing new has been submitted.
+    An exception in a call is raised here as it is, and nothing new is submitted after it.
     """
-    waiting = iter(items)
-    running: dict[Any, Item] = {submit(item): item for item in islice(waiting, window)}
+    pending = iter(items)
+    running: dict[Any, Item] = {submit(item): item for item in islice(pending, window)}
     while running:
         [done], _ = ray.wait(list(running), num_returns=1)
         item = running.pop(done)
@@ -191,43 +244,6 @@ def bounded_map(
             result = ray.get(done)
         except RayTaskError as error:
             raise error.cause or error from error
-        for following in islice(waiting, 1):
+        for following in islice(pending, 1):
             running[submit(following)] = following
         yield item, result
-
-
-def plan_placement(
-    nodes: Sequence[Node],
-    items: int,
-    workers: int | None = None,
-    cpus: int | None = None,
-    gpus: float | None = None,
-) -> Placement:
-    """A placement for so many items. None: one worker per GPU where there are any, else one per
-    eight cores of a node; and as many cores each as let all of them fit on the nodes that are
-    there, at least 1."""
-    if gpus is None:
-        gpus = 1.0 if any(node.gpus >= 1 for node in nodes) else 0.0
-    if workers is None:
-        workers = sum(
-            _workers_that_fit(
-                node, cpus or (1 if gpus else min(CORES_PER_WORKER, max(1, int(node.cpus)))), gpus
-            )
-            for node in nodes
-        )
-    workers = max(1, min(workers, items))
-    if cpus is None:
-        most = int(max((node.cpus for node in nodes), default=1))
-        fitting = (
-            c
-            for c in range(most, 1, -1)
-            if sum(_workers_that_fit(node, c, gpus) for node in nodes) >= workers
-        )
-        cpus = next(fitting, 1)
-    return Placement(workers=workers, cpus=cpus, gpus=gpus)
-
-
-def _workers_that_fit(node: Node, cpus: int, gpus: float) -> int:
-    """How many such workers a node holds."""
-    by_cpus = int(node.cpus // cpus)
-    return min(by_cpus, int(node.gpus // gpus)) if gpus else by_cpus

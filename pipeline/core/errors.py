@@ -1,7 +1,7 @@
 """The two errors that end a job with a sentence instead of a traceback, and the check of a flag.
 
-`InputError` ends a job with exit code 2, `Incomplete` with 1. Their messages say what was found, what was expected and
-what to do about it.
+`InputError` ends a job with exit code 2, `Incomplete` with 1. Their messages say what was found,
+what was expected and what to do about it.
 """
 
 
@@ -21,8 +21,8 @@ def require(condition: bool, flag: str, value: object, expected: str) -> None:
     `flag` is the name of the settings' field (`max_bad_fraction`) or the flag itself; `expected`
     says which values are valid and, after a semicolon, what to do where that is not obvious.
 
-    Raises InputError, "--max-bad-fraction is 2.0, expected a fraction from 0 to 1", if the condition
-    is false.
+    Raises InputError, "--max-bad-fraction is 2.0, expected a fraction from 0 to 1", if the
+    condition is false.
     """
     if not condition:
         name = flag.lstrip("-").replace("_", "-")

@@ -11,9 +11,8 @@ import numpy as np
 from pipeline.core.arrays import Doubles
 from pipeline.core.errors import InputError
 
-EARTH_RADIUS_M = (
-    6_371_008.8  # mean radius [IUGG]; against the ellipsoid distances err by up to 0.5 %
-)
+EARTH_RADIUS_M = 6_371_008.8
+"Mean radius [IUGG]; against the ellipsoid distances err by up to 0.5 %."
 
 
 def haversine_m(one_x2: Doubles, other_x2: Doubles) -> Doubles:
@@ -31,8 +30,8 @@ def haversine_m(one_x2: Doubles, other_x2: Doubles) -> Doubles:
 
 
 def on_sphere(positions_N2: Doubles) -> Doubles:
-    """Latitudes and longitudes as metres from the earth's centre (N, 3), where no meridian and no pole
-    is special."""
+    """Latitudes and longitudes as metres from the earth's centre (N, 3), where no meridian and no
+    pole is special."""
     lat_N, lon_N = np.radians(positions_N2[:, 0]), np.radians(positions_N2[:, 1])
     axes = np.cos(lat_N) * np.cos(lon_N), np.cos(lat_N) * np.sin(lon_N), np.sin(lat_N)
     return EARTH_RADIUS_M * np.stack(axes, axis=1)
@@ -40,8 +39,8 @@ def on_sphere(positions_N2: Doubles) -> Doubles:
 
 @dataclass(frozen=True, kw_only=True)
 class Box:
-    """A rectangle of positions, edges included. With `west` above `east` it crosses the meridian of 180
-    degrees.
+    """A rectangle of positions, edges included. With `west` above `east` it crosses the meridian of
+    180 degrees.
 
     Raises InputError if it is none.
     """
@@ -60,8 +59,8 @@ class Box:
         if not (latitudes and all(-180 <= lon <= 180 for lon in (self.west, self.east))):
             raise InputError(
                 f"the box is south {self.south}, north {self.north}, west {self.west}, east "
-                f"{self.east}; expected latitudes from -90 to 90, south below north, and longitudes "
-                "from -180 to 180; give west above east to cross 180 degrees"
+                f"{self.east}; expected latitudes from -90 to 90, south below north, and "
+                "longitudes from -180 to 180; give west above east to cross 180 degrees"
             )
 
     def spans(self) -> list[tuple[float, float]]:
@@ -73,7 +72,8 @@ class Box:
 
 @dataclass(frozen=True, kw_only=True)
 class Circle:
-    """A circle on the ground around a rough position: what a UAV that has just lost its GPS still knows.
+    """A circle on the ground around a rough position: what a UAV that has just lost its GPS still
+    knows.
 
     Raises InputError if it is none.
     """
@@ -89,6 +89,7 @@ class Circle:
         centre = -90 <= self.lat <= 90 and -180 <= self.lon <= 180
         if not (centre and 0 < self.radius_m < float("inf")):
             raise InputError(
-                f"the circle is at latitude {self.lat}, longitude {self.lon}, radius {self.radius_m} "
-                "m; expected a latitude from -90 to 90, a longitude from -180 to 180 and a radius above 0"
+                f"the circle is at latitude {self.lat}, longitude {self.lon}, radius "
+                f"{self.radius_m} m; expected a latitude from -90 to 90, a longitude from -180 to "
+                "180 and a radius above 0"
             )

@@ -1,130 +1,121 @@
-"""What a JSON file says -> a dataclass of ours, every type looked at.
+"""JSON files that carry a SHA-256 checksum of their own content, and JSON validated into
+dataclasses.
 
-In: decoded JSON. Out: the dataclass, or a ValueError that says which field is not what it should
-be. Whoever reads on may rely on it: a file may come from anybody, and Python would take a list
-where a number is meant until somebody computes with it.
+In: an object and a path. Out: a JSON file that any program reads, and the object again, or a
+ValueError if the content is not what was written. `from_json` parses a decoded object into a
+dataclass and checks the type of every field, because a file may come from anyone.
 """
 
-import dataclasses
 import hashlib
 import json
-import types
-import typing
-from enum import StrEnum
-from typing import Any, TypeVar, cast, get_args, get_origin
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, TypeVar, cast
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from pipeline.core import storage
 from pipeline.core.records import excerpt, is_utf8
 
-Told = TypeVar("Told")
+T = TypeVar("T")
+
+CHECKSUM_KEY = "checksum"
+"Name of the last entry of a file."
+CHECKSUM_PREFIX = "sha256:"
 
 
-def from_json(kind: type[Told], said: object) -> Told:
-    """The dataclass `kind` from a JSON object with its fields by name. Raises ValueError."""
-    return cast(Told, _value(kind, said, kind.__name__))
+def write_checksummed(path: str, content: dict[str, Any]) -> None:
+    """Write an object as a JSON file with its checksum, atomically."""
+    storage.write_json(path, content | {CHECKSUM_KEY: checksum_of(content)})
+
+
+def read_checksummed(path: str) -> dict[str, Any]:
+    """The object that `write_checksummed` wrote, without its checksum.
+
+    Raises ValueError if the file is not a JSON object, has no checksum or another one.
+    """
+    content = storage.read_json(path)
+    if not isinstance(content, dict):
+        raise ValueError(f"it holds a {type(content).__name__}, expected an object")
+    found = content.pop(CHECKSUM_KEY, None)
+    if found is None:
+        raise ValueError(
+            f"it has no entry {CHECKSUM_KEY!r}, so another program or a version before 0.2 wrote it"
+        )
+    if found != checksum_of(content):
+        raise ValueError(f"its content does not match its {CHECKSUM_KEY}")
+    return content
+
+
+def checksum_of(content: dict[str, Any]) -> str:
+    """SHA-256 of the object as a reader gets it, independent of the order of its entries."""
+    read_back = json.loads(json.dumps(content))
+    canonical = json.dumps(read_back, sort_keys=True, separators=(",", ":"))
+    return CHECKSUM_PREFIX + hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def from_json(kind: type[T], value: object) -> T:
+    """The dataclass `kind` from decoded JSON, with the type of every field checked.
+
+    Types are strict: no text for a number, no whole number with a decimal point, no missing and no
+    unknown fields, no NaN and no infinity, no text that is not UTF-8.
+
+    Raises ValueError that names the field, the value found and the one expected.
+    """
+    text = json.dumps([value])
+    try:
+        validated: tuple[T] = _adapter(cast(Any, kind)).validate_json(text)
+    except ValidationError as error:
+        raise ValueError(_message(kind.__name__, value, error)) from None
+    return validated[0]
 
 
 def is_file_name(name: str) -> bool:
-    """Whether a name is one file's in a folder: it leads nowhere else, whatever joins it to a path."""
+    """Whether a name is that of one visible file in a folder: joined to a path it leads nowhere
+    else."""
     return (
         bool(name) and not name.startswith(".") and not set(name) & set("/\\\0") and is_utf8(name)
     )
 
 
-def _value(kind: Any, said: object, name: str) -> object:
-    """`said` as a value of a type that dataclasses of ours have."""
-    origin, inner = get_origin(kind), get_args(kind)
-    if kind is Any:
-        return said
-    if dataclasses.is_dataclass(kind):
-        return _dataclass(kind, said, name)
-    if origin in (types.UnionType, typing.Union):
-        rest = [one for one in inner if one is not types.NoneType]
-        return None if said is None and len(rest) < len(inner) else _value(rest[0], said, name)
-    if origin is typing.Literal and isinstance(said, str | int) and said in inner:
-        return said
-    if origin is tuple and isinstance(said, list):
-        kinds = [inner[0]] * len(said) if inner[-1] is Ellipsis else list(inner)
-        if len(kinds) == len(said):
-            return tuple(
-                _value(one, value, f"{name}[{at}]")
-                for at, (one, value) in enumerate(zip(kinds, said, strict=True))
-            )
-    if origin is dict and isinstance(said, dict):
-        return {key: _value(inner[1], value, f"{name}[{key!r}]") for key, value in said.items()}
-    if (
-        isinstance(kind, type)
-        and issubclass(kind, StrEnum)
-        and isinstance(said, str)
-        and said in list(kind)
-    ):
-        return kind(said)
-    if kind is float and type(said) in (int, float):
-        return float(cast(float, said))  # OverflowError: a whole number beyond all floats
-    if (
-        kind in (int, bool, str)
-        and type(said) is kind
-        and (kind is not str or is_utf8(cast(str, said)))
-    ):
-        return said
-    raise ValueError(f"{name[:100]} is {excerpt(said)}, expected {getattr(kind, '__name__', kind)}")
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    # Around a tuple: a dataclass takes no settings from outside, but inherits those of what holds
+    # it.
+    config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    return TypeAdapter(tuple[kind], config=config)
 
 
-def _dataclass(kind: Any, said: object, name: str) -> object:
-    if not isinstance(said, dict):
-        raise ValueError(f"{name} is {excerpt(said)}, expected an object")
-    fields = {field.name: field for field in dataclasses.fields(kind)}
-    optional = {
-        field.name
-        for field in fields.values()
-        if field.default is not dataclasses.MISSING
-        or field.default_factory is not dataclasses.MISSING
-    }
-    missing, strange = (
-        sorted(fields.keys() - said.keys() - optional),
-        sorted(said.keys() - fields.keys()),
-    )
-    if missing or strange:
-        raise ValueError(
-            f"{name} has {'no' if missing else 'a strange'} field {excerpt((missing or strange)[0])}"
-        )
-    hints = typing.get_type_hints(kind)
-    return kind(
-        **{field: _value(hints[field], value, f"{name}.{field}") for field, value in said.items()}
-    )
+def _message(name: str, value: object, error: ValidationError) -> str:
+    """The first error as one sentence: field, value found, value expected."""
+    first = error.errors(include_url=False, include_context=False)[0]
+    steps = first["loc"][1:]
+    if first["type"] == "json_invalid":
+        path = _find_invalid_text(value, name)
+        return f"{path} is not UTF-8 text" if path else f"{name} is nested too deeply"
+    if first["type"] in ("missing", "unexpected_keyword_argument"):
+        what = "no" if first["type"] == "missing" else "an unknown"
+        return f"{_path(name, steps[:-1])} has {what} field {excerpt(steps[-1])}"
+    expected = first["msg"].removeprefix("Input should be ")
+    return f"{_path(name, steps)} is {excerpt(first['input'])}, expected {expected}"
 
 
-CHECKSUM_KEY, CHECKSUM_PREFIX = "seal", "sha256:"
-"Name and beginning of the last entry."
+def _path(name: str, steps: Sequence[int | str]) -> str:
+    """A field's path in the object, `Manifest.shards[3].name`; a hostile, long name is cut."""
+    return (name + "".join(f"[{s}]" if isinstance(s, int) else f".{s}" for s in steps))[:100]
 
 
-def write_checksummed(path: str, said: dict[str, Any]) -> None:
-    """Write an object as a JSON file with its seal, whole or not at all."""
-    storage.write_json(path, said | {CHECKSUM_KEY: checksum_of(said)})
-
-
-def read_checksummed(path: str) -> dict[str, Any]:
-    """The object without its seal.
-
-    Raises ValueError where the file is no JSON object or not what was written.
-    """
-    said = storage.read_json(path)
-    if not isinstance(said, dict):
-        raise ValueError(f"{type(said).__name__} in place of an object")
-    seal = said.pop(CHECKSUM_KEY, None)
-    # A seal under another name is one whose name was damaged.
-    sealed = seal is not None or any(
-        isinstance(value, str) and value.startswith(CHECKSUM_PREFIX) for value in said.values()
-    )
-    if sealed and seal != checksum_of(said):
-        raise ValueError(
-            f"its {CHECKSUM_KEY!r} is not of what it says; whoever changed it on purpose takes that entry out"
-        )
-    return said
-
-
-def checksum_of(said: dict[str, Any]) -> str:
-    """The hash of what reading the object back would give, whatever the order of its entries."""
-    read_back = json.loads(json.dumps(said))
-    plain = json.dumps(read_back, sort_keys=True, separators=(",", ":"))
-    return CHECKSUM_PREFIX + hashlib.sha256(plain.encode()).hexdigest()
+def _find_invalid_text(value: object, path: str) -> str | None:
+    """Path of the first text that cannot be written as UTF-8; for the name of a field, its
+    object's."""
+    if isinstance(value, str):
+        return None if is_utf8(value) else path
+    if isinstance(value, dict):
+        if not all(map(is_utf8, value)):
+            return path
+        found = (_find_invalid_text(item, f"{path}.{key}"[:100]) for key, item in value.items())
+    elif isinstance(value, list):
+        found = (_find_invalid_text(item, f"{path}[{i}]"[:100]) for i, item in enumerate(value))
+    else:
+        return None
+    return next(filter(None, found), None)

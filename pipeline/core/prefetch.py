@@ -1,8 +1,7 @@
-"""Work done by threads before it is asked for, in order and never too far ahead.
+"""Prefetching: threads do work before its result is asked for, in order and within a bounded depth.
 
-Threads are begun for one use, or given: whoever begins this a thousand times over keeps its own,
-for each new thread may get a heap of its own from the C library, and memory grows until there are
-eight heaps a core.
+Pass an executor if you call this often: glibc gives new threads their own malloc arenas (up to 8
+per core), so memory grows with every new pool.
 """
 
 from collections import deque
@@ -19,43 +18,43 @@ Item = TypeVar("Item")
 def prefetch_map(
     function: Callable[[In], Out], items: Iterable[In], threads: int | Executor, depth: int
 ) -> Iterator[Out]:
-    """`map` by threads, in order, at most `depth` items ahead of the consumer. Decoding releases
-    the GIL.
+    """`map` by threads, in order, at most `depth` items ahead of the consumer.
+
+    It pays for work that releases the GIL, such as decoding.
     """
-    with _executor(threads) as (pool, waiting):
+    with _executor(threads) as (pool, pending):
         for item in items:
-            waiting.append(pool.submit(function, item))
-            if len(waiting) > depth:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+            pending.append(pool.submit(function, item))
+            if len(pending) > depth:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
 
 
 def prefetch(
     items: Iterable[Item], depth: int, thread: Executor | None = None
 ) -> Generator[Item, None, None]:
-    """The items in order, made by a thread of their own, `depth` of them before they are asked for.
+    """The items in order, produced by one thread up to `depth` items before they are asked for.
 
-    `thread` must be a single one, that nobody else uses meanwhile.
+    `thread`: an executor with a single thread that nothing else uses meanwhile.
     """
     source, end = iter(items), object()
-    with _executor(thread or 1) as (pool, waiting):
-        waiting.extend(pool.submit(next, source, end) for _ in range(depth))
-        while (item := waiting.popleft().result()) is not end:
-            waiting.append(pool.submit(next, source, end))
+    with _executor(thread or 1) as (pool, pending):
+        pending.extend(pool.submit(next, source, end) for _ in range(depth))
+        while (item := pending.popleft().result()) is not end:
+            pending.append(pool.submit(next, source, end))
             yield item
 
 
 @contextmanager
 def _executor(threads: int | Executor) -> Iterator[tuple[Executor, deque[Future[Any]]]]:
-    """Threads, and a queue of what they were given: at the end what has not begun is dropped, what
-    has is waited for.
-    """
+    """An executor and a queue of its futures; at the end those not yet running are cancelled, the
+    others waited for, and an executor that was made here is shut down."""
     pool = ThreadPoolExecutor(threads) if isinstance(threads, int) else threads
-    waiting: deque[Future[Any]] = deque()
+    pending: deque[Future[Any]] = deque()
     try:
-        yield pool, waiting
+        yield pool, pending
     finally:
-        wait([future for future in waiting if not future.cancel()])
+        wait([future for future in pending if not future.cancel()])
         if pool is not threads:
             pool.shutdown()

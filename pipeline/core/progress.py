@@ -1,6 +1,5 @@
 """Progress of long work: a bar on a terminal, a JSON line every few seconds elsewhere; rate and
-time left in both.
-"""
+time left in both."""
 
 import json
 import re
@@ -27,17 +26,19 @@ SECONDS_BETWEEN_LINES = 5.0
 CONTROL_CHARACTERS = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
 )
-"""What a terminal would obey and not show, line ends and tabs aside; what turns the direction of
-writing round; and halves of characters, which stand for the bytes of names that are no UTF-8."""
+"""Characters that a terminal obeys instead of showing, line ends and tabs aside; those that reverse
+the direction of writing; and lone surrogates, which stand for the bytes of names that are not
+UTF-8."""
 
 
 def escape_controls(text: str) -> str:
-    """Text as a terminal may be given it: files may be called anything, also what clears a screen."""
+    """Text that is safe for a terminal: a file name may hold anything, even a command to clear the
+    screen."""
     return CONTROL_CHARACTERS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 class _PlainConsole(Console):
-    """A console that shows text as it is: names are no markup and no emoji, and command nothing."""
+    """A console that shows text as it is: no markup, no emoji, no control characters in names."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(highlight=False, markup=False, emoji=False, **kwargs)
@@ -47,24 +48,24 @@ class _PlainConsole(Console):
 
 
 console = _PlainConsole(stderr=True, soft_wrap=True)
-"Where progress and remarks go. Paths stay whole for whoever copies them."
+"For progress and remarks. Lines are not wrapped, so that a path can be copied in one piece."
 results = _PlainConsole()
-"Where results go: standard output."
+"For results: standard output."
 
 
 class Meter(Protocol):
-    """What long work tells of itself while it runs."""
+    """Where long work reports its progress."""
 
     def advance(self, count: float = 1, **facts: float | str) -> None:
-        """`count` more units are done; `facts` are shown beside the bar until others come."""
+        """Report `count` more units as done; `facts` are shown until others replace them."""
 
     def note(self, text: str) -> None:
-        """One remark that stays on the screen."""
+        """Print a remark that stays on the screen."""
 
 
 @contextmanager
 def progress(total: float | None, label: str, unit: str = "images") -> Iterator[Meter]:
-    """Show the progress of `total` units of work (None where unknown)."""
+    """Show the progress of `total` units of work (None: unknown)."""
     if not console.is_terminal:
         meter = _JsonLines(total, label, unit)
         yield meter
@@ -85,7 +86,7 @@ def progress(total: float | None, label: str, unit: str = "images") -> Iterator[
 
 
 class _PlainColumn(TextColumn):
-    """A column of text that is no markup."""
+    """A column of text without markup."""
 
     def __init__(self, form: str) -> None:
         super().__init__(form, markup=False)
@@ -114,33 +115,35 @@ class _TerminalBar:
 class _JsonLines:
     def __init__(self, total: float | None, label: str, unit: str) -> None:
         self._total, self._label, self._unit = total, label, unit
-        self._start = self._said = time.monotonic()
+        self._start = self._last_line = time.monotonic()
         self._done = 0.0
         self._facts: dict[str, float | str] = {}
 
     def advance(self, count: float = 1, **facts: float | str) -> None:
         self._done += count
         self._facts.update(facts)
-        if time.monotonic() - self._said >= SECONDS_BETWEEN_LINES:
+        if time.monotonic() - self._last_line >= SECONDS_BETWEEN_LINES:
             self.line()
 
     def line(self, last: bool = False) -> None:
-        self._said = time.monotonic()
-        seconds = max(1e-9, self._said - self._start)
+        self._last_line = time.monotonic()
+        seconds = max(1e-9, self._last_line - self._start)
         rate = self._done / seconds
-        said: dict[str, object] = {
+        row: dict[str, object] = {
             "step": self._label,
             "done": self._done,
             "total": self._total,
             "unit": self._unit,
+            "per_second": round(rate, 2),
+            "seconds": round(seconds, 1),
         }
-        said |= {"per_second": round(rate, 2), "seconds": round(seconds, 1)}
         if self._total is not None and rate > 0 and not last:
-            said["seconds_left"] = round((self._total - self._done) / rate, 1)
-        print(json.dumps(said | self._facts), file=sys.stderr, flush=True)
+            row["seconds_left"] = round((self._total - self._done) / rate, 1)
+        print(json.dumps(row | self._facts), file=sys.stderr, flush=True)
 
     def note(self, text: str) -> None:
-        print(json.dumps({"step": self._label, "note": text}), file=sys.stderr, flush=True)
+        row = {"step": self._label, "note": text}
+        print(json.dumps(row), file=sys.stderr, flush=True)
 
 
 def _format_value(value: float | str) -> str:

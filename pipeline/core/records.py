@@ -1,6 +1,4 @@
-"""The shared vocabulary: what an image is, which of them it is (key), where it shows, and why one
-was refused.
-"""
+"""The shared vocabulary: an image, its key, its position, and why one was rejected."""
 
 import hashlib
 import re
@@ -9,9 +7,8 @@ from enum import StrEnum
 
 
 class Split(StrEnum):
-    """Which part of a data set an image belongs to. The official test set is all of query and
-    gallery.
-    """
+    """The part of a data set that an image belongs to. The official test set is all of query and
+    gallery."""
 
     TRAIN = "train"
     QUERY = "query"
@@ -19,9 +16,8 @@ class Split(StrEnum):
 
 
 class View(StrEnum):
-    """From where an image was taken. `google` is University-1652's street view images found by a
-    web search.
-    """
+    """Where an image was taken from. `google` is University-1652's street view images found by a
+    web search."""
 
     DRONE = "drone"
     SATELLITE = "satellite"
@@ -31,12 +27,12 @@ class View(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class GeoTag:
-    """Where the place that an image shows lies, WGS84, and how the camera looked at it."""
+    """Position of the ground that an image shows, WGS84, and how the camera looked at it."""
 
     lat: float
-    "Latitude of the place shown, degrees north."
+    "Latitude of the ground shown, degrees north."
     lon: float
-    "Longitude of the place shown, degrees east."
+    "Longitude of the ground shown, degrees east."
     altitude_m: float | None = None
     "Height of the camera above the ground, metres."
     heading_deg: float | None = None
@@ -53,51 +49,47 @@ class ImageRecord:
     """One image as a source found it; its pixels have not been read."""
 
     path: str
-    "The file it is, or is a part of; a plain path or a URI."
+    "The image file, or the file that the image is a part of; a plain path or a URI."
     part: str = ""
-    "Which part of the file, in its source's words; empty where it is the whole file."
+    "Which part of the file, in its source's words; empty if the image is the whole file."
     split: Split
     view: View
     location: str
     "The label: the folder's name, never an index."
     variant: str = ""
-    "What tells apart images of one name in one location, such as the height they were taken from."
+    """Distinguishes images of one name in one location, such as by the height that they were taken
+    from."""
     geotag: GeoTag | None = None
     taken_at: str | None = None
     "When, ISO 8601; without an offset it is the camera's own clock."
     bytes: int | None = None
-    "Size of the file; None where the image is a part of one."
+    "Size of the file; None if the image is a part of one."
 
     @property
     def key(self) -> str:
         """Name of this image in the data set: `[a-z0-9_-]+`, derived from split, view, location,
-        variant and file name.
-        """
+        variant and file name."""
         stem = self.part or self.path.rsplit("/", 1)[-1].rsplit(".", 1)[0]
-        return make_key(
-            self.split, self.view, self.location, f"{self.variant}-{stem}" if self.variant else stem
-        )
+        named = f"{self.variant}-{stem}" if self.variant else stem
+        return make_key(self.split, self.view, self.location, named)
 
     @property
     def name(self) -> str:
-        """What a person would look for: the path, and which part of it."""
+        """The name that a person would look for: the path, and which part of it."""
         return f"{self.path}#{self.part}" if self.part else self.path
 
 
 MAX_KEY_LENGTH = 90
-"A tar header of the oldest kind holds names of 100 characters, ending included."
+"A tar header of the oldest kind holds names of 100 characters, suffix included."
 MAX_EXCERPT_LENGTH = 200
 "Characters of a damaged value that are shown."
 MAX_FOUND_LENGTH = 600
-"Characters of what was found that are written down."
+"Characters of `Rejection.found` that are kept."
 KEY_PATTERN = re.compile(rf"[a-z0-9_-]{{1,{MAX_KEY_LENGTH}}}")
-"What a key looks like."
 
 
 def is_utf8(name: str) -> bool:
-    """Whether it can be written down as UTF-8: names of files in other encodings hold lone
-    surrogates.
-    """
+    """Whether text can be written as UTF-8: file names in other encodings hold lone surrogates."""
     try:
         name.encode()
     except UnicodeEncodeError:
@@ -106,36 +98,37 @@ def is_utf8(name: str) -> bool:
 
 
 def escape_non_utf8(name: str) -> str:
-    """The name with what cannot be written down spelled out."""
+    """The text with characters that UTF-8 cannot hold written as escapes."""
     return name.encode("utf-8", "backslashreplace").decode()
 
 
 def is_position(lat: object, lon: object) -> bool:
-    """Whether these are degrees north and east of some place."""
+    """Whether these are degrees north and east of a point on the earth."""
     plain = all(
         isinstance(value, int | float) and not isinstance(value, bool) for value in (lat, lon)
     )
-    return plain and -90 <= lat <= 90 and -180 <= lon <= 180  # type: ignore[operator]  # false of a NaN
+    return plain and -90 <= lat <= 90 and -180 <= lon <= 180  # type: ignore[operator]  # NaN: false
 
 
 def excerpt(value: object) -> str:
-    """So much of what was found as a sentence can hold."""
-    said = repr(value)
-    return said if len(said) <= MAX_EXCERPT_LENGTH else f"{said[:MAX_EXCERPT_LENGTH]}..."
+    """The beginning of a value's repr, as much as a sentence can hold."""
+    text = repr(value)
+    return text if len(text) <= MAX_EXCERPT_LENGTH else f"{text[:MAX_EXCERPT_LENGTH]}..."
 
 
 def make_key(split: Split, view: View, location: str, stem: str) -> str:
     """Key of an image: stable under re-sharding, without dots (webdataset cuts a name at the first
     one).
 
-    Where a character had to be replaced or the end cut off, eight digits of the original name's
-    hash keep two names apart.
+    If a character had to be replaced or the end cut off, eight digits of the original name's hash
+    keep two names apart.
     """
     named = f"{split}-{view}-{location}-{stem}"
     slug = re.sub(r"[^a-z0-9_-]", "_", named.lower())
     if slug == named and len(slug) <= MAX_KEY_LENGTH:
         return slug
-    return f"{slug[: MAX_KEY_LENGTH - 9]}-{hashlib.sha256(named.encode('utf-8', 'surrogateescape')).hexdigest()[:8]}"
+    digest = hashlib.sha256(named.encode("utf-8", "surrogateescape")).hexdigest()
+    return f"{slug[: MAX_KEY_LENGTH - 9]}-{digest[:8]}"
 
 
 def key_matches(key: str, split: Split, view: View, location: str) -> bool:
@@ -146,18 +139,16 @@ def key_matches(key: str, split: Split, view: View, location: str) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Rejection:
-    """An image that was refused, and why."""
+    """A rejected image with its reason."""
 
     path: str
     reason: str
     "Short and countable: the same words for the same fault."
     found: str
-    "What this file held, for the person who mends it; cut where it is longer than LONGEST_FOUND."
+    "What this file held, for the person who repairs it; at most MAX_FOUND_LENGTH characters."
 
     def __post_init__(self) -> None:
         found = escape_non_utf8(self.found)
-        if (
-            len(found) > MAX_FOUND_LENGTH
-        ):  # a damaged file may hold a megabyte where a number was expected
+        if len(found) > MAX_FOUND_LENGTH:  # a damaged file may hold a megabyte instead of a number
             found = f"{found[: MAX_FOUND_LENGTH - 3]}..."
         object.__setattr__(self, "found", found)

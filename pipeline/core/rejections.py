@@ -1,4 +1,4 @@
-"""The list of what was refused: one row per image with its path, a countable reason, and what was
+"""The table of rejected images: one row per image with its path, a countable reason, and what was
 found.
 
 In: rejections. Out: `rejected.parquet`.
@@ -20,41 +20,42 @@ REJECTED_SCHEMA = pa.schema(
 
 
 def write_rejections(folder: str, rejected: Iterable[Rejection], keep: bool) -> int:
-    """Write the list, by path, and return its length; `keep`: beside what it holds already.
+    """Write the table, sorted by path, and return its length; `keep`: add to the rows already
+    there.
 
-    Raises InputError where that cannot be read.
+    Raises InputError if those cannot be read.
     """
     path = storage.join(folder, REJECTED_FILE)
-    listed = {(rejection.path, rejection.reason, rejection.found) for rejection in rejected}
+    rows = {(rejection.path, rejection.reason, rejection.found) for rejection in rejected}
     if keep and storage.exists(path):
-        listed.update(zip(*_read_rejections(path).to_pydict().values(), strict=True))
-    table = pa.Table.from_pylist(
-        [dict(zip(REJECTED_SCHEMA.names, row, strict=True)) for row in sorted(listed)],
-        REJECTED_SCHEMA,
-    )
+        rows.update(zip(*_read_rejections(path).to_pydict().values(), strict=True))
+    named = [dict(zip(REJECTED_SCHEMA.names, row, strict=True)) for row in sorted(rows)]
+    table = pa.Table.from_pylist(named, REJECTED_SCHEMA)
     parquet.write_table(path, table)
     return len(table)
 
 
 def rejections_intact(folder: str, count: int) -> bool:
-    """Whether the list is there, every byte as it was written, with so many images."""
+    """Whether the table exists, holds every byte as it was written, and has so many rows."""
     path = storage.join(folder, REJECTED_FILE)
-    try:
-        return parquet.parquet_intact(path) and len(_read_rejections(path)) == count
-    except InputError:  # of one without a seal
-        return False
+    return parquet.parquet_intact(path) and len(_read_rejections(path)) == count
 
 
 def rejected_paths(folder: str) -> frozenset[str]:
-    """The images that are listed; none where there is no list. Raises InputError where it cannot be
-    read.
+    """Paths of the rejected images; none if there is no table.
+
+    Raises InputError if it cannot be read.
     """
     path = storage.join(folder, REJECTED_FILE)
-    return (
-        frozenset(_read_rejections(path)["path"].to_pylist())
-        if storage.exists(path)
-        else frozenset()
-    )
+    if not storage.exists(path):
+        return frozenset()
+    return frozenset(_read_rejections(path)["path"].to_pylist())
+
+
+def most_common_reasons(rejected: Iterable[Rejection]) -> str:
+    """The three most common reasons with their counts."""
+    counts = Counter(rejection.reason for rejection in rejected).most_common(3)
+    return ", ".join(f"{reason} ({count})" for reason, count in counts)
 
 
 def _read_rejections(path: str) -> pa.Table:
@@ -62,12 +63,6 @@ def _read_rejections(path: str) -> pa.Table:
         return parquet.read_table(path)
     except parquet.DAMAGE_ERRORS as error:
         raise InputError(
-            f"{path} cannot be read ({error}), expected the list of refused images; delete it and run the same command again: "
-            "it lists what is refused from now on"
+            f"{path} cannot be read ({error}), expected the table of rejected images; delete it "
+            "and run the same command again: it lists images that are rejected from now on"
         ) from None
-
-
-def most_common_reasons(rejected: Iterable[Rejection]) -> str:
-    """The three commonest reasons with their counts."""
-    counts = Counter(rejection.reason for rejection in rejected).most_common(3)
-    return ", ".join(f"{reason} ({count})" for reason, count in counts)

@@ -1,6 +1,5 @@
 """Files on any storage that fsspec knows: a plain path, file://, s3://, gs://, memory://. Writing
-is all or nothing.
-"""
+is atomic."""
 
 import json
 import os
@@ -18,14 +17,13 @@ from fsspec.implementations.local import LocalFileSystem
 from pipeline.core.errors import InputError
 
 TEMPORARY_NAME = re.compile(r"\.(.+)\.[0-9a-f]{8}")
-"Names that `atomic_write` gives to files until they are whole."
+"Names that `atomic_file` gives to files until they are complete."
 
 
 def resolve(path: str) -> tuple[Any, str]:
-    """The fsspec file system of a path and the path on it.
+    """The fsspec file system of a path, and the path on it.
 
-    Raises InputError where no file system is known by a URI's scheme, or what it needs is not
-    installed.
+    Raises InputError if no file system is known by a URI's scheme, or its package is not installed.
     """
     if "://" not in path:  # to fsspec a name with :: in it would be a chain of file systems
         local = LocalFileSystem()
@@ -34,7 +32,8 @@ def resolve(path: str) -> tuple[Any, str]:
         filesystem, inner = fsspec.core.url_to_fs(path)
     except (ValueError, ImportError) as error:
         raise InputError(
-            f"{path} is on no storage that is known here ({error}); expected a path, file://, s3:// or gs://"
+            f"{path} is on no storage that is known here ({error}); expected a path, file://, "
+            "s3:// or gs://"
         ) from None
     return filesystem, inner
 
@@ -44,9 +43,7 @@ def is_local(path: str) -> bool:
 
 
 def absolute(path: str) -> str:
-    """The path as another process with another working directory would have to name it; URIs stay
-    as they are.
-    """
+    """The path as a process with another working directory must name it; URIs stay as they are."""
     return path if "://" in path else os.path.abspath(os.path.expanduser(path))
 
 
@@ -60,7 +57,7 @@ def exists(path: str) -> bool:
 
 
 def list_names(folder: str) -> list[str]:
-    """File names in a folder, sorted, without temporary and hidden ones; an absent folder has none."""
+    """File names in a folder, sorted, without hidden and temporary ones; none if it is absent."""
     filesystem, inner = resolve(folder)
     if not filesystem.isdir(inner):
         return []
@@ -79,19 +76,19 @@ def walk(folder: str) -> dict[str, int]:
     if isinstance(filesystem, LocalFileSystem):
         found = dict(_walk_disk(inner, frozenset()))
     else:
-        found = {path: entry["size"] for path, entry in filesystem.find(inner, detail=True).items()}
-    below = ((path.removeprefix(root), size) for path, size in found.items())
-    return {
-        path: size
-        for path, size in sorted(below)
-        if not any(part.startswith(".") for part in path.split("/"))
-    }
+        entries = filesystem.find(inner, detail=True).items()
+        found = {path: entry["size"] for path, entry in entries}
+    below = sorted((path.removeprefix(root), size) for path, size in found.items())
+    return {path: size for path, size in below if not _is_hidden(path)}
+
+
+def _is_hidden(path: str) -> bool:
+    return any(part.startswith(".") for part in path.split("/"))
 
 
 def _walk_disk(folder: str, above: frozenset[str]) -> Iterator[tuple[str, int]]:
     """All files below a folder of this machine; links whose target is gone have size 0. `above`:
-    the folders on the way.
-    """
+    the folders on the way."""
     real = os.path.realpath(folder)
     if real in above:
         return
@@ -125,16 +122,15 @@ def read_bytes(path: str) -> bytes:
 
 
 def read_head(path: str, size: int) -> bytes:
-    """The first `size` bytes of a file, or all of it where it is shorter; of a remote file no more
-    is fetched.
-    """
+    """The first `size` bytes of a file, or all of a shorter one; no more is fetched from a remote
+    file."""
     filesystem, inner = resolve(path)
     data: bytes = filesystem.cat_file(inner, start=0, end=size)
     return data
 
 
 def read_json(path: str) -> Any:
-    """Raises ValueError where it is no JSON, or nested deeper than anything of ours."""
+    """Raises ValueError if the file is not JSON, or nested deeper than anything written here."""
     try:
         return json.loads(read_bytes(path))
     except RecursionError:
@@ -149,18 +145,18 @@ def open_read(path: str) -> IO[bytes]:
 
 @contextmanager
 def atomic_write(path: str) -> Iterator[IO[bytes]]:
-    """A stream to write a file through, which appears under its name when complete or not at all."""
+    """A stream to write a file through, which appears under its name when complete or never."""
     with atomic_file(path) as local, open(local, "wb") as stream:
         yield stream
 
 
 @contextmanager
 def atomic_file(path: str) -> Iterator[str]:
-    """A path on this machine to write a file to, which appears under its own name when complete or
-    not at all.
+    """A local path to write a file to, which appears under its own name when complete or not at
+    all.
 
     On a local disk: a hidden temporary neighbour, fsynced and renamed. Elsewhere: one upload at the
-    end, which object stores make visible whole.
+    end, which object stores make visible at once.
     """
     filesystem, inner = resolve(path)
     if not isinstance(filesystem, LocalFileSystem):
@@ -183,23 +179,22 @@ def atomic_file(path: str) -> Iterator[str]:
 
 
 def remove_temporaries(folder: str, names: Iterable[str]) -> None:
-    """Remove what `atomic_write` left of these files in a folder where its process was killed; nobody may
-    be writing them.
-    """
+    """Remove the temporary files that a killed process left of these files in a folder. Nothing may
+    be writing them meanwhile."""
     filesystem, inner = resolve(folder)
     if isinstance(filesystem, LocalFileSystem) and os.path.isdir(inner):
         wanted = set(names)
         for entry in os.listdir(inner):
-            left = TEMPORARY_NAME.fullmatch(entry)
-            if left and left[1] in wanted:
+            match = TEMPORARY_NAME.fullmatch(entry)
+            if match and match[1] in wanted:
                 Path(inner, entry).unlink(missing_ok=True)
 
 
 def link_or_copy(source: str, target: str) -> None:
-    """A second name for a file's content on the same storage, all or nothing; both must be written
-    whole from then on.
+    """A second name for a file's content on the same storage, atomically; later writes to either
+    must be atomic too.
 
-    On a local disk a hard link, which costs nothing, where the disk has them.
+    On a local disk a hard link, which costs nothing, if the disk has them.
     """
     filesystem, inner = resolve(source)
     other = resolve(target)[1]
@@ -223,7 +218,7 @@ def remove(path: str) -> None:
 
 
 def remove_folder(path: str) -> None:
-    """A folder with all that is in it; one that is not there is no fault."""
+    """Remove a folder with all its content; an absent one is no error."""
     filesystem, inner = resolve(path)
     if filesystem.exists(inner):
         filesystem.rm(inner, recursive=True)
@@ -235,7 +230,7 @@ def write_bytes(path: str, data: bytes) -> None:
 
 
 def encode_json(value: Any) -> bytes:
-    """The file that `write_json` writes."""
+    """The bytes that `write_json` writes."""
     return (json.dumps(value, indent=2, ensure_ascii=False) + "\n").encode()
 
 

@@ -243,10 +243,10 @@ def pool_config(
         size=placement.workers,
         resources=f"{placement}, and the largest of {len(nodes)} nodes has {max((n.cpus for n in nodes), default=0):g} CPUs",
         in_flight=IN_FLIGHT,
-        refusals=(InputError,),
+        skip_on=(InputError,),
         fatal=(TableWriteFailed,),
         patience=settings.patience,
-        say=console.print,
+        notify=console.print,
     )
 
 
@@ -267,7 +267,7 @@ def run_pool(
                 assert isinstance(result, ShardResult)
                 spent.update(result.seconds)
                 embedded += shard.samples
-                meter.advance(shard.samples, workers=crew.working)
+                meter.advance(shard.samples, workers=crew.ready_workers)
     except NoWorkerStarted as error:
         raise InputError(
             f"{error}; start nodes that have them, or give --cpus-per-worker, --gpus-per-worker"

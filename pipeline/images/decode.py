@@ -1,5 +1,4 @@
-"""Bytes of a file -> pixels; the paper's train and test transforms per view, on uint8. The network
-normalises.
+"""Bytes of an image file -> pixels, RGB and upright.
 
 Shapes: H x W pixels.
 """
@@ -15,8 +14,8 @@ from PIL import Image, UnidentifiedImageError
 
 Pixels = npt.NDArray[np.uint8]
 PILLOW_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF", "PPM")
-"""What Pillow may take bytes for, whatever their name says. It knows forty more, some of them
-seldom looked at, and has Ghostscript run what calls itself EPS."""
+"""Formats that Pillow may recognise, whatever the file's name. It knows forty more, some of them
+seldom reviewed, and starts Ghostscript for a file that declares itself EPS."""
 ORIENTATION_TAG = 0x0112
 UPRIGHT_SLICES = {
     1: (slice(None), slice(None)),
@@ -24,16 +23,15 @@ UPRIGHT_SLICES = {
     3: (slice(None, None, -1), slice(None, None, -1)),
     4: (slice(None, None, -1), slice(None)),
 }
-"""What turns pixels upright, by EXIF orientation. Not ImageOps.exif_transpose: it writes all other
-tags again, and fails where a camera gave one of them a type that is not its own."""
+"""Slices that turn pixels upright, by EXIF orientation. Not ImageOps.exif_transpose: it rewrites
+all other tags, and fails if a camera gave one of them the type of another."""
 TRANSPOSED = {5: 1, 6: 2, 7: 3, 8: 4}
-"The orientations that are one of UPRIGHT's once rows and columns are exchanged."
+"Orientations that equal one of UPRIGHT_SLICES once rows and columns are exchanged."
 
 
 class DecodeError(ValueError):
     """Bytes that are not an image. `reason` is short and countable, the message says what was
-    found.
-    """
+    found."""
 
     def __init__(self, reason: str, found: str) -> None:
         super().__init__(f"{reason}: {found}")
@@ -47,14 +45,12 @@ def decode(data: bytes) -> Pixels:
     """
     with (
         decode_errors(data),
-        Image.open(io.BytesIO(data), formats=PILLOW_FORMATS) as opened,
-    ):  # reads the header only
-        if opened.format in ("JPEG", "MPO") and opened.mode in (
-            "RGB",
-            "L",
-        ):  # MPO: a JPEG that others follow
+        Image.open(io.BytesIO(data), formats=PILLOW_FORMATS) as opened,  # reads the header only
+    ):
+        # MPO: a JPEG that others follow
+        if opened.format in ("JPEG", "MPO") and opened.mode in ("RGB", "L"):
             return to_upright(simplejpeg.decode_jpeg(data, "RGB"), orientation_of(opened))
-        opened.load()  # Pillow turns a TIFF upright here, and its tag is gone
+        opened.load()  # Pillow turns a TIFF upright here, and removes its tag
         return to_upright(_rgb(opened), orientation_of(opened))
 
 
@@ -62,14 +58,14 @@ def _rgb(image: Image.Image) -> Pixels:
     if image.mode.startswith("I"):  # 16 bits a pixel, which Pillow's convert would clip at 255
         grey_HW = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)
         return np.repeat(grey_HW[:, :, None], 3, axis=2)
-    if image.mode == "P":  # by way of RGBA: Pillow warns of every palette that holds transparency
+    if image.mode == "P":  # through RGBA: Pillow warns of every palette that holds transparency
         image = image.convert("RGBA")
     return np.asarray(image.convert("RGB"))
 
 
 @contextmanager
 def decode_errors(data: bytes) -> Iterator[None]:
-    """Whatever goes wrong over an image's bytes becomes a DecodeError with a countable reason."""
+    """Turn any error over an image's bytes into a DecodeError with a countable reason."""
     if not data:
         raise DecodeError("empty file", "0 bytes")
     try:
@@ -77,9 +73,8 @@ def decode_errors(data: bytes) -> Iterator[None]:
     except (DecodeError, MemoryError):  # the latter is this machine's fault and not the image's
         raise
     except UnidentifiedImageError:
-        raise DecodeError(
-            "not an image", f"{len(data)} bytes that begin with {data[:8]!r}"
-        ) from None
+        found = f"{len(data)} bytes that begin with {data[:8]!r}"
+        raise DecodeError("not an image", found) from None
     except Image.DecompressionBombError as error:
         raise DecodeError("too many pixels", str(error)) from None
     except Exception as error:  # Pillow raises many kinds over damaged headers and metadata
@@ -87,15 +82,14 @@ def decode_errors(data: bytes) -> Iterator[None]:
 
 
 def orientation_of(image: Image.Image) -> int:
-    """The EXIF orientation, 1 (as it stands) to 8; 1 too where the image says none or one without a
-    meaning.
-    """
-    said = image.getexif().get(ORIENTATION_TAG, 1)
-    return said if said in UPRIGHT_SLICES or said in TRANSPOSED else 1
+    """The EXIF orientation, 1 (as stored) to 8; 1 too if the image has none or one without a
+    meaning."""
+    orientation = image.getexif().get(ORIENTATION_TAG, 1)
+    return orientation if orientation in UPRIGHT_SLICES or orientation in TRANSPOSED else 1
 
 
 def to_upright(image_HW3: Pixels, orientation: int) -> Pixels:
-    """Pixels as an image with that EXIF orientation holds them -> upright, one block of memory."""
+    """Pixels stored with an EXIF orientation -> upright, in one block of memory."""
     if orientation in TRANSPOSED:
         image_HW3, orientation = image_HW3.swapaxes(0, 1), TRANSPOSED[orientation]
     return np.ascontiguousarray(image_HW3[UPRIGHT_SLICES[orientation]])

@@ -1,7 +1,7 @@
-"""The bytes of a file -> the size of the image that they hold, in microseconds: judged by its
-structure, not decoded.
+"""The bytes of a file -> the size of the image that they hold, in microseconds: from its structure,
+not decoded.
 
-In: the encoded bytes, whole. Out: width and height as the image stands upright, or why it is
+In: the encoded bytes, all of them. Out: width and height as the image stands upright, or why it is
 refused.
 """
 
@@ -19,55 +19,64 @@ from pipeline.images.decode import (
     orientation_of,
 )
 
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
+"Of files that are taken for images, in lower case; upper case is valid too."
 MAX_PIXELS = 178_956_970
 """Where Pillow sees a decompression bomb: twice what 24 bits a pixel make of a quarter of a GiB.
-Beyond it decode refuses."""
+Larger images decode refuses."""
 MIN_SIDE, MAX_SIDE = 8, 65_535
-"""Pixels. Smaller ones are a web page's spacers and counters, larger ones a mosaic's, which a
+"""Pixels. Smaller images are a web page's spacers and counters, larger ones a mosaic's, which a
 source cuts into tiles."""
 MAX_RATIO = 100
-"Longer side over shorter one: what remains of a strip, squeezed into a square, shows no place."
+"Longer side over shorter one: a strip, squeezed into a square, shows no location."
 FIRST_TRANSPOSED = 5
 "EXIF orientations from this one on turn an image so that its width becomes its height."
 PNG_METADATA_KEYWORDS = (b"Raw profile type exif\0", b"XML:com.adobe.xmp\0")
-"Keywords of the text chunks that may hold an orientation."
+"Of the text chunks that may hold an orientation."
 
 
-def inspect(data: bytes, max_pixels: int = MAX_PIXELS) -> tuple[int, int]:
+def is_image_name(name: str) -> bool:
+    """Whether a file is taken for an image, by its name."""
+    return name.lower().endswith(IMAGE_SUFFIXES)
+
+
+def inspect(data: bytes, most_pixels: int = MAX_PIXELS) -> tuple[int, int]:
     """Encoded image -> (width, height), upright as its EXIF orientation says; JPEG, PNG and WebP
     without decoding.
 
-    It refuses for decode's reasons (`empty file`, `not an image`, `damaged image`, `too many pixels`), and besides for
-    `truncated image`, where the end is missing, and `absurd dimensions`. What it accepts may still not decode: flipped or
-    overwritten bytes within the compressed pixels, and a hole that was filled so that the end is where it belongs, are not
-    seen. CMYK JPEG, TIFF, BMP, GIF and all others are decoded, so of them all is seen; JPEG, PNG and WebP of more than
-    `max_pixels` never are.
+    It refuses for decode's reasons (`empty file`, `not an image`, `damaged image`, `too many
+    pixels`), and also for `truncated image`, where the end is missing, and `absurd dimensions`. An
+    accepted image may still not decode: flipped or overwritten bytes within the compressed pixels
+    are not seen, nor a hole that was filled so that the end is where it belongs. CMYK JPEG, TIFF,
+    BMP, GIF and all others are decoded, so every fault of theirs is seen; JPEG, PNG and WebP of
+    more than `most_pixels` never are.
 
     Raises DecodeError.
     """
     with decode_errors(data):
         if data.startswith(b"\xff\xd8\xff"):
-            size = _jpeg(data, max_pixels)
+            size = _jpeg(data, most_pixels)
         elif data.startswith(b"\x89PNG\r\n\x1a\n"):
-            size = _png(data, max_pixels)
+            size = _png(data, most_pixels)
         elif data.startswith(b"RIFF") and data[8:12] == b"WEBP":
             size = _webp(data)
         else:
             size = _size_by_decoding(data)
-    _check_dimensions(*size, max_pixels)
+    _check_dimensions(*size, most_pixels)
     return size
 
 
-def _check_dimensions(width: int, height: int, max_pixels: int) -> None:
+def _check_dimensions(width: int, height: int, most_pixels: int) -> None:
     short, long = sorted((width, height))
-    if width * height > max_pixels:
+    if width * height > most_pixels:
         raise DecodeError(
-            "too many pixels", f"{width} x {height}, expected at most {max_pixels} pixels"
+            "too many pixels", f"{width} x {height}, expected at most {most_pixels} pixels"
         )
     if short < MIN_SIDE or long > MAX_SIDE or long > MAX_RATIO * short:
         raise DecodeError(
             "absurd dimensions",
-            f"{width} x {height}, expected sides of {MIN_SIDE} to {MAX_SIDE} pixels, one at most {MAX_RATIO} times the other",
+            f"{width} x {height}, expected sides of {MIN_SIDE} to {MAX_SIDE} pixels, one at most "
+            f"{MAX_RATIO} times the other",
         )
 
 
@@ -77,7 +86,7 @@ def _size_by_decoding(data: bytes) -> tuple[int, int]:
 
 
 def _upright_size(data: bytes) -> tuple[int, int]:
-    """The size of an image that may say how it is to be turned: decode's own reader is asked."""
+    """The size of an image that may have an orientation, read as decode reads it."""
     with Image.open(io.BytesIO(data), formats=PILLOW_FORMATS) as opened:  # reads the header only
         width, height = opened.size
         return (height, width) if orientation_of(opened) >= FIRST_TRANSPOSED else (width, height)
@@ -88,36 +97,31 @@ class _JpegHeader:
     width: int
     height: int
     colours: int
-    described: bool
-    "Whether an APP1 segment (EXIF, XMP) is there."
+    has_metadata: bool
+    "Whether there is an APP1 segment (EXIF, XMP)."
     scan: int
     "Where the first scan begins."
 
 
-def _jpeg(data: bytes, max_pixels: int) -> tuple[int, int]:
+def _jpeg(data: bytes, most_pixels: int) -> tuple[int, int]:
     header = _jpeg_header(data)
-    _check_dimensions(header.width, header.height, max_pixels)
-    if header.colours not in (
-        1,
-        3,
-    ):  # decode leaves these to Pillow, which is milder than libjpeg about the end
+    _check_dimensions(header.width, header.height, most_pixels)
+    if header.colours not in (1, 3):  # decode leaves these to Pillow, which tolerates a missing end
         return _size_by_decoding(data)
     # The end marker cannot occur within compressed pixels. It may stand far from the file's end:
     # cameras append previews, depth maps and padding. A thumbnail in the header has one too, hence
     # the search from the first scan on.
     if data.rfind(b"\xff\xd9", header.scan) < 0:  # from the end: it is mostly there
         raise DecodeError("truncated image", f"{len(data)} bytes of JPEG without an end marker")
-    simplejpeg.decode_jpeg_header(data)  # libjpeg's own opinion of tables and colours
-    return _upright_size(data) if header.described else (header.width, header.height)
+    simplejpeg.decode_jpeg_header(data)  # libjpeg checks tables and colours
+    return _upright_size(data) if header.has_metadata else (header.width, header.height)
 
 
 def _jpeg_header(data: bytes) -> _JpegHeader:
-    """The segments up to the first scan. Bytes between segments that belong to none are skipped, as
-    libjpeg does.
-    """
+    """The segments up to the first scan. Bytes between segments are skipped, as libjpeg does."""
     at, end = 2, len(data)
     width = height = colours = -1
-    described = False
+    has_metadata = False
     while 0 <= at < end - 3:
         if data[at] != 0xFF:
             at = data.find(b"\xff", at)
@@ -132,29 +136,28 @@ def _jpeg_header(data: bytes) -> _JpegHeader:
         length = (data[at + 2] << 8) + data[at + 3]
         if kind == 0xDA:
             if colours < 0:
-                raise DecodeError(
-                    "damaged image", f"{end} bytes of JPEG whose pixels come before their size"
-                )
+                found = f"{end} bytes of JPEG whose pixels come before their size"
+                raise DecodeError("damaged image", found)
             return _JpegHeader(
                 width=width,
                 height=height,
                 colours=colours,
-                described=described,
+                has_metadata=has_metadata,
                 scan=at + 2 + length,
             )
         if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC) and at + 9 < end:
             height, width = (data[at + 5] << 8) + data[at + 6], (data[at + 7] << 8) + data[at + 8]
             colours = data[at + 9]
         elif kind == 0xE1:
-            described = True
+            has_metadata = True
         elif kind == 0xD9:
             raise DecodeError("damaged image", f"{end} bytes of JPEG that end before any pixel")
         at += 2 + length
     raise DecodeError("truncated image", f"{end} bytes of JPEG that end within the header")
 
 
-def _png(data: bytes, max_pixels: int) -> tuple[int, int]:
-    at, described, pixels, end = 8, False, False, len(data)
+def _png(data: bytes, most_pixels: int) -> tuple[int, int]:
+    at, has_metadata, pixels, end = 8, False, False, len(data)
     size: tuple[int, int] | None = None
     while at + 12 <= end:
         length, kind = int.from_bytes(data[at : at + 4]), data[at + 4 : at + 8]
@@ -162,32 +165,24 @@ def _png(data: bytes, max_pixels: int) -> tuple[int, int]:
             break
         if kind == b"IHDR":
             size = int.from_bytes(data[at + 8 : at + 12]), int.from_bytes(data[at + 12 : at + 16])
-            _check_dimensions(*size, max_pixels)
+            _check_dimensions(*size, most_pixels)
         elif kind == b"eXIf" or (
             kind in (b"iTXt", b"zTXt", b"tEXt") and data.startswith(PNG_METADATA_KEYWORDS, at + 8)
         ):
-            described = True
+            has_metadata = True
         pixels |= kind == b"IDAT"
         at += 12 + length
     else:
         raise DecodeError("truncated image", f"{end} bytes of PNG without an end chunk")
     if size is None or not pixels:
-        raise DecodeError(
-            "damaged image", f"{end} bytes of PNG without {'pixels' if size else 'a header'}"
-        )
-    return _upright_size(data) if described else size
+        missing = "pixels" if size else "a header"
+        raise DecodeError("damaged image", f"{end} bytes of PNG without {missing}")
+    return _upright_size(data) if has_metadata else size
 
 
 def _webp(data: bytes) -> tuple[int, int]:
-    said = 8 + int.from_bytes(data[4:8], "little")
-    if len(data) < said:
-        raise DecodeError("truncated image", f"{len(data)} bytes of WebP that says it has {said}")
+    stated = 8 + int.from_bytes(data[4:8], "little")
+    if len(data) < stated:
+        found = f"{len(data)} bytes of WebP that states a size of {stated}"
+        raise DecodeError("truncated image", found)
     return _upright_size(data)
-
-
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
-"Endings of files that are taken for images, in lower case; upper case is fine too."
-
-
-def is_image_name(name: str) -> bool:
-    return name.lower().endswith(IMAGE_SUFFIXES)

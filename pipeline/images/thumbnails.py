@@ -1,4 +1,8 @@
-"""TODO pipeline.images.thumbnails."""
+"""Small WebP pictures for HTML pages, as data URIs.
+
+In: encoded images, by key. Out: thumbnails, each made once; None if an image is missing or
+unreadable.
+"""
 
 import base64
 import io
@@ -8,17 +12,17 @@ from PIL import Image
 
 from pipeline.images.decode import DecodeError, decode
 
+QUERY_PX = 360
+ANSWER_PX = 180
+WEBP_QUALITY, WEBP_EFFORT = 78, 2  # two thirds of JPEG's bytes at a similar look
+
 ImageLoader = Callable[[Iterable[str]], dict[str, bytes]]
-"Encoded images by key; keys that are not known are absent."
+"Encoded images by key, of the keys that are found."
 
 
 def no_images(keys: Iterable[str]) -> dict[str, bytes]:
+    """An image loader that finds none."""
     return {}
-
-
-QUERY_PX = 360
-ANSWER_PX = 180
-WEBP_QUALITY, WEBP_EFFORT = 78, 2  # of WebP: two thirds of JPEG's bytes at a like look
 
 
 class ThumbnailCache:
@@ -26,20 +30,20 @@ class ThumbnailCache:
 
     def __init__(self, images: Mapping[str, bytes]) -> None:
         self._images = images
-        self._made: dict[tuple[str, int], str | None] = {}
+        self._thumbnails: dict[tuple[str, int], str | None] = {}
 
     def __bool__(self) -> bool:
         return bool(self._images)
 
     def get(self, key: str, pixels: int) -> str | None:
-        """A data URI; None where the picture is not at hand."""
-        if (key, pixels) not in self._made:
-            self._made[key, pixels] = thumbnail(self._images.get(key), pixels)
-        return self._made[key, pixels]
+        """A data URI; None if the image is missing or unreadable."""
+        if (key, pixels) not in self._thumbnails:
+            self._thumbnails[key, pixels] = thumbnail(self._images.get(key), pixels)
+        return self._thumbnails[key, pixels]
 
 
 def thumbnail(data: bytes | None, pixels: int) -> str | None:
-    """A small WebP as a data URI; None without a picture that can be read."""
+    """A small WebP as a data URI, at most so many pixels a side; None without a readable image."""
     if data is None:
         return None
     try:

@@ -1,4 +1,7 @@
-"""TODO pipeline.images.transforms."""
+"""The paper's train and test transforms per view, on uint8. The network normalises.
+
+Shapes: H x W pixels.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -15,7 +18,7 @@ on one without."""
 
 
 def preprocessing_name(by: Resizer = "torch") -> str:
-    """Part of the fingerprint: tables made with another preprocessing do not mix."""
+    """Part of the fingerprint: tables made with different preprocessing do not mix."""
     return f"resize bicubic {by}, ImageNet normalisation"
 
 
@@ -23,20 +26,21 @@ def resize(image_HW3: Pixels, size: int, by: Resizer = "torch") -> Pixels:
     """To (size, size, 3) by antialiased bicubic.
 
     Torch's is within one grey level of Pillow's, within two at a few pixels of the hardest edges.
-    Both go along the rows first; Pillow from version 13 on goes down the columns first where an
-    image is tall and shrinks, which shows at hard edges. One image by one thread: torch's code for
-    AVX2 starts no threads of its own, so many threads may call this.
+    Both go along the rows first; Pillow from version 13 on goes down the columns first if an image
+    is tall and shrinks, which shows at hard edges. One image by one thread: torch's code for AVX2
+    starts no threads of its own, so many threads may call this.
     """
     height, width, _ = image_HW3.shape
     if height == width == size:
         return image_HW3
     if by == "pillow":
-        return np.asarray(Image.fromarray(image_HW3).resize((size, size), Image.Resampling.BICUBIC))
-    # here: packing and ranking, which resize nothing, would wait most of a second for it
+        bicubic = Image.Resampling.BICUBIC
+        return np.asarray(Image.fromarray(image_HW3).resize((size, size), bicubic))
+    # Here: packing and ranking, which resize nothing, would wait most of a second for it.
     import torch
 
-    # A batch of one by reshape: with a new axis of stride 0 torch would not know it as channels
-    # last, and rearrange it.
+    # A batch of one by reshape: with a new axis of stride 0 torch would not recognise channels
+    # last, and rearrange the image.
     image_1HW3 = np.require(image_HW3, requirements=["C", "W"]).reshape(1, height, width, 3)
     image_13HW = torch.from_numpy(image_1HW3).permute(0, 3, 1, 2)
     resized_13HW = torch.nn.functional.interpolate(
@@ -51,7 +55,7 @@ class Augmentation:
     """The train transforms. The defaults are the paper's."""
 
     pad: int = 10
-    """Pixels added on each side by repeating the edge, out of which the image is cropped again
+    """Pixels added on each side by repeating the edge; the image is cropped from the result
     [paper, LPN]."""
     rotation: float = 90.0
     "Satellite images are turned by a random angle within +- this many degrees [paper, LPN]."
@@ -78,7 +82,8 @@ def augment(
     padded_HW3 = np.pad(image_HW3, ((pad, pad), (pad, pad), (0, 0)), mode="edge")
     if view == View.SATELLITE and settings.rotation:
         angle = float(rng.uniform(-settings.rotation, settings.rotation))
-        padded_HW3 = np.asarray(Image.fromarray(padded_HW3).rotate(angle, Image.Resampling.NEAREST))
+        turned = Image.fromarray(padded_HW3).rotate(angle, Image.Resampling.NEAREST)
+        padded_HW3 = np.asarray(turned)
     top, left = rng.integers(0, 2 * pad, size=2, endpoint=True)
     cropped_HW3 = padded_HW3[top : top + size, left : left + size]
     if settings.mirror and rng.random() < 0.5:

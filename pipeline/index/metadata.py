@@ -15,7 +15,7 @@ from pipeline.core.json_files import from_json, is_file_name
 from pipeline.core.records import excerpt
 from pipeline.index.plan import Refine
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 METADATA_FILE = "index.json"
 REBUILD_HINT = "delete it and build the index again with jobs/build_index.py"
 

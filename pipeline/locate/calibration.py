@@ -18,7 +18,7 @@ from pipeline.locate.consensus import Consensus
 from pipeline.locate.logistic import LogisticModel
 from pipeline.locate.reliability import ReliabilityBin
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 CALIBRATION_FILE = "calibration.json"
 FEATURE_NAMES = ("score", "margin", "depth", "share")
 

@@ -51,7 +51,7 @@ def parent_folder(photo: str) -> str:
 def read_taken_at(data: bytes) -> str | None:
     """When the camera says that it took a photo, ISO 8601; None where it does not say."""
     try:
-        return read_tags(find_metadata(data, whole=True)).taken_at
+        return read_tags(find_metadata(data, complete=True)).taken_at
     except UnreadableTag:
         return None
 

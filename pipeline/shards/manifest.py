@@ -13,7 +13,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.json_files import from_json, is_file_name
 from pipeline.core.records import Split, View, excerpt
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 MANIFEST = "manifest.json"
 DAMAGED_FILE = "damaged.json"
 """Names of the shards that verification found damaged: packing makes them anew, and takes the note

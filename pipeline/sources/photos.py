@@ -117,9 +117,9 @@ def read_photo(path: str, size: int) -> CameraTags:
     """
     if not size:
         return CameraTags()  # packing refuses it; object stores refuse a range of nothing
-    blocks = find_metadata(storage.read_head(path, HEAD_BYTES), whole=size <= HEAD_BYTES)
-    if blocks.cut and size > HEAD_BYTES:
-        blocks = find_metadata(storage.read_bytes(path), whole=True)
+    blocks = find_metadata(storage.read_head(path, HEAD_BYTES), complete=size <= HEAD_BYTES)
+    if blocks.truncated and size > HEAD_BYTES:
+        blocks = find_metadata(storage.read_bytes(path), complete=True)
     return read_tags(blocks)
 
 

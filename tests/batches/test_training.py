@@ -76,7 +76,7 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> str:
             )
             written.append(write_shard(plan, University1652(), out, "").shard)
     manifest = Manifest(shards=tuple(written), classes=CLASSES, packing={}, rejected=0)
-    storage.write_json(storage.join(out, MANIFEST), asdict(manifest))
+    json_files.write_checksummed(storage.join(out, MANIFEST), asdict(manifest))
     return out
 
 
@@ -371,7 +371,7 @@ def test_fewer_uav_than_satellite_images_come_again_within_an_epoch(
     ]
     for tar in Path(shards).glob("*.tar"):
         (tmp_path / tar.name).symlink_to(tar)
-    storage.write_json(str(tmp_path / MANIFEST), said)
+    json_files.write_checksummed(str(tmp_path / MANIFEST), said)
     seen = Counter(keys(epoch(str(tmp_path)), View.DRONE))
     assert set(seen.values()) == {2}
     assert len(seen) == 10

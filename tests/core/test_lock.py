@@ -14,53 +14,50 @@ from pipeline.core.errors import InputError
 from pipeline.core.lock import locks_output, output_lock
 
 ROOT = Path(__file__).parents[2]
-HOLD = """
+HOLDER = """
 import sys, time
-from pipeline.core.lock import only_one
-with only_one(sys.argv[1]):
-    print("held", flush=True)
+from pipeline.core.lock import output_lock
+with output_lock(sys.argv[1]):
+    print("locked", flush=True)
     time.sleep(60)
 """
 
 
 @contextmanager
-def held(out: Path) -> Iterator["subprocess.Popen[str]"]:
-    """Another process that holds a folder."""
+def locked_elsewhere(out: Path) -> Iterator["subprocess.Popen[str]"]:
+    """Another process that holds the lock of a folder."""
     with subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(out)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", HOLDER, str(out)], cwd=ROOT, stdout=subprocess.PIPE, text=True
     ) as other:
         assert other.stdout is not None
-        assert other.stdout.readline() == "held\n"
+        assert other.stdout.readline() == "locked\n"
         try:
             yield other
         finally:
             other.kill()
 
 
-def test_a_second_run_is_refused_with_who_holds_it_and_leaves_nothing(tmp_path: Path) -> None:
+def test_lock_refuses_a_second_run_and_names_the_first(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with held(out) as other:
-        with (
-            pytest.raises(
-                InputError,
-                match=rf"is being written by process {other.pid}, since 2.*wait until it has ended",
-            ),
-            output_lock(str(out)),
-        ):
+    with locked_elsewhere(out) as other:
+        sentence = rf"is being written by process {other.pid}, since 2.*wait until it has ended"
+        with pytest.raises(InputError, match=sentence), output_lock(str(out)):
             pass
         with output_lock(str(tmp_path / "another")):
             assert not out.exists()
 
 
-def test_a_run_that_was_killed_holds_nothing(tmp_path: Path) -> None:
-    with held(tmp_path) as other:
+def test_lock_of_a_killed_run_is_free(tmp_path: Path) -> None:
+    with locked_elsewhere(tmp_path) as other:
         os.kill(other.pid, signal.SIGKILL)
         other.wait()
         with output_lock(str(tmp_path)):
             pass
 
 
-def test_one_folder_by_two_names_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lock_knows_a_folder_by_all_its_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "out")
     monkeypatch.chdir(tmp_path)
     with output_lock("out"):
@@ -71,7 +68,7 @@ def test_one_folder_by_two_names_is_one(tmp_path: Path, monkeypatch: pytest.Monk
         pass
 
 
-def test_a_stage_holds_its_output_while_it_runs_and_then_no_more(tmp_path: Path) -> None:
+def test_stage_holds_the_lock_only_while_it_runs(tmp_path: Path) -> None:
     @locks_output(lambda number, out: out)
     def stage(number: int, out: str) -> int:
         with pytest.raises(InputError, match="one run at a time"), output_lock(out):

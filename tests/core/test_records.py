@@ -10,7 +10,7 @@ names = st.text(
 )
 
 
-def test_a_key_says_which_image_it_is() -> None:
+def test_key_holds_split_view_location_and_file_name() -> None:
     record = ImageRecord(
         path="s3://b/x/image-01.jpeg", split=Split.TRAIN, view=View.DRONE, location="0839"
     )
@@ -18,13 +18,13 @@ def test_a_key_says_which_image_it_is() -> None:
 
 
 @given(names, names)
-def test_keys_are_safe_and_no_two_names_share_one(first: str, second: str) -> None:
+def test_keys_are_safe_and_differ_by_name(first: str, second: str) -> None:
     keys = [make_key(Split.QUERY, View.SATELLITE, "l", name) for name in (first, second)]
     assert all(set(key) <= set("abcdefghijklmnopqrstuvwxyz0123456789_-") for key in keys)
     assert (keys[0] == keys[1]) == (first == second)
 
 
-def test_a_variant_tells_apart_images_of_one_name_in_one_location() -> None:
+def test_keys_differ_by_variant() -> None:
     records = [
         ImageRecord(
             path="a/0.jpg", split=Split.QUERY, view=View.DRONE, location="0008", variant=variant

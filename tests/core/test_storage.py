@@ -1,4 +1,4 @@
-"""Files appear whole or not at all, on a disk and on any storage that fsspec knows."""
+"""Files appear complete or not at all, on a disk and on any storage that fsspec knows."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ def folder(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     return str(tmp_path) if request.param == "disk" else tmp_path.as_uri()
 
 
-def test_what_is_written_is_read_back_and_listed(folder: str) -> None:
+def test_written_json_is_read_back_and_listed(folder: str) -> None:
     path = storage.join(folder, "deep", "a.json")
     assert not storage.exists(path)
     storage.write_json(path, {"é": [1, 2]})
@@ -27,7 +27,7 @@ def test_what_is_written_is_read_back_and_listed(folder: str) -> None:
     assert storage.is_folder(folder)
 
 
-def test_a_write_that_fails_leaves_what_was_there(folder: str) -> None:
+def test_failed_write_leaves_the_old_file(folder: str) -> None:
     path = storage.join(folder, "a.bin")
     storage.write_bytes(path, b"good")
 
@@ -42,11 +42,11 @@ def test_a_write_that_fails_leaves_what_was_there(folder: str) -> None:
     assert storage.list_names(folder) == ["a.bin"]
 
 
-def test_an_absent_folder_has_no_names(tmp_path: Path) -> None:
+def test_absent_folder_has_no_names(tmp_path: Path) -> None:
     assert storage.list_names(str(tmp_path / "nowhere")) == []
 
 
-def test_paths_are_made_absolute_and_uris_left_alone(
+def test_absolute_changes_paths_and_not_uris(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -54,7 +54,7 @@ def test_paths_are_made_absolute_and_uris_left_alone(
     assert storage.absolute("s3://bucket/a") == "s3://bucket/a"
 
 
-def test_what_killed_writers_left_is_swept_away_and_nothing_else(tmp_path: Path) -> None:
+def test_remove_temporaries_leaves_other_files(tmp_path: Path) -> None:
     for name in (
         ".a.parquet.0123abcd",
         ".b.parquet.0123abcd",

@@ -12,6 +12,7 @@ from webdataset import TarWriter
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
+from pipeline.core.json_files import write_checksummed
 from pipeline.core.records import Split, View
 from pipeline.evaluation.evaluate import EvaluationSettings, evaluate
 from pipeline.features.table import PartFooter, PartRows, write_part
@@ -102,7 +103,7 @@ def test_pictures_come_from_the_shards_by_key(tmp_path: Path) -> None:
             for key in pq.read_table(path)["key"].to_pylist():
                 tar.write({"__key__": key, "png": picture.getvalue(), "json": {"key": key}})
     manifest = Manifest(shards=tuple(listed), classes=(), packing={}, rejected=0)
-    storage.write_json(str(shards / "manifest.json"), asdict(manifest))
+    write_checksummed(str(shards / "manifest.json"), asdict(manifest))
     evaluate(EvaluationSettings(table=table, out=str(tmp_path / "out"), shards=str(shards)))
     text = (tmp_path / "out" / "report.html").read_text()
     assert text.count("<img src=") >= 2 * (1 + 5)

@@ -327,16 +327,3 @@ def test_an_evaluation_is_read_back_as_it_was_written_or_not_at_all(tmp_path: Pa
     assert (
         found_or_equal(path, look_or_say_gone(path, lambda: read_inputs(str(tmp_path))), 200) > 150
     )
-
-
-def test_json_without_a_seal_is_believed_and_one_changed_on_purpose_is_told_what_to_do(
-    tmp_path: Path,
-) -> None:
-    path, said = str(tmp_path / "a.json"), {"b": 1.5, "a": [None, "é"], "n": {"2": 1, "10": 2}}
-    json_files.write_checksummed(path, said)
-    assert json_files.read_checksummed(path) == said
-    storage.write_json(path, said)
-    assert json_files.read_checksummed(path) == said
-    storage.write_json(path, said | {"b": 2, "seal": json_files.checksum_of(said)})
-    with pytest.raises(ValueError, match="whoever changed it on purpose takes that entry out"):
-        json_files.read_checksummed(path)

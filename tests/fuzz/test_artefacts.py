@@ -16,7 +16,12 @@ from hypothesis import strategies as st
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.core.json_files import is_file_name
+from pipeline.core.json_files import (
+    CHECKSUM_KEY,
+    checksum_of,
+    is_file_name,
+    read_checksummed,
+)
 from pipeline.core.records import Rejection, Split, View
 from pipeline.features.part import PartFooter, PartRows, read_rejected, write_part
 from pipeline.features.row_reader import RowReader
@@ -120,11 +125,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("artefacts")
 
 
-def put(data: st.DataObject, path: Path, value: Any) -> None:
-    """The value, twisted, as JSON; now and then damaged as text too."""
-    told = json.dumps(data.draw(twisted(value))).encode()
+def put(data: st.DataObject, path: Path, value: Any, checksum: bool = True) -> None:
+    """The value, twisted, as JSON with a valid checksum; now and then damaged as text too."""
+    twisted_value = data.draw(twisted(value))
+    if checksum and isinstance(twisted_value, dict):
+        twisted_value |= {CHECKSUM_KEY: checksum_of(twisted_value)}
+    text = json.dumps(twisted_value).encode()
     path.parent.mkdir(exist_ok=True)
-    path.write_bytes(told if data.draw(st.integers(0, 3)) else data.draw(damaged(told)))
+    path.write_bytes(text if data.draw(st.integers(0, 3)) else data.draw(damaged(text)))
 
 
 @given(st.data())
@@ -150,7 +158,8 @@ def test_a_shards_name_that_leads_elsewhere_is_refused(name: str, folder: Path) 
     (folder / "set").mkdir(exist_ok=True)
     said = dataclasses.asdict(MANIFEST)
     said["shards"][0]["name"] = name
-    (folder / "set" / "manifest.json").write_text(json.dumps(said))
+    text = json.dumps(said | {CHECKSUM_KEY: checksum_of(said)})
+    (folder / "set" / "manifest.json").write_text(text)
     with pytest.raises(InputError, match=r"manifest\.json is damaged"):
         read_manifest(str(folder / "set"))
 
@@ -169,7 +178,7 @@ def test_what_an_index_says_of_itself(folder: Path, data: st.DataObject) -> None
 def test_a_calibration(folder: Path, data: st.DataObject) -> None:
     path = folder / "calibration.json"
     write_calibration(str(path), CONFIDENCE)
-    put(data, path, json.loads(path.read_text()))
+    put(data, path, read_checksummed(str(path)))
     with bounded(InputError):
         found = read_calibration(str(path), {"fingerprint": "0" * 64})
         assert np.isfinite(found.model.probabilities(np.zeros((1, len(FEATURE_NAMES))))).all()
@@ -316,6 +325,6 @@ def test_a_finished_evaluation_and_a_runs_curves(folder: Path, data: st.DataObje
     put(data, out / "views.json", METRICS)
     with bounded(InputError):
         read_findings(str(out))
-    put(data, out / "metrics.jsonl", {"epoch": 1, "step": 3})
+    put(data, out / "metrics.jsonl", {"epoch": 1, "step": 3}, checksum=False)
     with bounded(InputError):
         read_training(str(out))

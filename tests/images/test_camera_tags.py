@@ -265,7 +265,7 @@ def test_blocks_are_found_in_every_kind_of_file_that_carries_them() -> None:
             image.save(stream, kind, **options)  # type: ignore[arg-type]
         else:
             image.save(stream, kind, exif=EXIF_HEADER + exif(PARIS), **options)  # type: ignore[arg-type]
-        tags = read_tags(find_metadata(stream.getvalue(), whole=True))
+        tags = read_tags(find_metadata(stream.getvalue(), complete=True))
         assert tags.height_m == 50.1, kind
         assert kind == "TIFF" or tags.position == pytest.approx((48.8582222, 2.2945)), kind
 
@@ -274,10 +274,10 @@ def test_a_beginning_that_ends_too_early_is_told_from_a_photo_without_tags() -> 
     stream = io.BytesIO()
     Image.new("RGB", (8, 8)).save(stream, "JPEG", exif=EXIF_HEADER + exif(PARIS))
     data = stream.getvalue()
-    assert find_metadata(data[:60], whole=False) == MetadataBlocks(cut=True)
-    assert not find_metadata(data[:-9], whole=False).cut, "the scan is of no interest"
-    assert find_metadata(b"MM\0*" + bytes(9), whole=False) == MetadataBlocks(cut=True)
-    assert find_metadata(b"no image", whole=True) == MetadataBlocks()
+    assert find_metadata(data[:60], complete=False) == MetadataBlocks(truncated=True)
+    assert not find_metadata(data[:-9], complete=False).truncated, "the scan is of no interest"
+    assert find_metadata(b"MM\0*" + bytes(9), complete=False) == MetadataBlocks(truncated=True)
+    assert find_metadata(b"no image", complete=True) == MetadataBlocks()
 
 
 @pytest.mark.parametrize(

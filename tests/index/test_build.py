@@ -325,7 +325,7 @@ def test_a_torn_or_missing_file_is_named(table: str, tmp_path: Path, name: str) 
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda facts: facts | {"schema_version": 1}, "is of version 1, expected 2"),
+        (lambda facts: facts | {"schema_version": 1}, "is of version 1, expected 3"),
         (lambda facts: {k: v for k, v in facts.items() if k != "parts"}, "is damaged"),
         (lambda facts: facts | {"parts": [{"faiss": 3}]}, "is damaged"),
         (lambda facts: [facts], "is damaged"),
@@ -336,8 +336,11 @@ def test_an_index_that_another_wrote_is_refused(
 ) -> None:
     out = tmp_path / "index"
     build(table, out)
-    facts = json_files.read_checksummed(str(out / "index.json"))
-    (out / "index.json").write_text(json.dumps(change(facts)))  # type: ignore[operator]
+    changed = change(json_files.read_checksummed(str(out / "index.json")))  # type: ignore[operator]
+    if isinstance(changed, dict):
+        json_files.write_checksummed(str(out / "index.json"), changed)
+    else:
+        storage.write_json(str(out / "index.json"), changed)
     with pytest.raises(InputError, match=sentence):
         Index(str(out))
 

@@ -3,7 +3,6 @@ half of each.
 """
 
 import asyncio
-import json
 import shutil
 import threading
 import time
@@ -111,9 +110,8 @@ def test_a_new_index_is_taken_over_and_a_search_under_way_keeps_the_old_one(
 
 def broken_files(path: Path) -> None:
     (path / "index.faiss").write_bytes(b"no index")
-    (path / "index.json").write_text(
-        json.dumps(json_files.read_checksummed(str(path / "index.json")) | {"build_seconds": 9})
-    )
+    metadata = json_files.read_checksummed(str(path / "index.json"))
+    json_files.write_checksummed(str(path / "index.json"), metadata | {"build_seconds": 9})
 
 
 BROKEN = {

@@ -153,7 +153,7 @@ def test_a_network_that_did_not_make_the_index_ends_it_with_a_sentence(
 ) -> None:
     checkpoint, index = road
     said = json_files.read_checksummed(str(index / "index.json"))
-    (index / "index.json").write_text(json.dumps(said | {"fingerprint": "e" * 64}))
+    json_files.write_checksummed(str(index / "index.json"), said | {"fingerprint": "e" * 64})
     with pytest.raises(InputError, match="did not make this index"):
         main(Settings(checkpoint=str(checkpoint), index=str(index), port=0, threads=1))
     assert not serve_actors()

@@ -164,7 +164,7 @@ def test_street_images_come_when_asked_for(tmp_path: Path) -> None:
 def test_a_damaged_manifest_is_refused_with_the_remedy(tmp_path: Path, tiny_shards: str) -> None:
     said = json_files.read_checksummed(storage.join(tiny_shards, "manifest.json"))
     for damage in ({"schema_version": 9}, {"shards": [{"name": "x"}]}):
-        storage.write_json(str(tmp_path / "manifest.json"), said | damage)
+        json_files.write_checksummed(str(tmp_path / "manifest.json"), said | damage)
         with pytest.raises(InputError, match="again"):
             read_manifest(str(tmp_path))
     (tmp_path / "manifest.json").write_bytes(b"{")
