@@ -27,4 +27,6 @@ def require(condition: bool, flag: str, value: object, expected: str) -> None:
     if not condition:
         name = flag.lstrip("-").replace("_", "-")
         found = repr(value) if isinstance(value, str) else value
+        if isinstance(value, tuple):  # as it was typed
+            found = " ".join(map(str, value)) or "nothing"
         raise InputError(f"--{name} is {found}, expected {expected}")

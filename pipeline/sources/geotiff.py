@@ -1,8 +1,7 @@
-"""GeoTIFF mosaics -> tiles as ImageRecords. In: one file, or a folder of them at any depth. Out: a
-record per tile.
+"""GeoTIFF mosaics -> tiles as ImageRecords.
 
-Tiles are told from coordinates and masks alone; their pixels are cut out, and encoded, when they
-are read.
+In: one file, or a folder of them at any depth. Out: a record per tile. A scan reads headers and
+masks; the pixels of a tile are cut out, turned and encoded when it is read.
 """
 
 import math
@@ -10,36 +9,37 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import lru_cache
+from typing import Literal
 
-import numpy as np
 from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 
 from pipeline.core import storage
-from pipeline.core.errors import InputError
+from pipeline.core.errors import InputError, require
 from pipeline.core.progress import console, progress
 from pipeline.core.records import ImageRecord, Rejection, Split, View
 from pipeline.images.decode import DecodeError
 from pipeline.images.inspect import MAX_PIXELS
 from pipeline.sources.base import Source
-from pipeline.sources.maps.colours import Colours
-from pipeline.sources.maps.georeference import Georeference, parse_crs
+from pipeline.sources.maps.colours import Colours, UnknownColours
+from pipeline.sources.maps.georeference import parse_crs
 from pipeline.sources.maps.mosaic import (
     Encoding,
     colours_for,
     encode_window,
+    file_version,
     nodata_share,
     open_mosaic,
     root_cause,
 )
+from pipeline.sources.maps.placement import MosaicRejected, Placement, place_mosaic
 from pipeline.sources.maps.tiles import Tile, count_tiles, parse_window, plan_tiles
 
-DEFAULT_TILE_PIXELS = 512  # where no size is asked for
-MIN_PIXEL_M = 1e-6  # below it pixels are no places: all lie on one point, or on one line
+DEFAULT_TILE_PIXELS = 512
 MAX_TILES = 2_000_000
-"""Of one mosaic: with their records they take a few gigabytes. A header alone may say sides of four
-thousand million pixels."""
+"""Of one mosaic: with their records they take a few gigabytes. A header alone may claim sides of
+four thousand million pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +63,14 @@ class GeoTiff(Source):
     stretch: tuple[float, float] | None = None
     """Values that become black and white. None: 8-bit as it is, else the 2nd and 98th percentile of
     the whole mosaic."""
+    bands: tuple[int, int, int] | None = None
+    """Numbers, from 1, of the bands that are red, green and blue, such as 3 2 1. None: as the file
+    names them, else the first three."""
     crs: str | None = None
     "Coordinate system, such as EPSG:32633, of files that name none."
+    assume_wgs84: bool = False
+    """Take a datum for WGS84 where PROJ knows no shift from it to WGS84, instead of refusing the
+    mosaic: positions may be wrong by hundreds of metres."""
     encoding: Encoding = "jpg"
     "Of the tiles: jpg of quality 95 with full colour resolution, or png without loss."
     view: View = View.SATELLITE
@@ -75,93 +81,89 @@ class GeoTiff(Source):
     def __post_init__(self) -> None:
         if self.tile_m is not None and self.tile_pixels is not None:
             raise InputError(
-                "--tile-m and --tile-pixels are both given; expected one of them: leave the other out"
+                "--tile-m and --tile-pixels are both given; expected one of them: leave one out"
             )
-        sides = {
-            "tile-m": self.tile_m,
-            "tile-pixels": self.tile_pixels,
-            "output-pixels": self.output_pixels,
-        }
-        for flag, value in sides.items():
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"--{flag} is {value}, expected a number above 0")
-        if self.output_pixels is not None and self.output_pixels**2 > MAX_PIXELS:
-            raise InputError(
-                f"--output-pixels is {self.output_pixels}, expected at most {math.isqrt(MAX_PIXELS)}"
-            )
-        if not 0 <= self.overlap < 1:
-            raise InputError(f"--overlap is {self.overlap}, expected a share from 0 to below 1")
-        if not 0 <= self.max_nodata <= 1:
-            raise InputError(f"--max-nodata is {self.max_nodata}, expected a share from 0 to 1")
-        if (
-            self.stretch is not None
-            and not -math.inf < self.stretch[0] < self.stretch[1] < math.inf
-        ):
-            raise InputError(
-                f"--stretch is {self.stretch[0]} {self.stretch[1]}, expected two numbers, the smaller one first"
-            )
-        if self.crs is not None and parse_crs(self.crs) is None:
-            raise InputError(
-                f"--crs is {self.crs!r}, which names no coordinate system; expected one such as EPSG:32633"
-            )
+        for flag in ("tile_m", "tile_pixels", "output_pixels"):
+            value = getattr(self, flag)
+            require(value is None or 0 < value < math.inf, flag, value, "a number above 0")
+        side, most = self.output_pixels, math.isqrt(MAX_PIXELS)
+        require(side is None or side <= most, "output_pixels", side, f"at most {most}")
+        require(0 <= self.overlap < 1, "overlap", self.overlap, "a share from 0 to below 1")
+        require(0 <= self.max_nodata <= 1, "max_nodata", self.max_nodata, "a share from 0 to 1")
+        if self.stretch is not None:
+            low, high = self.stretch
+            rising = -math.inf < low < high < math.inf
+            require(rising, "stretch", self.stretch, "two numbers, the smaller one first")
+        if self.bands is not None:
+            require(min(self.bands) > 0, "bands", self.bands, "numbers of bands, from 1")
+        if self.crs is not None:
+            expected = "one such as EPSG:32633; it names no coordinate system"
+            require(parse_crs(self.crs) is not None, "crs", self.crs, expected)
 
     def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
         names: dict[str, str] = {}
         for path, name in find_mosaics(root):
             first = names.setdefault(name, path)
             if first != path:
-                yield Rejection(
-                    path=path,
-                    reason="same name twice",
-                    found=f"{first} has its name for locations, {name}",
-                )
+                found = f"{first} has its name for locations, {name}"
+                yield Rejection(path=path, reason="same name twice", found=found)
                 continue
             try:
                 yield from self._tiles(path, name)
-            except _MosaicRejected as refused:
-                yield Rejection(path=path, reason=refused.reason, found=refused.found)
+            except MosaicRejected as rejected:
+                yield Rejection(path=path, reason=rejected.reason, found=rejected.found)
+            except UnknownColours as error:
+                yield Rejection(path=path, reason="unknown colours", found=str(error))
             except RasterioError as error:
                 yield Rejection(path=path, reason="damaged image", found=root_cause(error))
 
     def read(self, record: ImageRecord) -> bytes:
         """The tile, encoded; the same bytes each time. Raises DecodeError."""
-        window = parse_window(record.part)
+        window, path = parse_window(record.part), record.path
         size = (window.width, window.height)
-        if (
-            self.output_pixels is not None
-        ):  # the same scale for the smaller tile of a smaller mosaic
-            size = self._output_size(record.path, size, self.output_pixels)
-        return encode_window(
-            record.path, window, self.encoding, size, Resampling[self.resampling], self.stretch
-        )
+        try:
+            placement = self._placement(path)
+            if self.output_pixels is not None:  # one scale, for a mosaic smaller than a tile too
+                tile = self._tile_size(placement)
+                scaled = (self.output_pixels * a / b for a, b in zip(size, tile, strict=True))
+                width, height = (max(1, round(side)) for side in scaled)
+                size = (width, height)
+            shown = colours_for(path, self.stretch, self.bands)
+        except RasterioError as error:
+            raise DecodeError("damaged image", root_cause(error)) from None
+        except MosaicRejected as rejected:  # the file was replaced after the scan
+            raise DecodeError(rejected.reason, rejected.found) from None
+        except UnknownColours as error:
+            raise DecodeError("unknown colours", str(error)) from None
+        how = Resampling[self.resampling]
+        return encode_window(path, window, self.encoding, size, how, shown, placement.flip)
 
     def ending(self, record: ImageRecord) -> str:
         return self.encoding
 
     def _tiles(self, path: str, name: str) -> Iterator[ImageRecord]:
-        """The tiles of one mosaic. Raises _Refused, RasterioError."""
+        """The tiles of one mosaic. Raises MosaicRejected, UnknownColours, RasterioError."""
         dataset = open_mosaic(path)
-        if dataset.dtypes[0].startswith("complex"):  # GDAL has some that NumPy has no name for
-            raise _MosaicRejected(
-                "not a picture", f"{dataset.dtypes[0]} values; expected integers or floats"
-            )
-        place = self._georeference(dataset)
-        planned = self._plan((dataset.width, dataset.height), self._tile_size(dataset, place))
-        shown = colours_for(path, self.stretch)
+        kind = dataset.dtypes[0]
+        if kind.startswith("complex"):  # GDAL has some that NumPy has no name for
+            found = f"{kind} values; expected integers or floats"
+            raise MosaicRejected("not a picture", found)
+        placement = self._placement(path)
+        planned = self._plan((dataset.width, dataset.height), self._tile_size(placement))
+        shown = colours_for(path, self.stretch, self.bands)
         kept = self._without_nodata(path, planned, shown)
-        tags = place.geotags(tile.window for tile in kept)
+        windows = [tile.window for tile in kept]
+        tags = placement.georeference.geotags(windows, placement.flip)
         placed = [(tile, tag) for tile, tag in zip(kept, tags, strict=True) if tag is not None]
-        across, down = place.ground_pixel((dataset.width / 2, dataset.height / 2))
         left_out = f", {len(planned) - len(kept):,} left out as nodata" if shown.gaps else ""
-        left_out += (
-            f", {len(kept) - len(placed):,} left out as nowhere on Earth"
-            if len(placed) < len(kept)
-            else ""
-        )
-        first = planned[0].window
+        if len(placed) < len(kept):
+            left_out += f", {len(kept) - len(placed):,} left out as nowhere on Earth"
+        (across, down), first = placement.pixel_m, planned[0].window
         console.print(
-            f"{name}: {dataset.width} x {dataset.height} px of {across:.3g} x {down:.3g} m, {place.name}, {shown.said}, "
-            f"{len(placed):,} tiles of {first.width} x {first.height} px{left_out}",
+            f"{name}: {dataset.width} x {dataset.height} px of {across:.3g} x {down:.3g} m, "
+            f"{placement.description}, {shown.description}, {len(placed):,} tiles of "
+            f"{first.width} x {first.height} px{left_out}",
+            markup=False,
         )
         for tile, tag in placed:
             yield ImageRecord(
@@ -173,71 +175,33 @@ class GeoTiff(Source):
                 geotag=tag,
             )
 
+    def _placement(self, path: str) -> Placement:
+        """Raises MosaicRejected, RasterioError."""
+        return _place(path, file_version(path), self.crs, self.assume_wgs84)
+
     def _plan(self, size: tuple[int, int], tile: tuple[int, int]) -> list[Tile]:
-        """Raises _Refused where a tile is larger than an image may be, or there are more than
-        anybody could want.
+        """Raises MosaicRejected where a tile is larger than an image may be, or there are more
+        than MAX_TILES.
         """
-        said = f"{size[0]} x {size[1]} pixels in tiles of {tile[0]} x {tile[1]}"
+        asked = f"{size[0]} x {size[1]} pixels in tiles of {tile[0]} x {tile[1]}"
         if min(tile[0], size[0]) * min(tile[1], size[1]) > MAX_PIXELS:
-            raise _MosaicRejected(
-                "absurd dimensions",
-                f"{said}, expected tiles of at most {MAX_PIXELS} pixels: cut smaller ones",
-            )
+            found = f"{asked}, expected tiles of at most {MAX_PIXELS} pixels: cut smaller ones"
+            raise MosaicRejected("absurd dimensions", found)
         if (count := count_tiles(size, tile, self.overlap)) > MAX_TILES:
-            raise _MosaicRejected(
-                "too many tiles",
-                f"{said} make {count}, expected at most {MAX_TILES}: cut larger ones, or the mosaic",
-            )
+            found = f"{asked} make {count}, expected at most {MAX_TILES}: "
+            raise MosaicRejected("too many tiles", f"{found}cut larger ones, or the mosaic")
         return plan_tiles(size, tile, self.overlap)
 
-    def _georeference(self, dataset: Any) -> Georeference:
-        """Where the mosaic lies. Raises _Refused where it does not say."""
-        with_gcps = f"{len(dataset.gcps[0])} ground control points alone" if dataset.gcps[0] else ""
-        if dataset.transform.is_identity:
-            found = f"{with_gcps or 'no transform'}; expected pixels with coordinates: warp it with gdalwarp"
-            raise _MosaicRejected("no coordinates", found)
-        crs = dataset.crs or (self.crs and parse_crs(self.crs))
-        if not crs:
-            raise _MosaicRejected(
-                "no coordinates", "no coordinate system; expected one: name it with --crs EPSG:..."
-            )
-        place = Georeference(crs=crs, affine=dataset.transform)
-        ground = place.ground_pixel((dataset.width / 2, dataset.height / 2))
-        if not np.isfinite(ground).all():
-            raise _MosaicRejected(
-                "no coordinates", f"its centre lies nowhere on Earth by {place.name}"
-            )
-        if not min(ground) > MIN_PIXEL_M:
-            raise _MosaicRejected(
-                "no coordinates",
-                f"pixels of {ground[0]:g} x {ground[1]:g} m by {place.name}, expected larger ones",
-            )
-        return place
-
-    def _tile_size(self, dataset: Any, place: Georeference) -> tuple[int, int]:
-        """(width, height) of a whole tile in the mosaic's pixels."""
+    def _tile_size(self, placement: Placement) -> tuple[int, int]:
+        """(width, height) of a full tile in the mosaic's pixels."""
         if self.tile_m is None:
             return (self.tile_pixels or DEFAULT_TILE_PIXELS,) * 2
-        across, down = place.ground_pixel((dataset.width / 2, dataset.height / 2))
+        across, down = placement.pixel_m
         return max(1, round(self.tile_m / across)), max(1, round(self.tile_m / down))
 
-    def _output_size(self, path: str, size: tuple[int, int], side_out: int) -> tuple[int, int]:
-        """(width, height) in which a window of `size` is written, a whole tile with `side_out`.
-        Raises DecodeError.
-        """
-        try:
-            dataset = open_mosaic(path)
-            whole = self._tile_size(dataset, self._georeference(dataset))
-        except RasterioError as error:
-            raise DecodeError("damaged image", root_cause(error)) from None
-        except _MosaicRejected as refused:  # another file than the one that was scanned
-            raise DecodeError(refused.reason, refused.found) from None
-        width, height = (side_out * part / side for part, side in zip(size, whole, strict=True))
-        return max(1, round(width)), max(1, round(height))
-
     def _without_nodata(self, path: str, tiles: list[Tile], shown: Colours) -> list[Tile]:
-        """The tiles that hold enough of an image. Masks are read only where the mosaic has any, in
-        threads.
+        """The tiles that hold enough of an image. Masks are read in threads, and only where the
+        mosaic has any.
         """
         if not shown.gaps or self.max_nodata == 1:
             return tiles
@@ -254,12 +218,12 @@ class GeoTiff(Source):
         return kept
 
 
-class _MosaicRejected(Exception):
-    """A mosaic that cannot be cut; `reason` and `found` as in a Rejection."""
-
-    def __init__(self, reason: str, found: str) -> None:
-        super().__init__(f"{reason}: {found}")
-        self.reason, self.found = reason, found
+@lru_cache(maxsize=256)
+def _place(
+    path: str, version: tuple[int, ...], crs_name: str | None, assume_wgs84: bool
+) -> Placement:
+    """`place_mosaic`, once per process and version of the file. Raises what that raises."""
+    return place_mosaic(path, crs_name, assume_wgs84)
 
 
 def find_mosaics(root: str) -> Iterator[tuple[str, str]]:

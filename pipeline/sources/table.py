@@ -19,7 +19,7 @@ from pipeline.images.camera_tags import parse_number, validate_position
 from pipeline.images.image_blocks import UnreadableTag
 from pipeline.images.inspect import is_image_name
 from pipeline.sources.base import Source
-from pipeline.sources.maps.geojson_shapes import Shape, order_footprint
+from pipeline.sources.maps.geojson_shapes import Shape, order_footprint, wrap_longitude
 from pipeline.sources.table_rows import BROKEN_COLUMN, SHAPE_COLUMN, Row, read_table_rows
 
 
@@ -112,7 +112,7 @@ def geotag_of_row(row: Row) -> GeoTag | None:
         found = validate_position(lat, lon, "position" if shape is None else shape.found)
         corners = shape.corners if shape is not None else ()
         for corner in corners:
-            validate_position(*corner, "corner of a polygon")
+            validate_position(corner[0], wrap_longitude(corner[1]), "corner of a polygon")
     except UnreadableTag as error:
         raise BadRow("unreadable tag", str(error)) from None
     return (

@@ -25,7 +25,7 @@ from pipeline.core.records import GeoTag, ImageRecord, Rejection
 from pipeline.images.decode import DecodeError, decode
 from pipeline.sources.geotiff import GeoTiff
 from pipeline.sources.maps.colours import sample_values
-from pipeline.sources.maps.georeference import Georeference, on_ellipsoid, parse_crs
+from pipeline.sources.maps.georeference import Georeference, parse_crs
 from pipeline.sources.maps.mosaic import open_mosaic
 from pipeline.sources.maps.tiles import parse_window, plan_tiles, tile_starts
 
@@ -208,13 +208,6 @@ def test_a_tile_of_100_metres_is_100_metres_on_the_ground(
         (lower_left, upper_left),
     ]:
         assert metres(one, other) == pytest.approx(100, abs=0.5)
-
-
-def test_a_place_on_the_ellipsoid_is_where_pyproj_has_it() -> None:
-    places = np.array([(0, 0), (51.5, -0.1), (-89.9, 170), (90, 0)], float)
-    to_earth = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:4978")
-    expected = np.stack(to_earth.transform(places[:, 0], places[:, 1], np.zeros(4)), axis=1)
-    assert np.allclose(on_ellipsoid(places), expected, atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -633,5 +626,6 @@ def test_no_mosaic_and_no_root_are_told_apart(tmp_path: Path) -> None:
 
 def test_a_pixels_size_is_found_although_one_place_around_it_is_nowhere() -> None:
     crs = parse_crs("+proj=ortho +ellps=WGS84")
+    assert crs is not None
     disc = Georeference(crs=crs, affine=rasterio.Affine(1000, 0, 6_370_000, 0, -1000, 0))
     assert np.isnan(disc.degrees(np.array([(0, 0), (100.0, 0)]))[:, 0]).tolist() == [False, True]

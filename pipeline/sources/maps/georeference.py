@@ -1,139 +1,215 @@
-"""Where pixels of a mosaic lie on the Earth. In: pixel places, an affine transform, a coordinate
-system. Out: WGS84.
+"""Where the pixels of a mosaic lie on the Earth: an affine transform and a coordinate system.
 
-Pixel places are (x, y) from the upper left corner of the upper left pixel.
+In: pixel positions, (x, y) from the upper left corner of the upper left pixel. Out: latitudes and
+longitudes, WGS84, and the ground size of a pixel. PROJ does the geodesy; this module decides which
+of its answers may be used. PROJ has a "ballpark" answer for a datum whose shift to WGS84 it does
+not know: a shift of zero, which is 850 m wrong for TWD67 in Taiwan. It is used only where the
+datum's ellipsoid is that of WGS84, as such datums (CGCS2000 and other modern ones) differ from
+WGS84 by a few metres at most, or where the user asks for it.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
+import pyproj
 import rasterio
-from rasterio._err import CPLE_BaseError  # what transform raises; rasterio gives it no public name
-from rasterio.crs import CRS
-from rasterio.errors import CRSError
-from rasterio.warp import transform
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError, ProjError
 
+from pipeline.core.arrays import Doubles
 from pipeline.core.records import GeoTag
 from pipeline.sources.maps.tiles import Window
 
-Array = npt.NDArray[np.float64]
 WGS84 = CRS.from_epsg(4326)
-EQUATOR_M, POLE_M = 6378137.0, 6356752.314245  # the ellipsoid's half axes [WGS84]
-# pixels either side of the place measured: enough against rounding, little against the map's
-# distortion
+ELLIPSOID = pyproj.Geod(ellps="WGS84")
+Shift = Literal["known", "unknown", "nowhere"]
 BASELINE_PIXELS = 10.0
+"""Pixels on either side of the position that is measured: enough against rounding, little against
+the map's distortion."""
 MAX_COORDINATE = 1e12
-"""In any unit: beyond it nothing is on Earth, and PROJ goes round Web Mercator's equator turn by
-turn to find out."""
+"In any unit: no position on Earth has larger coordinates, and PROJ takes long to find that out."
+ALIKE_M, ALIKE_FLATTENING = 1.0, 1e-4
+"""Within these of WGS84's half axis (metres) and inverse flattening lie the ellipsoids of GRS 1980
+and CGCS2000, and no ellipsoid of a national datum of the last century."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Georeference:
-    """A mosaic's place on the Earth."""
+    """Maps pixels of one mosaic to positions."""
 
     crs: CRS
     "Of the coordinates that `affine` gives."
     affine: rasterio.Affine
-    "Pixel places to coordinates; turned and sheared ones are fine."
+    "Pixel positions to coordinates; rotated and sheared transforms are fine."
+    assume_wgs84: bool = False
+    "Whether a datum without a known shift is taken for WGS84."
 
-    def degrees(self, places_N2: Array) -> Array:
-        """(lat, lon) of pixel places, (N, 2), WGS84: latitude within +-90, longitude within +-180.
+    def degrees(self, pixels_N2: Doubles) -> Doubles:
+        """(lat, lon) of pixel positions, (N, 2): latitude within +-90, longitude within +-180.
 
-        NaN where a place lies outside of what the projection can show, or its coordinate system has
-        no place on Earth.
+        NaN where a position lies outside of what the projection can show, where its coordinate
+        system has no position on Earth, and where the shift of its datum is unknown.
         """
-        x, y = places_N2.T
+        x, y = pixels_N2.T
         a, b, c, d, e, f = self.affine[:6]
         xs, ys = a * x + b * y + c, d * x + e * y + f
-        near = (np.abs(xs) < MAX_COORDINATE) & (np.abs(ys) < MAX_COORDINATE)  # false of a NaN
-        lon, lat = _to_wgs84(self.crs, np.where(near, xs, 0.0), np.where(near, ys, 0.0))
-        lon, lat = np.where(near, lon, np.nan), np.where(near, lat, np.nan)
-        lon = np.where(
-            np.abs(lon) > 180, (lon + 180) % 360 - 180, lon
-        )  # mosaics may run on beyond the date line
+        near = (np.abs(xs) < MAX_COORDINATE) & (np.abs(ys) < MAX_COORDINATE)  # False for NaN
+        xs, ys = np.where(near, xs, np.nan), np.where(near, ys, np.nan)
+        lon, lat = _to_wgs84(_transformer(self.crs, ballpark=False), xs, ys)
+        if self.assume_wgs84 or self.resembles_wgs84:
+            lost = np.isnan(lon)
+            lon[lost], lat[lost] = _to_wgs84(
+                _transformer(self.crs, ballpark=True), xs[lost], ys[lost]
+            )
+        # A mosaic may run on beyond the date line.
+        lon = np.where(np.abs(lon) > 180, (lon + 180) % 360 - 180, lon)
         return np.stack([np.clip(lat, -90, 90), lon], axis=1)
 
-    def geotags(self, windows: Iterable[Window]) -> list[GeoTag | None]:
-        """For each window its centre and its four corners; None where the centre is nowhere on
-        Earth.
+    def geotags(
+        self, windows: Iterable[Window], flip: tuple[bool, bool] = (False, False)
+    ) -> list[GeoTag | None]:
+        """For each window its centre and its four corners; None where the centre has no position.
+
+        `flip`: whether the image is mirrored left-right and upside down when it is read, so that
+        its upper left corner is another one of the window's.
         """
-        places = [(window.centre, *window.corners) for window in windows]
+        pixels = [
+            (window.centre, *(window.corners[at] for at in corner_order(flip)))
+            for window in windows
+        ]
+        degrees_NK2 = self.degrees(np.array(pixels, float).reshape(-1, 2)).reshape(-1, 5, 2)
         tags: list[GeoTag | None] = []
-        for centre, *corners in (
-            self.degrees(np.array(places, float).reshape(-1, 2)).reshape(-1, 5, 2).tolist()
-        ):
+        for centre, *corners in degrees_NK2.tolist():
             if np.isnan(centre).any():
                 tags.append(None)
                 continue
-            footprint = (
-                None if np.isnan(corners).any() else tuple((lat, lon) for lat, lon in corners)
-            )
+            known = not np.isnan(corners).any()
+            footprint = tuple((lat, lon) for lat, lon in corners) if known else None
             tags.append(GeoTag(lat=centre[0], lon=centre[1], footprint=footprint))
         return tags
 
-    def ground_pixel(self, place: tuple[float, float]) -> tuple[float, float]:
-        """Width and height in metres, on the ground, of the pixel at a place; NaN where `degrees`
-        is.
+    def ground_pixel(self, pixel: tuple[float, float]) -> tuple[float, float]:
+        """Width and height in metres, on the ground, of the pixel at a position; NaN where
+        `degrees` is.
 
-        Measured between places a few pixels apart on the ellipsoid: true metres whatever the map's
-        unit and scale are.
+        Measured along geodesics between positions a few pixels apart: true metres, whatever the
+        map's unit and scale are.
         """
-        x, y = place
-        around = np.array(
-            [
-                (x - BASELINE_PIXELS, y),
-                (x + BASELINE_PIXELS, y),
-                (x, y - BASELINE_PIXELS),
-                (x, y + BASELINE_PIXELS),
-            ]
-        )
-        west, east, north, south = on_ellipsoid(self.degrees(around))
-        across, down = np.linalg.norm(east - west), np.linalg.norm(south - north)
-        return float(across / (2 * BASELINE_PIXELS)), float(down / (2 * BASELINE_PIXELS))
+        (across, _), (down, _) = self._directions(pixel)
+        return across / (2 * BASELINE_PIXELS), down / (2 * BASELINE_PIXELS)
+
+    def flip(self, pixel: tuple[float, float]) -> tuple[bool, bool]:
+        """Whether an image must be mirrored left-right, and upside down, to show the ground as it
+        is with north more up than down, judged at a position.
+
+        A south-up raster (its rows run north) and an east-left one are mirror images of the
+        ground. One that is rotated by more than 90 degrees is turned by 180.
+        """
+        (_, along_row), (_, along_column) = self._directions(pixel)
+        x_east, x_north = np.sin(along_row), np.cos(along_row)
+        y_east, y_north = np.sin(along_column), np.cos(along_column)
+        mirrored = x_east * y_north - x_north * y_east > 0
+        # How far east the columns run and how far south the rows do, for each choice of mirrors.
+        if mirrored:
+            return (True, False) if -x_east - y_north > x_east + y_north else (False, True)
+        upside_down = bool(x_east - y_north < -0.5)  # not for a rotation by about 90 degrees
+        return upside_down, upside_down
+
+    def _directions(self, pixel: tuple[float, float]) -> tuple[tuple[float, float], ...]:
+        """Along a row and down a column, over two baselines: metres, and radians from north."""
+        (x, y), reach = pixel, BASELINE_PIXELS
+        around = np.array([(x - reach, y), (x + reach, y), (x, y - reach), (x, y + reach)])
+        lat, lon = self.degrees(around).T
+        azimuths, _, metres = ELLIPSOID.inv(lon[0::2], lat[0::2], lon[1::2], lat[1::2])
+        return tuple(zip(metres.tolist(), np.radians(azimuths).tolist(), strict=True))
 
     @property
     def name(self) -> str:
-        """The coordinate system in a word or two: its EPSG code, or what its definition calls it."""
+        """The coordinate system in a word or two: its EPSG code, else its definition's name."""
         code = self.crs.to_epsg()
-        said: str = f"EPSG:{code}" if code else self.crs.to_wkt().split('"')[1]
-        return said
+        return f"EPSG:{code}" if code else self.crs.name
+
+    @property
+    def datum(self) -> str:
+        """The name of its datum."""
+        return self.crs.datum.name if self.crs.datum else "unknown"
+
+    @property
+    def resembles_wgs84(self) -> bool:
+        """Whether its datum's ellipsoid is that of WGS84, of GRS 1980 (0.1 mm smaller at the poles)
+        or of CGCS2000.
+        """
+        ours, theirs = WGS84.ellipsoid, self.crs.ellipsoid
+        return (
+            ours is not None
+            and theirs is not None
+            and abs(theirs.semi_major_metre - ours.semi_major_metre) < ALIKE_M
+            and abs(theirs.inverse_flattening - ours.inverse_flattening) < ALIKE_FLATTENING
+        )
+
+    def shift(self, pixel: tuple[float, float]) -> Shift:
+        """Whether PROJ knows the shift from the datum to WGS84 at a position; nowhere: the
+        position is not on Earth by any datum.
+        """
+        x, y = (np.array([value]) for value in self.affine @ pixel)
+        answers: tuple[tuple[bool, Shift], ...] = ((False, "known"), (True, "unknown"))
+        for ballpark, answer in answers:
+            if np.isfinite(_to_wgs84(_transformer(self.crs, ballpark), x, y)[0]).all():
+                return answer
+        return "nowhere"
+
+    def accuracy_m(self, pixel: tuple[float, float]) -> float | None:
+        """How accurate the shift to WGS84 is at a position, metres, by the EPSG data set; None
+        where that does not say.
+        """
+        transformer = Transformer.from_crs(self.crs, WGS84, always_xy=True)
+        transformer.transform(*(self.affine @ pixel))
+        try:  # of several operations the one that was right here; of one its own
+            accuracy = transformer.get_last_used_operation().accuracy
+        except ProjError:
+            accuracy = transformer.accuracy
+        return None if accuracy < 0 else float(accuracy)
 
 
-def on_ellipsoid(degrees_N2: Array) -> Array:
-    """(lat, lon) in degrees, WGS84 -> (N, 3) metres from the Earth's centre. There neither poles
-    nor date line are seams.
+def corner_order(flip: tuple[bool, bool]) -> tuple[int, ...]:
+    """Which of a window's corners (clockwise from its upper left) are those of the mirrored image,
+    clockwise from its upper left.
     """
-    lat, lon = np.radians(degrees_N2).T
-    radius = EQUATOR_M**2 / np.hypot(EQUATOR_M * np.cos(lat), POLE_M * np.sin(lat))
-    flat = radius * np.cos(lat)
-    return np.stack(
-        [flat * np.cos(lon), flat * np.sin(lon), radius * (POLE_M / EQUATOR_M) ** 2 * np.sin(lat)],
-        axis=1,
-    )
+    order = (0, 1, 2, 3)
+    if flip[0]:
+        order = (order[1], order[0], order[3], order[2])
+    if flip[1]:
+        order = (order[3], order[2], order[1], order[0])
+    return order
 
 
 def parse_crs(name: str) -> CRS | None:
-    """The coordinate system of a name such as EPSG:32633; None where there is none of it."""
-    with rasterio.Env():  # outside of one, GDAL prints its errors
-        try:
-            return CRS.from_user_input(name)
-        except CRSError:
-            return None
-
-
-def _to_wgs84(crs: CRS, xs: Array, ys: Array) -> tuple[Array, Array]:
-    """Longitudes and latitudes, NaN where there are none."""
+    """The coordinate system of a name such as EPSG:32633, or of WKT; None where there is none."""
     try:
-        lon, lat = (
-            np.array(values, float) for values in transform(crs, WGS84, xs.tolist(), ys.tolist())
-        )
-    except CPLE_BaseError:  # one place outside of the projection fails them all
-        if len(xs) == 1:
-            return np.array([np.nan]), np.array([np.nan])
-        half = len(xs) // 2
-        parts = [_to_wgs84(crs, xs[cut], ys[cut]) for cut in (slice(half), slice(half, None))]
-        lon, lat = (np.concatenate(values) for values in zip(*parts, strict=True))
-    outside = ~(np.isfinite(lon) & np.isfinite(lat))
-    return np.where(outside, np.nan, lon), np.where(outside, np.nan, lat)
+        return CRS.from_user_input(name)
+    except CRSError:
+        return None
+
+
+@lru_cache(maxsize=64)
+def _transformer(crs: CRS, ballpark: bool) -> Transformer | None:
+    """From `crs` to WGS84, longitude first; None where PROJ knows no operation. Making one takes
+    up to half a second; threads may share it.
+    """
+    try:
+        return Transformer.from_crs(crs, WGS84, always_xy=True, allow_ballpark=ballpark)
+    except ProjError:
+        return None
+
+
+def _to_wgs84(transformer: Transformer | None, xs: Doubles, ys: Doubles) -> tuple[Doubles, Doubles]:
+    """Longitudes and latitudes, NaN where there are none."""
+    if transformer is None:
+        return np.full(len(xs), np.nan), np.full(len(xs), np.nan)
+    lon, lat = (np.array(values, float) for values in transformer.transform(xs, ys))
+    lost = ~(np.isfinite(lon) & np.isfinite(lat))
+    lon[lost] = lat[lost] = np.nan
+    return lon, lat

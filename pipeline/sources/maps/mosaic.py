@@ -1,8 +1,8 @@
-"""Opened mosaics, and their windows as pictures. In: the path of a TIFF, a window. Out: 8-bit RGB
-or an image file of it, the share of nodata.
+"""Reads windows of mosaics as 8-bit RGB.
 
-A GDAL data set may be used by one thread at a time, and not by a process forked from its own: each
-process and thread opens its own, once. Shapes: B bands, H x W pixels.
+In: the path of a TIFF, a window. Out: the window as RGB or as an image file; its share of nodata.
+A GDAL data set may be used by one thread at a time, and not by a process forked from the one that
+opened it, so each process and thread opens its own and keeps it. Shapes: B bands, H x W pixels.
 """
 
 import io
@@ -25,14 +25,13 @@ from rasterio.windows import Window as RasterWindow
 
 from pipeline.core import storage
 from pipeline.images.decode import DecodeError, Pixels
-from pipeline.sources.maps.colours import Colours, colours_of, to_8bit
+from pipeline.sources.maps.colours import Colours, UnknownColours, colours_of, to_8bit
 from pipeline.sources.maps.tiles import Window
 
 Encoding = Literal["jpg", "png"]
 JPEG_QUALITY = 95  # with full colour resolution: what is lost cannot be seen, a tenth of PNG's size
-# data sets kept open per thread: tiles come in the order of their keys' hashes, from all mosaics in
-# turn
 MAX_OPEN_DATASETS = 8
+"Per thread: tiles are read in the order of their keys' hashes, from all mosaics in turn."
 PILLOW_RESAMPLING = {
     Resampling.average: Image.Resampling.BOX,
     Resampling.bilinear: Image.Resampling.BILINEAR,
@@ -45,9 +44,9 @@ _open_lock = threading.Lock()  # the filters of warnings belong to the whole pro
 def open_mosaic(path: str) -> Any:
     """This process's and thread's data set of a GeoTIFF; do not close it.
 
-    Raises rasterio.errors.RasterioIOError when the file is none.
+    Raises rasterio.errors.RasterioIOError when the file is not a TIFF.
     """
-    key = (os.getpid(), path, _file_version(path))
+    key = (os.getpid(), path, file_version(path))
     if not hasattr(_open_datasets, "datasets"):
         _open_datasets.datasets = OrderedDict()
     datasets: OrderedDict[Any, Any] = _open_datasets.datasets
@@ -59,45 +58,62 @@ def open_mosaic(path: str) -> Any:
     return datasets[key]
 
 
-def _file_version(path: str) -> tuple[int, ...]:
-    """What changes when a local file is written again: a kept data set of it would show a mixture
-    of both.
+def file_version(path: str) -> tuple[int, ...]:
+    """Changes when a local file is written again; empty for a remote file. A data set that was
+    opened before would show a mixture of the old and the new file.
     """
     if not storage.is_local(path):
         return ()
     try:
-        said = os.stat(storage.resolve(path)[1])
+        status = os.stat(storage.resolve(path)[1])
     except OSError:
-        return ()  # opening it says what is wrong
-    return said.st_mtime_ns, said.st_size
+        return ()  # opening the file raises the error
+    return status.st_mtime_ns, status.st_size
 
 
-def _open(path: str) -> Any:
-    # One driver: what a file's content would have others read (URLs, other files) is not for
-    # imagery from elsewhere.
+def _open(path: str, **options: str) -> Any:
+    # Only this driver: other drivers follow URLs and paths that the file's content names, which is
+    # unsafe for files of unknown origin.
     filesystem, inner = storage.resolve(path)
-    with _open_lock, warnings.catch_warnings():  # whoever needs coordinates looks for them
+    with _open_lock, warnings.catch_warnings():  # a caller that needs coordinates checks for them
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         if storage.is_local(path):
-            return rasterio.open(Path(inner), driver="GTiff")
-        return rasterio.open(path, driver="GTiff", opener=filesystem)
+            return rasterio.open(Path(inner), driver="GTiff", **options)
+        return rasterio.open(path, driver="GTiff", opener=filesystem, **options)
 
 
-def colours_for(path: str, stretch: tuple[float, float] | None) -> Colours:
-    """How a mosaic's bands become RGB; found once per process, the same in all."""
-    return _colours(path, _file_version(path), stretch)
+def transform_by(path: str, source: str) -> rasterio.Affine | None:
+    """The transform that one of GDAL's sources (INTERNAL, WORLDFILE, PAM) states; None where it
+    states none.
+    """
+    with _open(path, GEOREF_SOURCES=source) as dataset:
+        affine: rasterio.Affine = dataset.transform
+        return None if affine.is_identity else affine
+
+
+def colours_for(
+    path: str, stretch: tuple[float, float] | None, bands: tuple[int, ...] | None = None
+) -> Colours:
+    """How the bands of a mosaic become RGB; computed once per process, equal in all processes.
+
+    Raises UnknownColours, rasterio.errors.RasterioIOError.
+    """
+    return _colours(path, file_version(path), stretch, bands)
 
 
 @lru_cache(maxsize=256)
-def _colours(path: str, version: tuple[int, ...], stretch: tuple[float, float] | None) -> Colours:
-    return colours_of(open_mosaic(path), stretch)
+def _colours(
+    path: str,
+    version: tuple[int, ...],
+    stretch: tuple[float, float] | None,
+    bands: tuple[int, ...] | None,
+) -> Colours:
+    return colours_of(open_mosaic(path), stretch, bands)
 
 
 def nodata_share(path: str, window: Window, shown: Colours) -> float:
-    """The share of a window's pixels that hold no image, from 0 to 1: every pixel is looked at, at
-    full resolution.
-    """
-    with rasterio.Env():  # outside of one, GDAL prints its errors
+    """The share of a window's pixels without an image, from 0 to 1, counted at full resolution."""
+    with rasterio.Env():  # outside of an Env GDAL prints its errors
         valid_HW = _valid_mask(
             open_mosaic(path),
             _raster_window(window),
@@ -118,13 +134,11 @@ def read_window(
     """
     width, height = size
     with rasterio.Env():
-        dataset, where = open_mosaic(path), _raster_window(window)
-        if (
-            shown.palette_N3 is not None
-        ):  # the mean of two indices is no colour: full resolution, shrunk as colours
-            index_HW = np.minimum(
-                dataset.read(shown.bands[0], window=where), len(shown.palette_N3) - 1
-            )
+        dataset, area = open_mosaic(path), _raster_window(window)
+        # The mean of two indices is not a colour: read at full resolution and shrink as colours.
+        if shown.palette_N3 is not None:
+            index_HW = dataset.read(shown.bands[0], window=area)
+            index_HW = np.minimum(index_HW, len(shown.palette_N3) - 1)
             image = Image.fromarray(shown.palette_N3[index_HW])
             if image.size != size:
                 image = image.resize(size, PILLOW_RESAMPLING[resampling])
@@ -132,12 +146,13 @@ def read_window(
         else:
             shape = (len(shown.bands), height, width)
             values_BHW = dataset.read(
-                list(shown.bands), window=where, out_shape=shape, resampling=resampling
+                list(shown.bands), window=area, out_shape=shape, resampling=resampling
             )
-            grey_or_rgb_HWB = np.moveaxis(to_8bit(values_BHW, shown.stretch), 0, -1)
+            shown_BHW = to_8bit(values_BHW, shown.stretch, shown.negative)
+            grey_or_rgb_HWB = np.moveaxis(shown_BHW, 0, -1)
             rgb_HW3 = np.array(np.broadcast_to(grey_or_rgb_HWB, (height, width, 3)), order="C")
         if shown.gaps:
-            rgb_HW3[~_valid_mask(dataset, where, shown, (height, width), resampling)] = 0
+            rgb_HW3[~_valid_mask(dataset, area, shown, (height, width), resampling)] = 0
     return rgb_HW3
 
 
@@ -147,19 +162,23 @@ def encode_window(
     encoding: Encoding,
     size: tuple[int, int] | None = None,
     resampling: Resampling = Resampling.average,
-    stretch: tuple[float, float] | None = None,
+    shown: Colours | None = None,
+    flip: tuple[bool, bool] = (False, False),
 ) -> bytes:
     """A window as an image file of `size`, by default its own; the same bytes each time.
 
+    `shown`: by default as the file says. `flip`: whether to mirror it left-right and upside down.
     Raises DecodeError where the mosaic cannot be read.
     """
     try:
-        own = (window.width, window.height)
-        return encode_image(
-            read_window(path, window, size or own, resampling, colours_for(path, stretch)), encoding
-        )
+        own, colours = (window.width, window.height), shown or colours_for(path, None)
+        rgb_HW3 = read_window(path, window, size or own, resampling, colours)
     except RasterioError as error:
         raise DecodeError("damaged image", root_cause(error)) from None
+    except UnknownColours as error:
+        raise DecodeError("unknown colours", str(error)) from None
+    columns, rows = (slice(None, None, -1 if mirrored else 1) for mirrored in flip)
+    return encode_image(np.ascontiguousarray(rgb_HW3[rows, columns]), encoding)
 
 
 def encode_image(image_HW3: Pixels, encoding: Encoding) -> bytes:
@@ -175,7 +194,7 @@ def encode_image(image_HW3: Pixels, encoding: Encoding) -> bytes:
 
 
 def root_cause(error: BaseException) -> str:
-    """What GDAL said first; rasterio's own words above it say that something was said."""
+    """GDAL's first error, which the exceptions of rasterio above it only wrap."""
     while error.__cause__ is not None:
         error = error.__cause__
     return str(error)
@@ -183,23 +202,23 @@ def root_cause(error: BaseException) -> str:
 
 def _valid_mask(
     dataset: Any,
-    where: RasterWindow,
+    area: RasterWindow,
     shown: Colours,
     shape: tuple[int, int],
     resampling: Resampling,
 ) -> npt.NDArray[np.bool_]:
-    """(H, W), true where a mask, alpha or nodata value leaves any of the shown bands, and it is a
-    finite number.
+    """(H, W), true where mask, alpha and nodata value leave a finite number in any of the shown
+    bands.
     """
     bands = list(shown.bands[:1] if shown.one_mask else shown.bands)
     masks_BHW = dataset.read_masks(
-        bands, window=where, out_shape=(len(bands), *shape), resampling=resampling
+        bands, window=area, out_shape=(len(bands), *shape), resampling=resampling
     )
     valid_HW: npt.NDArray[np.bool_] = (masks_BHW > 0).any(axis=0)
     if np.issubdtype(np.dtype(dataset.dtypes[0]), np.floating):
         bands = list(shown.bands)
         values_BHW = dataset.read(
-            bands, window=where, out_shape=(len(bands), *shape), resampling=resampling
+            bands, window=area, out_shape=(len(bands), *shape), resampling=resampling
         )
         valid_HW &= np.isfinite(values_BHW).any(axis=0)
     return valid_HW
