@@ -1,5 +1,5 @@
-"""Inspection against decoding: the same size for whole images of every kind, and a countable reason
-for the others.
+"""Inspection against decoding: the same size for complete images of every kind, and a countable
+reason for the others.
 """
 
 import io
@@ -36,7 +36,7 @@ def encoded(form: str, image: Image.Image = PHOTO, **options: object) -> bytes:
 
 
 def with_thumbnail() -> bytes:
-    """A photo whose EXIF segment holds a whole small JPEG, end marker included."""
+    """A photo whose EXIF segment holds a small JPEG, end marker included."""
     small = encoded("JPEG", PHOTO.resize((16, 16)))
     tags = (
         b"Exif\0\0II*\0\x08\0\0\0\x01\0" + struct.pack("<HHII", 0x0112, 3, 1, 6) + bytes(4) + small
@@ -81,7 +81,7 @@ OTHERS = {
     "bmp": encoded("BMP"),
     "gif": encoded("GIF", PHOTO.convert("P")),
 }
-WHOLE = (
+COMPLETE = (
     JPEGS
     | PNGS
     | WEBPS
@@ -90,8 +90,8 @@ WHOLE = (
 )
 
 
-@pytest.mark.parametrize("data", WHOLE.values(), ids=WHOLE)
-def test_a_whole_image_has_the_size_that_decoding_gives(data: bytes) -> None:
+@pytest.mark.parametrize("data", COMPLETE.values(), ids=COMPLETE)
+def test_inspect_gives_the_size_that_decoding_gives(data: bytes) -> None:
     height, width, _ = decode(data).shape
     assert inspect(data) == (width, height)
     assert sorted(inspect(data)) == [37, 50]
@@ -100,24 +100,22 @@ def test_a_whole_image_has_the_size_that_decoding_gives(data: bytes) -> None:
 @pytest.mark.parametrize(
     "data", [*JPEGS.values(), *PNGS.values(), *WEBPS.values()], ids=[*JPEGS, *PNGS, *WEBPS]
 )
-def test_half_an_image_is_refused_by_inspection_itself(data: bytes) -> None:
-    whole = data[: data.rindex(b"SEFT")] if b"SEFT" in data else data
+def test_inspect_refuses_half_an_image(data: bytes) -> None:
+    complete = data[: data.rindex(b"SEFT")] if b"SEFT" in data else data
     with pytest.raises(DecodeError) as caught:
-        inspect(whole[: len(whole) // 3])  # of two JPEGs in one file the first, too, is cut
+        inspect(complete[: len(complete) // 3])  # of two JPEGs in one file the first, too, is cut
     assert caught.value.reason in ("truncated image", "damaged image")
 
 
 @settings(max_examples=300)
-@given(data=st.sampled_from(list(WHOLE.values())), share=st.floats(0, 1, exclude_max=True))
-def test_a_cut_is_seen_by_inspection_or_by_decoding_or_leaves_a_whole_image(
-    data: bytes, share: float
-) -> None:
+@given(data=st.sampled_from(list(COMPLETE.values())), share=st.floats(0, 1, exclude_max=True))
+def test_truncation_is_found_by_inspect_or_decode(data: bytes, share: float) -> None:
     cut = data[: int(share * len(data))]
     with suppress(DecodeError):
         size = inspect(cut)
         height, width, _ = decode(cut).shape
         assert size == (width, height)
-        # What may be cut off without loss: a trailer, a second image, the last bytes of formats
+        # A trailer, a second image, or last bytes that a format does not need may be cut off.
         # that do not need them.
         assert np.array_equal(decode(cut), decode(data))
 
@@ -125,10 +123,10 @@ def test_a_cut_is_seen_by_inspection_or_by_decoding_or_leaves_a_whole_image(
 @pytest.mark.filterwarnings("ignore")  # of Pillow, over metadata that makes no sense
 @settings(max_examples=300)
 @given(
-    data=st.sampled_from(list(WHOLE.values())),
+    data=st.sampled_from(list(COMPLETE.values())),
     faults=st.lists(st.tuples(st.integers(0, 700), st.integers(0, 255)), max_size=4),
 )
-def test_no_damage_raises_anything_but_a_decode_error(
+def test_inspect_of_damage_raises_only_decode_errors(
     data: bytes, faults: list[tuple[int, int]]
 ) -> None:
     damaged = bytearray(data)
@@ -139,7 +137,7 @@ def test_no_damage_raises_anything_but_a_decode_error(
 
 
 def png(width: int, height: int) -> bytes:
-    """A small PNG file that says it has that size."""
+    """A small PNG file whose header states that size."""
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(100))), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(
@@ -149,7 +147,7 @@ def png(width: int, height: int) -> bytes:
 
 
 def jpeg_of(width: int, height: int) -> bytes:
-    """A JPEG file that says it has that size."""
+    """A JPEG file whose header states that size."""
     frame = PLAIN.index(b"\xff\xc0") + 5
     return PLAIN[:frame] + struct.pack(">HH", height, width) + PLAIN[frame + 4 :]
 
@@ -185,19 +183,19 @@ def jpeg_of(width: int, height: int) -> bytes:
         (encoded("BMP", PHOTO.resize((7, 7))), "absurd dimensions"),
     ],
 )
-def test_what_is_no_whole_image_is_refused_for_a_countable_reason(data: bytes, reason: str) -> None:
+def test_inspect_refuses_with_a_countable_reason(data: bytes, reason: str) -> None:
     with pytest.raises(DecodeError) as caught:
         inspect(data)
     assert caught.value.reason == reason
     assert caught.value.found
 
 
-def test_pixels_are_too_many_where_decoding_finds_them_too_many() -> None:
+def test_max_pixels_are_those_of_pillow() -> None:
     assert Image.MAX_IMAGE_PIXELS is not None
     assert 2 * Image.MAX_IMAGE_PIXELS == MAX_PIXELS
 
 
-def test_a_plain_jpeg_is_judged_without_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_inspect_of_a_jpeg_does_not_decode(monkeypatch: pytest.MonkeyPatch) -> None:
     data = encoded("JPEG", quality=90)
     monkeypatch.setattr(ImageFile.ImageFile, "load", lambda image: pytest.fail("decoded"))
     monkeypatch.setattr(simplejpeg, "decode_jpeg", lambda *_, **__: pytest.fail("decoded"))
