@@ -1,6 +1,4 @@
-"""Files damaged in seeded ways, and the verdict on who reads them: a sentence naming file and
-remedy, or the same content.
-"""
+"""Files damaged by seed, and what a reader has to do: name file and remedy, or read the same."""
 
 import hashlib
 import re
@@ -15,34 +13,32 @@ from pipeline.core import json_files
 from pipeline.core.errors import InputError
 from pipeline.shards.manifest import read_manifest
 
-MENDS = re.compile(
-    r"jobs/\w+\.py|embed its shard again|run the same command again|calibrate again|taking checkpoint"
+REMEDIES = re.compile(
+    r"jobs/\w+\.py|embed its shard again|run the same command again|calibrate again"
+    r"|taking checkpoint"
 )
 
 
-def damages(good: bytes, count: int, seed: int = 0) -> Iterator[bytes | None]:
-    """The file with as many damages, one at a time; None: it is gone."""
+def damaged_versions(good: bytes, count: int, seed: int = 0) -> Iterator[bytes | None]:
+    """None for a deleted file, then `count` damaged versions of its bytes."""
     rng = np.random.default_rng(seed)
     yield None
     for number in range(count):
-        data, place = bytearray(good), int(rng.integers(len(good)))
+        data, at = bytearray(good), int(rng.integers(len(good)))
         if number % 10 == 8:
-            data[place : place + int(rng.integers(1, 65))] = b""
+            data[at : at + int(rng.integers(1, 65))] = b""
         elif number % 10 == 9:
-            data = data[:place]
+            data = data[:at]
         else:
             for _ in range((1, 1, 1, 1, 1, 2, 4, 16)[number % 10]):
-                data[place] ^= 1 << int(rng.integers(8))
-                place = (
-                    int(rng.integers(len(good)))
-                    if rng.random() < 0.5
-                    else min(place + 1, len(good) - 1)
-                )
+                data[at] ^= 1 << int(rng.integers(8))
+                jump = rng.random() < 0.5
+                at = int(rng.integers(len(good))) if jump else min(at + 1, len(good) - 1)
         yield bytes(data)
 
 
-def sentence_of(work: Callable[[], Any], errors: type[Exception] = InputError) -> str | None:
-    """What it is refused with, None where it is not."""
+def error_message(work: Callable[[], Any], errors: type[Exception] = InputError) -> str | None:
+    """The message of the error that `work` raises; None if it raises none."""
     try:
         work()
     except errors as error:
@@ -50,51 +46,52 @@ def sentence_of(work: Callable[[], Any], errors: type[Exception] = InputError) -
     return None
 
 
-def unchanged(found: Any, expected: Any) -> None:
-    assert found == expected, "other content, and not a word"
+def assert_unchanged(found: Any, expected: Any) -> None:
+    assert found == expected, "other content, and no error"
 
 
-def found_or_equal(
-    path: Path, look: Callable[[], Any], count: int, errors: type[Exception] = InputError
+def count_detected(
+    path: Path, read: Callable[[], Any], count: int, errors: type[Exception] = InputError
 ) -> int:
-    """Damage the file in so many ways; returns how many were refused, each naming it and what mends
-    it.
+    """Damage the file in `count` ways and delete it; the number of versions that `read` refused.
+
+    Each refusal has to name the file and a remedy; without one, the content has to be the same.
     """
-    good, expected, refused = path.read_bytes(), look(), 0
-    for data in damages(good, count):
+    good, expected, refused = path.read_bytes(), read(), 0
+    for data in damaged_versions(good, count):
         path.unlink(missing_ok=True)
         if data is not None:
             path.write_bytes(data)
-        said = sentence_of(lambda: unchanged(look(), expected), errors)
-        if said is not None:
-            assert str(path) in said
-            assert MENDS.search(said), said
+        message = error_message(lambda: assert_unchanged(read(), expected), errors)
+        if message is not None:
+            assert str(path) in message
+            assert REMEDIES.search(message), message
             refused += 1
     path.write_bytes(good)
-    assert look() == expected
+    assert read() == expected
     return refused
 
 
-def look_or_say_gone(
-    path: Path, look: Callable[[], Any], error: type[Exception] = InputError
+def raising_if_missing(
+    path: Path, read: Callable[[], Any], error: type[Exception] = InputError
 ) -> Callable[[], Any]:
-    """`look`, of a file whose absence means that nothing was done yet."""
+    """`read`, for a file whose absence means that a stage has not started: raises instead."""
 
-    def looked() -> Any:
+    def checked() -> Any:
         if not path.exists():
             raise error(f"{path} is gone; jobs/again.py")
-        return look()
+        return read()
 
-    return looked
+    return checked
 
 
-def say_again(shards: Path, name: str) -> None:
-    """Have the manifest say what a tar is now, as if it had been packed so."""
+def update_checksum(shards: Path, name: str) -> None:
+    """Write a tar's present hash into the manifest, as if it had been packed like this."""
     manifest = read_manifest(str(shards))
     digest = hashlib.sha256((shards / f"{name}.tar").read_bytes()).hexdigest()
-    said = tuple(
-        replace(one, sha256=digest) if one.name == name else one for one in manifest.shards
+    updated = tuple(
+        replace(shard, sha256=digest) if shard.name == name else shard for shard in manifest.shards
     )
     json_files.write_checksummed(
-        str(shards / "manifest.json"), asdict(replace(manifest, shards=said))
+        str(shards / "manifest.json"), asdict(replace(manifest, shards=updated))
     )

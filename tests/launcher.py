@@ -1,8 +1,7 @@
-"""Runs the real jobs from a process that has imported their libraries already: one begins in
-milliseconds, not in seconds.
+"""Runs jobs and benchmarks as processes forked from one that has imported their libraries.
 
-The server forks; each child is a session of its own and does what `python jobs/NAME.py ARGUMENTS`
-would do.
+A run starts within milliseconds instead of seconds. Each child is a session of its own and does
+what `python FOLDER/NAME.py ARGUMENTS` would do.
 """
 
 import atexit
@@ -23,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
-PATH = (str(Path(__file__).parent / "chaos" / "hook"), str(ROOT))
-"Of every Python process: where the faults of the storage are, and the project."
+PYTHON_PATH = (str(Path(__file__).parent / "chaos" / "hook"), str(ROOT))
+"PYTHONPATH of every process: the hook for storage faults, and the project."
 LIBRARIES = (
     "torch",
     "ray",
@@ -35,73 +34,77 @@ LIBRARIES = (
     "PIL.Image",
     "simplejpeg",
 )
-PATIENCE = 300.0
-"Seconds that a job may take on a busy machine."
+TIMEOUT_S = 300.0
+"Longest run of a job on a busy machine."
 JOBS = ("simulate", "make_shards", "train", "embed_gallery", "build_index", "evaluate")
+"Jobs whose modules are imported before the first fork."
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ended:
-    """How a job ended."""
+class JobResult:
+    """The outcome of a run."""
 
     code: int | None
-    "Exit code, negative for a signal; None where it was stopped for taking too long."
+    "Exit code, negative for a signal; None if the run was killed after its timeout."
     seconds: float
-    said: str
+    output: str
     "Standard output and error together."
 
 
-class Job:
-    """A job that runs."""
+class RunningJob:
+    """A run that was started."""
 
     def __init__(self, pid: int, log: Path) -> None:
-        self.pid, self._log, self._began = pid, log, time.monotonic()
+        self.pid, self._log, self._start = pid, log, time.monotonic()
         self.code: int | None = None
-        "Once it is over."
+        "Exit code, once the run has ended."
 
     @property
     def seconds(self) -> float:
-        return time.monotonic() - self._began
+        return time.monotonic() - self._start
 
     def wait(self, until: float) -> bool:
-        """Whether it is over, at the latest when it has run for `until` seconds."""
+        """Wait until the run ends, at most until it has taken `until` seconds; whether it ended."""
         while self.code is None and self.seconds < until:
             time.sleep(0.005)
         return self.code is not None
 
-    def end(self, patience: float = PATIENCE) -> Ended:
-        """Wait for its end, or stop it when it has run for `patience` seconds."""
-        over, took = self.wait(patience), self.seconds
-        with suppress(ProcessLookupError):  # what it has left running too
+    def end(self, timeout_s: float = TIMEOUT_S) -> JobResult:
+        """Wait for the run's end, or kill it when it has taken `timeout_s`."""
+        ended, seconds = self.wait(timeout_s), self.seconds
+        with suppress(ProcessLookupError):  # processes that the run has left behind
             os.killpg(self.pid, signal.SIGKILL)
-        self.wait(patience + 30)
-        said = self._log.read_text(errors="replace")
-        return Ended(code=self.code if over else None, seconds=took, said=said)
+        self.wait(timeout_s + 30)
+        output = self._log.read_text(errors="replace")
+        return JobResult(code=self.code if ended else None, seconds=seconds, output=output)
 
 
 class Launcher:
-    """The server, and the jobs that it runs. `environment` holds for all of them."""
+    """The server that forks, and its runs. `environment` applies to all of them."""
 
     def __init__(self, scratch: Path, environment: Mapping[str, str]) -> None:
-        self._log, self._jobs = scratch / "job.log", dict[int, Job]()
+        self._log, self._jobs = scratch / "job.log", dict[int, RunningJob]()
         self._server = subprocess.Popen(
-            [sys.executable, "-m", "tests.launcher"],
+            [sys.executable, __file__],
             cwd=ROOT,
             text=True,
             bufsize=1,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env=os.environ | environment | {"PYTHONPATH": os.pathsep.join(PATH)},
+            env=os.environ | environment | {"PYTHONPATH": os.pathsep.join(PYTHON_PATH)},
         )
         self._started: list[int] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
-    def start(self, name: str, arguments: Sequence[str], **environment: str) -> Job:
+    def start(
+        self, name: str, arguments: Sequence[str], folder: str = "jobs", **environment: str
+    ) -> RunningJob:
+        """Run `FOLDER/NAME.py`; its log replaces that of the run before."""
         assert self._server.stdin is not None
         known = len(self._started)
         order = {
-            "name": name,
+            "path": str(ROOT / folder / f"{name}.py"),
             "arguments": list(arguments),
             "environment": environment,
             "log": str(self._log),
@@ -124,33 +127,32 @@ class Launcher:
     def _read(self) -> None:
         assert self._server.stdout is not None
         for line in self._server.stdout:
-            told: dict[str, Any] = json.loads(line)
-            if "code" in told:
-                self._jobs[told["pid"]].code = told["code"]
+            event: dict[str, Any] = json.loads(line)
+            if "code" in event:
+                self._jobs[event["pid"]].code = event["code"]
             else:
-                self._jobs[told["pid"]] = Job(told["pid"], self._log)
-                self._started.append(told["pid"])
+                self._jobs[event["pid"]] = RunningJob(event["pid"], self._log)
+                self._started.append(event["pid"])
 
 
 def serve() -> dict[str, Any]:
-    """Fork a child per order; returns in the children alone, with the order, and ends the server
-    when its input does.
+    """Fork a child per order read from stdin; returns in the children only, with their order.
+
+    The server exits at the end of its input.
     """
     for name in (*LIBRARIES, *(f"jobs.{job}" for job in JOBS)):
         importlib.import_module(name)
-    wanted, waiting = b"", True
-    while waiting:
+    buffer, is_open = b"", True
+    while is_open:
         with suppress(ChildProcessError):
-            while (over := os.waitpid(-1, os.WNOHANG))[0]:
-                print(
-                    json.dumps({"pid": over[0], "code": os.waitstatus_to_exitcode(over[1])}),
-                    flush=True,
-                )
+            while (ended := os.waitpid(-1, os.WNOHANG))[0]:
+                code = os.waitstatus_to_exitcode(ended[1])
+                print(json.dumps({"pid": ended[0], "code": code}), flush=True)
         if not select.select([0], [], [], 0.01)[0]:
             continue
-        more = os.read(0, 1 << 16)
-        waiting = bool(more)
-        *orders, wanted = (wanted + more).split(b"\n")
+        data = os.read(0, 1 << 16)
+        is_open = bool(data)
+        *orders, buffer = (buffer + data).split(b"\n")
         for order in map(json.loads, orders):
             if not (pid := os.fork()):
                 return dict(order)
@@ -158,26 +160,27 @@ def serve() -> dict[str, Any]:
     sys.exit(0)
 
 
-def become(order: dict[str, Any]) -> None:
-    """Be the job that an order names."""
+def run_job(order: dict[str, Any]) -> None:
+    """Run the script of an order in this process, and exit."""
     os.setsid()
     log = os.open(order["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     for number in (1, 2):
         os.dup2(log, number)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     os.environ.update(order["environment"])
-    path = ROOT / "jobs" / f"{order['name']}.py"
-    sys.argv = [str(path), *order["arguments"]]
+    path = order["path"]
+    sys.argv = [path, *order["arguments"]]
+    sys.path.insert(0, os.path.dirname(path))
     code: Any = 1
     try:
-        runpy.run_path(str(path), run_name="__main__")
+        runpy.run_path(path, run_name="__main__")
         code = 0
-    except SystemExit as asked:
-        code = asked.code
+    except SystemExit as exit_:
+        code = exit_.code
     except BaseException:
         sys.excepthook(*sys.exc_info())
-    # As Python ends, but for taking every imported module apart, which costs seconds where all of
-    # its memory is shared.
+    # As Python ends, but without taking every imported module apart, which costs seconds because
+    # the process shares all of its memory.
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()
     sys.stdout.flush()
@@ -186,4 +189,4 @@ def become(order: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    become(serve())
+    run_job(serve())

@@ -1,7 +1,6 @@
-"""The processes of a job and of a Ray cluster on this machine: which there are, and how a cluster
-of our own is begun.
+"""Processes on this machine: a job's descendants, Ray's workers and daemons, a cluster of our own.
 
-Linux's /proc is read; psutil would be one more dependency for three lines.
+Reads Linux's /proc; psutil would be one more dependency for three lines.
 """
 
 import os
@@ -15,8 +14,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
-def named(pid: int) -> str:
-    """A process's command line; empty when it is gone."""
+def command_line(pid: int) -> str:
+    """A process's command line; empty if it has ended."""
     try:
         return (
             Path(f"/proc/{pid}/cmdline")
@@ -29,12 +28,12 @@ def named(pid: int) -> str:
         return ""
 
 
-def below(pid: int) -> list[int]:
+def descendants(pid: int) -> list[int]:
     """All descendants of a process."""
     children: dict[int, list[int]] = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
-            with suppress(OSError, IndexError):  # gone meanwhile
+            with suppress(OSError, IndexError):  # it has ended meanwhile
                 parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
                 children.setdefault(parent, []).append(int(entry.name))
     found, todo = list[int](), [pid]
@@ -45,29 +44,30 @@ def below(pid: int) -> list[int]:
     return sorted(found)
 
 
-def working(pid: int) -> list[int]:
-    """Ray's workers below a process that have something to do; its agents, whose death takes the
-    node along, are none.
+def busy_workers(pid: int) -> list[int]:
+    """Ray's workers below a process that run a task or an actor.
+
+    Ray's agents do not count: a node does not survive their death.
     """
-    passed_over = ("ray::IDLE", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
+    ignored = ("ray::IDLE", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
     return [
-        one
-        for one in below(pid)
-        if (name := named(one)).startswith("ray::") and not name.startswith(passed_over)
+        child
+        for child in descendants(pid)
+        if (name := command_line(child)).startswith("ray::") and not name.startswith(ignored)
     ]
 
 
-def daemons(pid: int) -> list[int]:
-    """Ray's own processes below a process: without the raylet or the GCS there is no cluster."""
+def ray_daemons(pid: int) -> list[int]:
+    """The raylet and the GCS below a process: a cluster does not survive their death."""
     return [
-        one
-        for one in below(pid)
-        if any(word in named(one) for word in ("raylet/raylet", "gcs/gcs_server"))
+        child
+        for child in descendants(pid)
+        if any(word in command_line(child) for word in ("raylet/raylet", "gcs/gcs_server"))
     ]
 
 
-def strike(pid: int, kind: signal.Signals) -> bool:
-    """Send a signal; whether there was anyone to have it."""
+def send_signal(pid: int, kind: signal.Signals) -> bool:
+    """Send a signal; False if the process has ended."""
     try:
         os.kill(pid, kind)
     except ProcessLookupError:
@@ -76,13 +76,13 @@ def strike(pid: int, kind: signal.Signals) -> bool:
 
 
 @contextmanager
-def cluster(cpus: int, environment: dict[str, str]) -> Iterator[tuple[int, str]]:
-    """A Ray cluster of this machine: the process above all of it, and its address."""
+def start_cluster(cpus: int, environment: dict[str, str]) -> Iterator[tuple[int, str]]:
+    """A Ray cluster on this machine: the pid of the process above all of it, and its address."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    # With its dashboard: Ray Train asks it whether a controller lives, and keeps a dead one's
-    # places where there is none.
+    # With its dashboard: Ray Train asks it whether a controller is alive, and without it keeps the
+    # resources of a dead one reserved.
     words = ["start", "--head", "--block", f"--port={port}", f"--num-cpus={cpus}"]
     ray = Path(sys.executable).with_name("ray")
     head = subprocess.Popen(
@@ -94,13 +94,12 @@ def cluster(cpus: int, environment: dict[str, str]) -> Iterator[tuple[int, str]]
     )
     try:
         deadline = time.monotonic() + 60
-        while not any("raylet/raylet" in named(one) for one in below(head.pid)):
+        while not any("raylet/raylet" in command_line(child) for child in descendants(head.pid)):
             if head.poll() is not None or time.monotonic() > deadline:
                 raise RuntimeError("Ray has not started")
             time.sleep(0.1)
         yield head.pid, f"127.0.0.1:{port}"
     finally:
-        everyone = [head.pid, *below(head.pid)]
-        for one in everyone:
-            strike(one, signal.SIGKILL)
+        for member in [head.pid, *descendants(head.pid)]:
+            send_signal(member, signal.SIGKILL)
         head.wait()

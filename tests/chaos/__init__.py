@@ -1,1 +1,6 @@
-"""The fault campaign: processes killed and files damaged on purpose."""
+"""The fault campaign: real jobs are killed, their storage fails, their files are damaged.
+
+`stages.py` lists the jobs, `faults.py` the faults, `workspace.py` runs jobs in scratch folders,
+`campaign.py` runs one trial and compares content, `test_chaos.py` is the short campaign and
+`python -m tests.chaos` the long one. `hook/` injects storage faults into every Python process.
+"""

@@ -1,9 +1,8 @@
-"""The campaign: a stage runs, meets faults, is run again by the same command, and its content is
-compared.
+"""One trial of the campaign: a stage meets a fault, is rerun by the same command, is compared.
 
-A trial's verdict is by content: what the stage has written in the end equals what an undisturbed
-run wrote. Where a run refuses, what its sentence asks for is done: a damaged input is put back (the
-stage before it makes it again), a damaged output that it names is deleted.
+The verdict is by content: a stage's final output equals that of an undisturbed run. Where a run
+refuses, the remedy of its error message is applied: a damaged input is restored (the stage before
+would make it again), a damaged output that the message names is deleted.
 """
 
 import random
@@ -12,60 +11,61 @@ import shutil
 import signal
 from dataclasses import dataclass, field
 
-from tests.chaos.faults import DAMAGE, KILLS, PLACES, STORAGE, Damaged, damage
-from tests.chaos.grounds import Ground, Undisturbed
+from tests.chaos.faults import DAMAGE, KILLS, STORAGE, TARGETS, DamagedFile, damage_file
 from tests.chaos.stages import Stage
-from tests.launcher import Ended
-from tests.processes import strike
+from tests.chaos.workspace import Baseline, Workspace
+from tests.launcher import JobResult
+from tests.processes import send_signal
 
-TRIES = 6
-"Runs after the faults in which the stage has to come to its end."
-PASSED_OVER = ("tensorboard", "ray", "job.log", ".parts")
+MAX_RERUNS = 6
+"Runs after the fault within which the stage has to complete."
+IGNORED = ("tensorboard", "ray", "job.log", ".parts")
+"Files and folders that are never damaged."
 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """One trial: which fault the stage meets."""
+    """The fault of one trial."""
 
     stage: Stage
     kind: str
-    "Of KILLS, STORAGE or DAMAGE."
-    place: str = ""
-    "Of PLACES, for damage."
+    "One of KILLS, STORAGE or DAMAGE."
+    target: str = ""
+    "One of TARGETS, for damage."
     seed: int
 
     @property
     def name(self) -> str:
-        return f"{self.place} {self.kind}".strip()
+        return f"{self.target} {self.kind}".strip()
 
 
 @dataclass
-class Verdict:
-    """What came of a trial."""
+class TrialResult:
+    """The outcome of one trial."""
 
     case: Case
     faults: int = 0
-    "That were injected: a kill that came too late counts as none."
+    "Faults injected; a kill after the end of the run does not count."
     runs: int = 0
-    found: str = ""
+    detected: str = ""
     "How damage was noticed: by default, by --verify, or it made no difference."
     lost: list[str] = field(default_factory=list)
-    "Content that is missing in the end, or another than it should be."
-    doubled: list[str] = field(default_factory=list)
-    "Content that should not be there."
+    "Content that is missing or differs in the end."
+    duplicated: list[str] = field(default_factory=list)
+    "Content that an undisturbed run does not have."
     hangs: int = 0
-    unclear: list[str] = field(default_factory=list)
-    "Last lines of runs that ended in a traceback instead of a sentence."
+    tracebacks: list[str] = field(default_factory=list)
+    "Last lines of runs that ended in a traceback instead of a one-line error."
     restart_seconds: float = 0.0
-    "Of the run that came to the end, over an undisturbed run's."
+    "Duration of the run that completed, beyond an undisturbed run's."
 
     @property
-    def bad(self) -> bool:
-        return bool(self.lost or self.doubled or self.hangs or self.unclear)
+    def failed(self) -> bool:
+        return bool(self.lost or self.duplicated or self.hangs or self.tracebacks)
 
 
 def cases(stage: Stage, seed: int) -> list[Case]:
-    """One trial of every fault that the stage can meet."""
+    """One case of every fault that the stage can meet and detect."""
     kills = [Case(stage=stage, kind=kind, seed=seed) for kind in KILLS]
     storage = [
         Case(stage=stage, kind=kind, seed=seed)
@@ -73,184 +73,202 @@ def cases(stage: Stage, seed: int) -> list[Case]:
         if stage.reads or STORAGE[kind] == "write"
     ]
     damages = [
-        Case(stage=stage, kind=kind, place=place, seed=seed)
-        for place in PLACES
-        if stage.reads or place != "input"
+        Case(stage=stage, kind=kind, target=target, seed=seed)
+        for target in TARGETS
+        if stage.reads or target != "input"
         for kind in DAMAGE
     ]
     return [
         case
         for case in kills + storage + damages
-        if not any(word in case.name for word in stage.blind)
+        if not any(word in case.name for word in stage.undetectable)
     ]
 
 
-def trial(ground: Ground, case: Case) -> Verdict:
-    """Let a stage meet a fault, bring it to its end, and judge."""
-    stage, rng, verdict = (
-        case.stage,
-        random.Random(repr((case.stage.name, case.name, case.seed))),
-        Verdict(case),
-    )
-    usual = ground.undisturbed(stage)
-    damaged: list[Damaged] = []
+def run_trial(workspace: Workspace, case: Case) -> TrialResult:
+    """Inject the fault, rerun the stage until it completes, compare its content."""
+    rng = random.Random(repr((case.stage.name, case.name, case.seed)))
+    result = TrialResult(case)
+    baseline = workspace.baseline(case.stage)
+    damaged: list[DamagedFile] = []
     if case.kind in KILLS:
-        _kill(ground, case, rng, verdict)
+        _inject_kills(workspace, case, rng, result)
     elif case.kind in STORAGE:
-        ground.prepare(stage)
-        _spoil_operation(ground, case, rng, usual, verdict)
+        workspace.prepare(case.stage)
+        _inject_storage_fault(workspace, case, rng, baseline, result)
     else:
-        damaged = _damage(ground, case, rng, verdict)
-    _bring_to_its_end(ground, case, usual, verdict, damaged)
-    return verdict
+        damaged = _inject_damage(workspace, case, rng, result)
+    _rerun_until_complete(workspace, case, baseline, result, damaged)
+    return result
 
 
-def _spread(ground: Ground, case: Case, rng: random.Random) -> bool:
-    """Whether Ray's workers do it where one process could."""
-    return not case.stage.alone or (rng.random() < 0.5 and not ground.quick)
+def _is_distributed(workspace: Workspace, case: Case, rng: random.Random) -> bool:
+    """Whether Ray's workers run the stage, for a stage that could run in one process."""
+    return not case.stage.in_process or (rng.random() < 0.5 and not workspace.quick)
 
 
-def _kill(ground: Ground, case: Case, rng: random.Random, verdict: Verdict) -> None:
-    """Up to three kills at random moments, of workers; one of the driver or of the cluster.
+def _inject_kills(
+    workspace: Workspace, case: Case, rng: random.Random, result: TrialResult
+) -> None:
+    """Up to three kills of workers at random moments; one of the driver or of the cluster.
 
-    A run that is over before the first of them tells how long it takes, and another one is begun.
+    A run that ends before the first kill gives its duration, and another run is started.
     """
-    spread = not case.kind.startswith("driver") or _spread(ground, case, rng)
-    own = case.kind.startswith("cluster")
-    extent = ground.seconds(case.stage, spread) + (6.0 if own else 0.0)
+    distributed = not case.kind.startswith("driver") or _is_distributed(workspace, case, rng)
+    own_cluster = case.kind.startswith("cluster")
+    duration = workspace.seconds(case.stage, distributed) + (6.0 if own_cluster else 0.0)
     kills = 3 if case.kind.startswith("worker") else 1
-    for _ in range(TRIES):
-        ground.prepare(case.stage)
-        job = ground.start(case.stage, spread, own_cluster=own)
-        for moment in sorted(rng.uniform(0, extent) for _ in range(kills)):
+    for _ in range(MAX_RERUNS):
+        workspace.prepare(case.stage)
+        job = workspace.start(case.stage, distributed, own_cluster=own_cluster)
+        for moment in sorted(rng.uniform(0, duration) for _ in range(kills)):
             if job.wait(moment):
                 break
-            while not (victims := ground.victims(job, case.kind)) and not job.wait(
+            while not (victims := workspace.victims(job, case.kind)) and not job.wait(
                 job.seconds + 0.02
             ):
                 pass
-            verdict.faults += bool(victims) and strike(rng.choice(victims), KILLS[case.kind])
-        ended = job.end(ground.patience(case.stage))
-        _judge_run(verdict, ended)
-        if verdict.faults:
+            result.faults += bool(victims) and send_signal(rng.choice(victims), KILLS[case.kind])
+        ended = job.end(workspace.timeout_s(case.stage))
+        _record_run(result, ended)
+        if result.faults:
             return
-        extent = min(extent, ended.seconds)
+        duration = min(duration, ended.seconds)
 
 
-def _spoil_operation(
-    ground: Ground, case: Case, rng: random.Random, usual: Undisturbed, verdict: Verdict
+def _inject_storage_fault(
+    workspace: Workspace,
+    case: Case,
+    rng: random.Random,
+    baseline: Baseline,
+    result: TrialResult,
 ) -> None:
-    count = max(1, usual.operations[STORAGE[case.kind]])
-    at = rng.randrange(count)
-    ground.arm(case.kind, at)
-    ended = ground.run(case.stage, spread=_spread(ground, case, rng))
-    verdict.faults += ground.disarm()[STORAGE[case.kind]] > at
-    _judge_run(verdict, ended)
+    operation = STORAGE[case.kind]
+    at = rng.randrange(max(1, baseline.operations[operation]))
+    workspace.arm(case.kind, at)
+    ended = workspace.run(case.stage, distributed=_is_distributed(workspace, case, rng))
+    result.faults += workspace.disarm()[operation] > at
+    _record_run(result, ended)
 
 
-def _damage(ground: Ground, case: Case, rng: random.Random, verdict: Verdict) -> list[Damaged]:
-    """Spoil a file: of the input, before a run or during it; of the finished output; of what a
-    killed run left.
-    """
+def _inject_damage(
+    workspace: Workspace, case: Case, rng: random.Random, result: TrialResult
+) -> list[DamagedFile]:
+    """Damage a file: of the input, before or during a run; of the finished or unfinished output."""
     stage = case.stage
-    ground.prepare(stage, without=case.place != "output")
-    if case.place == "input":
-        during = rng.random() < 0.5
-        folder = ground.here / rng.choice(stage.reads)
-        job = ground.start(stage, spread=False) if during else None
+    workspace.prepare(stage, with_output=case.target == "output")
+    if case.target == "input":
+        during_run = rng.random() < 0.5
+        folder = workspace.folder / rng.choice(stage.reads)
+        job = workspace.start(stage, distributed=False) if during_run else None
         if job is not None:
-            job.wait(rng.uniform(0, ground.seconds(stage, False)))
-        spoilt = damage(folder, case.kind, rng, PASSED_OVER)
-        ended = (
-            job.end(ground.patience(case.stage))
-            if job is not None
-            else ground.run(stage, spread=False)
-        )
-        _judge_run(verdict, ended)
-        verdict.found = "by default" if ended.code else ""
+            job.wait(rng.uniform(0, workspace.seconds(stage, False)))
+        damaged = damage_file(folder, case.kind, rng, IGNORED)
+        if job is not None:
+            ended = job.end(workspace.timeout_s(stage))
+        else:
+            ended = workspace.run(stage, distributed=False)
+        _record_run(result, ended)
+        result.detected = "by default" if ended.code else ""
     else:
-        if case.place == "unfinished output":
-            job = ground.start(stage, spread=False)
-            job.wait(rng.uniform(0.5, 1.0) * ground.seconds(stage, False))
-            strike(job.pid, signal.SIGKILL)
-            _judge_run(verdict, job.end(ground.patience(case.stage)))
-        spoilt = damage(ground.here / stage.writes, case.kind, rng, PASSED_OVER)
-    verdict.faults += spoilt is not None
-    return [spoilt] if spoilt is not None else []
+        if case.target == "unfinished output":
+            job = workspace.start(stage, distributed=False)
+            job.wait(rng.uniform(0.5, 1.0) * workspace.seconds(stage, False))
+            send_signal(job.pid, signal.SIGKILL)
+            _record_run(result, job.end(workspace.timeout_s(stage)))
+        damaged = damage_file(workspace.folder / stage.writes, case.kind, rng, IGNORED)
+    result.faults += damaged is not None
+    return [damaged] if damaged is not None else []
 
 
-def _bring_to_its_end(
-    ground: Ground, case: Case, usual: Undisturbed, verdict: Verdict, damaged: list[Damaged]
+def _rerun_until_complete(
+    workspace: Workspace,
+    case: Case,
+    baseline: Baseline,
+    result: TrialResult,
+    damaged: list[DamagedFile],
 ) -> None:
-    """Run the same command until it succeeds, doing what its sentences ask for, and compare."""
+    """Rerun the same command until it succeeds, applying remedies, and compare the content."""
     stage = case.stage
-    for _ in range(TRIES):
-        ended = ground.run(stage, spread=False)
-        _judge_run(verdict, ended)
+    for _ in range(MAX_RERUNS):
+        ended = workspace.run(stage, distributed=False)
+        _record_run(result, ended)
         if ended.code != 0:
-            verdict.found = verdict.found or "by default"
-            _mend(ground, case, ended, damaged)
+            result.detected = result.detected or "by default"
+            _apply_remedy(workspace, case, ended, damaged)
             continue
-        verdict.restart_seconds = max(0.0, ended.seconds - ground.seconds(stage, False))
-        wrong = _differences(ground, stage, usual)
-        if not any(wrong):
-            verdict.found = verdict.found or ("no difference" if damaged else "")
+        result.restart_seconds = max(0.0, ended.seconds - workspace.seconds(stage, False))
+        differences = _differences(workspace, stage, baseline)
+        if not any(differences):
+            result.detected = result.detected or ("no difference" if damaged else "")
             return
-        checked = _look_closely(ground, case, damaged)
-        if checked is None or (checked.code == 0 and any(_differences(ground, stage, usual))):
-            verdict.lost, verdict.doubled = wrong
+        verified = _verify(workspace, case, damaged)
+        if verified is None or (
+            verified.code == 0 and any(_differences(workspace, stage, baseline))
+        ):
+            result.lost, result.duplicated = differences
             return
-        verdict.found = "by --verify"
-        if checked.code == 0:  # and mended
+        result.detected = "by --verify"
+        if verified.code == 0:  # --verify repaired the output as well
             return
-        _mend(ground, case, checked, damaged)
-    verdict.lost = [f"no end after {TRIES} runs: {ended.said.strip().splitlines()[-1:]}"]
+        _apply_remedy(workspace, case, verified, damaged)
+    result.lost = [f"no end after {MAX_RERUNS} runs: {ended.output.strip().splitlines()[-1:]}"]
 
 
-def _look_closely(ground: Ground, case: Case, damaged: list[Damaged]) -> Ended | None:
-    """What the check of every byte says of damage that made a difference and went unseen; None
-    where there is no such check.
+def _verify(workspace: Workspace, case: Case, damaged: list[DamagedFile]) -> JobResult | None:
+    """Run the check of every byte, for damage that the stage missed; None if there is no check.
 
-    Of an input, the stage is begun anew on the same damage and told to look first.
+    For a damaged input, the stage is started again on the same damage, with its inputs verified.
     """
     if not damaged:
         return None
-    if case.place == "input":
-        ground.prepare(case.stage)
-        for one in damaged:
-            one.repeat()
-    elif case.stage.verify:
-        return ground.check(case.stage)
-    return ground.run(case.stage, spread=False, guarded=True) if case.stage.guard else None
+    if case.target == "input":
+        workspace.prepare(case.stage)
+        for file in damaged:
+            file.repeat()
+    elif case.stage.verify_output:
+        return workspace.verify_output(case.stage)
+    if not case.stage.verify_input:
+        return None
+    return workspace.run(case.stage, distributed=False, verified=True)
 
 
-def _mend(ground: Ground, case: Case, ended: Ended, damaged: list[Damaged]) -> None:
-    """What a sentence asks for: inputs are put back, outputs that it names are deleted."""
-    if case.place == "input":
-        for one in damaged:
-            one.restore()
+def _apply_remedy(
+    workspace: Workspace, case: Case, ended: JobResult, damaged: list[DamagedFile]
+) -> None:
+    """Apply an error message's remedy: restore inputs, delete the outputs that it names."""
+    if case.target == "input":
+        for file in damaged:
+            file.restore()
         return
-    folder = ground.here / case.stage.writes
-    said = re.sub(r"\s*\n\s*", "", ended.said) + " " + ended.said.replace("\n", " ")
-    if re.search(rf"delete {re.escape(str(folder))}(?![^ ;,])", said):
+    folder = workspace.folder / case.stage.writes
+    # The terminal wraps lines: a path may be cut by a line break, or end at one.
+    message = re.sub(r"\s*\n\s*", "", ended.output) + " " + ended.output.replace("\n", " ")
+    if re.search(rf"delete {re.escape(str(folder))}(?![^ ;,])", message):
         shutil.rmtree(folder)
     for path in sorted(folder.rglob("*"), reverse=True):
-        if path.is_file() and str(path) in said:
+        if path.is_file() and str(path) in message:
             path.unlink()
 
 
-def _differences(ground: Ground, stage: Stage, usual: Undisturbed) -> tuple[list[str], list[str]]:
-    """What is lost and what is doubled."""
+def _differences(
+    workspace: Workspace, stage: Stage, baseline: Baseline
+) -> tuple[list[str], list[str]]:
+    """Names of (lost, duplicated) content."""
     try:
-        got = stage.held(ground.here)
-    except Exception as error:  # what cannot be read is lost, whatever it raises
+        content = stage.read_content(workspace.folder)
+    except Exception as error:  # unreadable content is lost, whatever the exception
         return [f"{type(error).__name__}: {error}"], []
-    lost = [name for name, value in usual.content.items() if name not in got or got[name] != value]
-    return lost, [name for name in got if name not in usual.content]
+    lost = [
+        name
+        for name, value in baseline.content.items()
+        if name not in content or content[name] != value
+    ]
+    return lost, [name for name in content if name not in baseline.content]
 
 
-def _judge_run(verdict: Verdict, ended: Ended) -> None:
-    verdict.runs += 1
-    verdict.hangs += ended.code is None
-    if "Traceback (most recent call last)" in ended.said and ended.code not in (0, None):
-        verdict.unclear.append(ended.said.strip().splitlines()[-1])
+def _record_run(result: TrialResult, ended: JobResult) -> None:
+    result.runs += 1
+    result.hangs += ended.code is None
+    if "Traceback (most recent call last)" in ended.output and ended.code not in (0, None):
+        result.tracebacks.append(ended.output.strip().splitlines()[-1])

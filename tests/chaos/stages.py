@@ -1,6 +1,4 @@
-"""The stages of the road as a fault campaign sees them: a command, what it reads and writes, and
-what its content is.
-"""
+"""The stages of the campaign: each job's command, inputs, output, and the content to compare."""
 
 import hashlib
 import json
@@ -17,7 +15,7 @@ from model.checkpoint import loads
 from pipeline.index.searcher import Index
 
 Content = dict[str, Any]
-"What must be equal, by name."
+"What a rerun has to reproduce, by name."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,49 +25,48 @@ class Stage:
     name: str
     job: str
     reads: tuple[str, ...]
-    "Folders that it needs, of stages before it."
+    "Folders of earlier stages that it reads."
     writes: str
     arguments: str
-    spread: str
-    "What makes Ray's workers do it."
-    alone: str
-    "What makes one process do it; empty where it always asks Ray."
-    verify: str | None = None
-    """Arguments that check every byte of what it wrote; None where `guard` does, or running it
-    again."""
-    guard: str = ""
-    "Added to its arguments, has every byte checked first."
-    blind: tuple[str, ...] = ()
-    "Damage that nobody can know of, because no hash of the file was ever told: it is not tried."
+    distributed: str
+    "Arguments that have Ray's workers do the work."
+    in_process: str
+    "Arguments that have one process do the work; empty for a stage that always uses Ray."
+    verify_output: str | None = None
+    "Arguments that check every byte of the output; None if `verify_input` or a rerun does."
+    verify_input: str = ""
+    "Extra arguments that check every byte of the input first."
+    undetectable: tuple[str, ...] = ()
+    "Damage that no job can detect, because no hash of the file exists; not tried."
     content: Callable[[Path], Content]
 
-    def command(self, here: Path, spread: bool, guarded: bool = False) -> list[str]:
+    def command(self, folder: Path, distributed: bool, verified: bool = False) -> list[str]:
         words = (
             self.arguments,
-            self.spread if spread else self.alone,
-            self.guard if guarded else "",
+            self.distributed if distributed else self.in_process,
+            self.verify_input if verified else "",
         )
-        return " ".join(words).format(here=here).split()
+        return " ".join(words).format(here=folder).split()
 
-    def held(self, here: Path) -> Content:
-        return self.content(here / self.writes)
+    def read_content(self, folder: Path) -> Content:
+        return self.content(folder / self.writes)
 
 
-def files_of(folder: Path) -> Content:
+def file_hashes(folder: Path) -> Content:
     """The hash of every file."""
-    found = (
+    files = (
         path
         for path in sorted(folder.rglob("*"))
         if path.is_file() and not path.name.startswith(".")
     )
     return {
         str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in found
+        for path in files
     }
 
 
-def trained(folder: Path) -> Content:
-    """Weights, optimisers and losses; not how long a step took."""
+def training_content(folder: Path) -> Content:
+    """Weights, optimisers and losses; no durations."""
     checkpoint = loads((folder / "last.pt").read_bytes())
     found: Content = {"epoch": checkpoint.epoch, "locations": checkpoint.locations}
     for row in checkpoint.history:
@@ -90,8 +87,8 @@ def trained(folder: Path) -> Content:
     return found
 
 
-def searched(folder: Path) -> Content:
-    """What the index answers, and what it says that it holds."""
+def index_content(folder: Path) -> Content:
+    """The answers of the index, its size and its metadata."""
     index = Index(str(folder))
     queries = np.random.default_rng(0).standard_normal((20, index.dimension)).astype(np.float32)
     queries /= np.linalg.norm(queries, axis=1, keepdims=True)
@@ -106,8 +103,8 @@ def searched(folder: Path) -> Content:
     }
 
 
-def measured(folder: Path) -> Content:
-    """Every measure and every query's answers."""
+def evaluation_content(folder: Path) -> Content:
+    """All measures and every query's answers."""
     found: Content = {
         name: json.loads((folder / name).read_text())
         for name in ("metrics.json", "views.json", "parts.json")
@@ -118,74 +115,76 @@ def measured(folder: Path) -> Content:
 
 STAGES = (
     Stage(
-        # Its images are, like a user's, what packing takes the first hash of.
+        # Packing takes the first hashes of its images, as of a user's.
         name="simulate",
         job="simulate",
         reads=(),
         writes="flights",
-        alone="",
-        spread="",
-        blind=("output",),
-        content=files_of,
-        arguments="--out {here}/flights --train-locations 8 --test-locations 4 --distractors 4 --views 3 --size 64",
+        in_process="",
+        distributed="",
+        undetectable=("output",),
+        content=file_hashes,
+        arguments="--out {here}/flights --train-locations 8 --test-locations 4 --distractors 4 "
+        "--views 3 --size 64",
     ),
     Stage(
         name="pack",
         job="make_shards",
         reads=("flights",),
         writes="shards",
-        alone="--workers 0",
-        spread="--workers 2",
-        arguments="--source university1652 --root {here}/flights --out {here}/shards --samples-per-shard 4",
-        verify="--verify --out {here}/shards",
-        blind=("input bit flipped", "input deleted"),
-        content=files_of,
+        in_process="--workers 0",
+        distributed="--workers 2",
+        arguments="--source university1652 --root {here}/flights --out {here}/shards "
+        "--samples-per-shard 4",
+        verify_output="--verify --out {here}/shards",
+        undetectable=("input bit flipped", "input deleted"),
+        content=file_hashes,
     ),
     Stage(
         name="train",
         job="train",
         reads=("shards",),
         writes="run",
-        alone="--workers 0",
-        spread="--workers 1",
-        arguments="smoke --shards {here}/shards --out {here}/run --checkpoint-minutes 0 --keep 3 --epochs 2 "
-        "--batch-size 2 --part-dim 16 --discriminator-channels 16 --probe-epochs 0",
-        guard="--verify",
-        content=trained,
+        in_process="--workers 0",
+        distributed="--workers 1",
+        arguments="smoke --shards {here}/shards --out {here}/run --checkpoint-minutes 0 --keep 3 "
+        "--epochs 2 --batch-size 2 --part-dim 16 --discriminator-channels 16 --probe-epochs 0",
+        verify_input="--verify",
+        content=training_content,
     ),
     Stage(
         name="embed",
         job="embed_gallery",
         reads=("shards", "run"),
         writes="table",
-        alone="",
-        spread="--workers 2",
-        arguments="--shards {here}/shards --checkpoint {here}/run/last.pt --out {here}/table --batch-size 2 "
-        "--cpus-per-worker 1",
-        guard="--verify",
-        content=files_of,
+        in_process="",
+        distributed="--workers 2",
+        arguments="--shards {here}/shards --checkpoint {here}/run/last.pt --out {here}/table "
+        "--batch-size 2 --cpus-per-worker 1",
+        verify_input="--verify",
+        content=file_hashes,
     ),
     Stage(
         name="index",
         job="build_index",
         reads=("table",),
         writes="index",
-        alone="--workers 0",
-        spread="--workers 2",
+        in_process="--workers 0",
+        distributed="--workers 2",
         arguments="--table {here}/table --out {here}/index --factory IVF4,SQ8 --refine --parts 3",
-        verify="--verify --out {here}/index",
-        guard="--verify",
-        content=searched,
+        verify_output="--verify --out {here}/index",
+        verify_input="--verify",
+        content=index_content,
     ),
     Stage(
         name="evaluate",
         job="evaluate",
         reads=("table", "shards"),
         writes="evaluation",
-        alone="",
-        spread="--workers 2",
+        in_process="",
+        distributed="--workers 2",
         arguments="--table {here}/table --shards {here}/shards --out {here}/evaluation --panels 2",
-        guard="--verify",
-        content=measured,
+        verify_input="--verify",
+        content=evaluation_content,
     ),
 )

@@ -1,66 +1,77 @@
-"""The road survives what machines do to it: a short fault campaign over every stage, judged by
-content.
+"""The stages survive faults of machines: a short campaign over every stage, judged by content.
 
-benchmarks/chaos.py is the long one. What that found stands here first, by its seed.
+`python -m tests.chaos` is the long one. The faults that it found stand here first, by their seeds.
 """
 
 from collections.abc import Iterator
 
 import pytest
 
-from tests.chaos.campaign import Case, Verdict, cases, trial
-from tests.chaos.grounds import Ground, ground
+from tests.chaos.__main__ import line, table
+from tests.chaos.campaign import Case, TrialResult, cases, run_trial
 from tests.chaos.stages import STAGES, Stage
+from tests.chaos.workspace import Workspace, open_workspace
 
 FAULTS = 10
-"Per stage, besides those that once did harm."
-HARMED = {
-    ("pack", "read ends early"): 0,  # the image was refused for good
-    ("pack", "output bit flipped"): 1,  # a byte of a record table that --verify did not look at
-    ("train", "input bit flipped"): 0,  # other weights, without a word
-    ("train", "unfinished output bit flipped"): 0,  # training went on from other weights
+"Faults per stage, besides those of FOUND."
+FOUND = {
+    ("pack", "read ends early"): 0,  # the image was rejected for good
+    ("pack", "output bit flipped"): 1,  # a byte of a record table that --verify did not check
+    ("train", "input bit flipped"): 0,  # other weights, and no message
+    ("train", "unfinished output bit flipped"): 0,  # training resumed from other weights
     ("embed", "output bit flipped"): 0,  # the part passed for finished
     ("index", "input deleted"): 0,  # an index of fewer rows
-    ("index", "output deleted"): 0,  # complete, it said, and could not be mended by its own command
-    ("evaluate", "unfinished output bit flipped"): 0,  # what its sentence asked for did not help
+    ("index", "output deleted"): 0,  # passed for complete; its own command did not repair it
+    ("evaluate", "unfinished output bit flipped"): 0,  # the remedy of the message did not help
 }
-"Stage and fault -> seed."
+"(stage, fault) that once did harm -> seed."
 QUICK = ("worker", "driver", "read", "disk", "output", "input", "unfinished")
-"""The faults of the short campaign, in their order. A lost cluster takes longest, and Ray Train
-nearly so."""
+"First words of the short campaign's faults, in order. A lost cluster and Ray Train take longest."
 
 
 @pytest.fixture(scope="module")
-def here(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
-    with ground(tmp_path_factory.mktemp("chaos"), quick=True) as made:
-        yield made
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workspace]:
+    with open_workspace(tmp_path_factory.mktemp("chaos"), quick=True) as opened:
+        yield opened
 
 
-def chosen(stage: Stage) -> list[Case]:
-    """The trials of a stage in their order."""
-    harmed = [
+def short_campaign(stage: Stage) -> list[Case]:
+    """The cases of a stage in their order."""
+    found = [
         case
-        for (name, fault), seed in HARMED.items()
+        for (name, fault), seed in FOUND.items()
         if name == stage.name
         for case in cases(stage, seed)
         if case.name == fault
     ]
     quick = [case for word in QUICK for case in cases(stage, seed=1) if case.name.startswith(word)]
-    passed_over = {one.name for one in harmed}
+    skipped = {case.name for case in found}
     if stage.name == "train":
-        passed_over |= {"worker killed", "worker terminated"}
-    return harmed + [case for case in quick if case.name not in passed_over]
+        skipped |= {"worker killed", "worker terminated"}
+    return found + [case for case in quick if case.name not in skipped]
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.name)
-def test_a_stage_that_meets_faults_ends_with_what_an_undisturbed_one_writes(
-    here: Ground, stage: Stage
-) -> None:
-    here.undisturbed(stage)
-    verdicts = list[Verdict]()
-    for case in chosen(stage):
-        verdicts.append(trial(here, case))
-        if sum(verdict.faults for verdict in verdicts) >= FAULTS:
+def test_stage_after_faults_equals_undisturbed_run(workspace: Workspace, stage: Stage) -> None:
+    workspace.baseline(stage)
+    results = list[TrialResult]()
+    for case in short_campaign(stage):
+        results.append(run_trial(workspace, case))
+        if sum(result.faults for result in results) >= FAULTS:
             break
-    assert [verdict for verdict in verdicts if verdict.bad] == []
-    assert sum(verdict.faults for verdict in verdicts) >= min(FAULTS, len(verdicts) // 2)
+    assert [result for result in results if result.failed] == []
+    assert sum(result.faults for result in results) >= min(FAULTS, len(results) // 2)
+
+
+def test_long_campaign_prints_a_line_and_a_table_row() -> None:
+    case = Case(stage=STAGES[1], kind="driver killed", seed=3)
+    good = TrialResult(case, faults=1, runs=2, restart_seconds=0.5)
+    bad = TrialResult(case, faults=1, runs=2, lost=["a.tar"], detected="by default")
+    assert " ".join(line(good).split()) == (
+        "pack seed 3 driver killed faults 1 runs 2 restart 0.5 s"
+    )
+    assert line(bad).endswith("by default FAILED a.tar")
+    assert table([good, bad]).splitlines()[2:] == [
+        "| pack | driver killed | 2 | 4 | 1 | 0 | 0 | 0 | 1 / 0 | 0.2 |",
+        "| pack | all | 2 | 4 | 1 | 0 | 0 | 0 | 1 / 0 | 0.2 |",
+    ]

@@ -44,7 +44,13 @@ from pipeline.retrieval.results import INPUTS, METRICS, VIEWS, read_inputs, read
 from pipeline.shards import record_table
 from pipeline.shards.manifest import MANIFEST, Manifest, Shard, read_manifest
 from pipeline.shards.record_table import Packed
-from tests.damaging import MENDS, damages, found_or_equal, look_or_say_gone, sentence_of
+from tests.damaging import (
+    REMEDIES,
+    count_detected,
+    damaged_versions,
+    error_message,
+    raising_if_missing,
+)
 
 ROWS, DIMENSION = 40, 16
 
@@ -104,7 +110,7 @@ def look_at_table(part: Path) -> list[Any]:
 
 
 def test_a_damaged_part_of_a_table_is_refused_however_it_is_read(part: Path) -> None:
-    assert found_or_equal(part, lambda: look_at_table(part), 400) > 300
+    assert count_detected(part, lambda: look_at_table(part), 400) > 300
 
 
 def test_a_footer_is_held_against_the_seal_before_arrow_sees_it(part: Path) -> None:
@@ -120,7 +126,9 @@ def test_a_footer_is_held_against_the_seal_before_arrow_sees_it(part: Path) -> N
 
 
 def test_every_byte_of_a_part_is_looked_at_when_asked(part: Path) -> None:
-    assert found_or_equal(part, look_or_say_gone(part, lambda: verify_part(str(part))), 200) == 201
+    assert (
+        count_detected(part, raising_if_missing(part, lambda: verify_part(str(part))), 200) == 201
+    )
 
 
 def test_parts_without_seals_and_checksums_are_read_as_they_are(part: Path) -> None:
@@ -173,7 +181,7 @@ def test_a_damaged_record_part_is_refused_and_not_taken_for_done(tmp_path: Path)
         assert record_table.read_packed(str(tmp_path), shard.name) in (packed, None)
         return record_table.read_part(str(tmp_path), shard.name).to_pylist()
 
-    assert found_or_equal(path, look, 300) > 200
+    assert count_detected(path, look, 300) > 200
 
 
 def test_a_damaged_list_of_what_was_refused_is_named(tmp_path: Path) -> None:
@@ -182,11 +190,11 @@ def test_a_damaged_list_of_what_was_refused_is_named(tmp_path: Path) -> None:
     )
     path = tmp_path / rejections.REJECTED_FILE
     good = path.read_bytes()
-    for data in damages(good, 100):
+    for data in damaged_versions(good, 100):
         if data is None:
             continue
         path.write_bytes(data)
-        said = sentence_of(
+        said = error_message(
             lambda: rejections.write_rejections(
                 str(tmp_path), [Rejection(path="d", reason="e", found="f")], keep=True
             )
@@ -195,7 +203,7 @@ def test_a_damaged_list_of_what_was_refused_is_named(tmp_path: Path) -> None:
             assert len(pq.read_table(path)) == 2
         else:
             assert str(path) in said
-            assert MENDS.search(said)
+            assert REMEDIES.search(said)
 
 
 def test_a_damaged_list_of_a_table_is_named_and_written_again(tmp_path: Path) -> None:
@@ -203,9 +211,9 @@ def test_a_damaged_list_of_a_table_is_named_and_written_again(tmp_path: Path) ->
     write_rejected(str(tmp_path), rows)
     path = tmp_path / "_rejected" / "rejected.parquet"
 
-    look = look_or_say_gone(path, lambda: read_rejected(str(tmp_path)).to_pylist())
-    assert found_or_equal(path, look, 100) > 80
-    for data in damages(path.read_bytes(), 30, seed=1):
+    look = raising_if_missing(path, lambda: read_rejected(str(tmp_path)).to_pylist())
+    assert count_detected(path, look, 100) > 80
+    for data in damaged_versions(path.read_bytes(), 30, seed=1):
         path.write_bytes(data or b"")
         write_rejected(str(tmp_path), rows)
         assert len(read_rejected(str(tmp_path))) == 1
@@ -228,8 +236,8 @@ def test_a_damaged_manifest_is_refused(tmp_path: Path) -> None:
     )
     path = tmp_path / MANIFEST
     json_files.write_checksummed(str(path), asdict(manifest))
-    look = look_or_say_gone(path, lambda: asdict(read_manifest(str(tmp_path))))
-    assert found_or_equal(path, look, 400) > 300
+    look = raising_if_missing(path, lambda: asdict(read_manifest(str(tmp_path))))
+    assert count_detected(path, look, 400) > 300
 
 
 def test_a_damaged_index_json_is_refused(tmp_path: Path) -> None:
@@ -267,7 +275,7 @@ def test_a_damaged_index_json_is_refused(tmp_path: Path) -> None:
     write_metadata(str(tmp_path), facts)
     path = tmp_path / METADATA_FILE
     assert (
-        found_or_equal(path, look_or_say_gone(path, lambda: read_metadata(str(tmp_path))), 400)
+        count_detected(path, raising_if_missing(path, lambda: read_metadata(str(tmp_path))), 400)
         > 300
     )
 
@@ -301,8 +309,8 @@ def test_a_damaged_calibration_is_refused(tmp_path: Path) -> None:
     )
     path = tmp_path / "calibration.json"
     write_calibration(str(path), calibration)
-    look = look_or_say_gone(path, lambda: read_calibration(str(path), {"fingerprint": "f" * 64}))
-    assert found_or_equal(path, look, 400) > 300
+    look = raising_if_missing(path, lambda: read_calibration(str(path), {"fingerprint": "f" * 64}))
+    assert count_detected(path, look, 400) > 300
 
 
 def test_an_evaluation_is_read_back_as_it_was_written_or_not_at_all(tmp_path: Path) -> None:
@@ -322,8 +330,9 @@ def test_an_evaluation_is_read_back_as_it_was_written_or_not_at_all(tmp_path: Pa
     storage.write_json(str(tmp_path / METRICS), metrics)
     for name, listed in ((METRICS, METRICS), (VIEWS, VIEWS)):
         read = partial(read_rows, str(tmp_path), listed)
-        assert found_or_equal(tmp_path / name, read, 200) == 201
+        assert count_detected(tmp_path / name, read, 200) == 201
     path = tmp_path / INPUTS
     assert (
-        found_or_equal(path, look_or_say_gone(path, lambda: read_inputs(str(tmp_path))), 200) > 150
+        count_detected(path, raising_if_missing(path, lambda: read_inputs(str(tmp_path))), 200)
+        > 150
     )

@@ -14,7 +14,7 @@ from pipeline.features.part import read_rejected
 from pipeline.features.table import open_table, read_footer
 from pipeline.shards.manifest import read_manifest
 from pipeline.shards.samples import read_shard
-from tests.damaging import say_again
+from tests.damaging import update_checksum
 
 
 def mean_colour_network(fingerprint: str = "f" * 64) -> EncoderSpec:
@@ -110,7 +110,7 @@ def test_an_image_that_cannot_be_decoded_is_left_out_and_told(
     data[start : start + 3] = b"\0\0\0"
     shutil.copytree(tiny_shards, tmp_path, dirs_exist_ok=True)
     (tmp_path / f"{shard.name}.tar").write_bytes(data)
-    say_again(tmp_path, shard.name)
+    update_checksum(tmp_path, shard.name)
     settings = EmbeddingSettings(
         shards=str(tmp_path), out=str(tmp_path / "table"), split=Split.QUERY, view=View.SATELLITE
     )

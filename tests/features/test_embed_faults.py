@@ -31,7 +31,7 @@ from pipeline.features.embed import (
 from pipeline.features.part import part_names, read_footer, read_rejected
 from pipeline.features.table import open_table, verify_table
 from pipeline.shards.manifest import Shard, read_manifest
-from tests.damaging import say_again
+from tests.damaging import update_checksum
 
 
 def network_of_colours(
@@ -115,7 +115,7 @@ def blacken(shards: Path, shard: Shard) -> None:
     data[member.offset_data : member.offset_data + member.size] = black
     before, after = (hashlib.sha256(image).hexdigest().encode() for image in (room, black))
     path.write_bytes(bytes(data).replace(before, after))
-    say_again(shards, shard.name)
+    update_checksum(shards, shard.name)
 
 
 def test_a_shard_that_kills_its_worker_is_set_aside_and_the_rest_is_done(
@@ -203,7 +203,7 @@ def test_a_shard_without_one_image_becomes_a_part_without_rows(
     shard = min(manifest.shards, key=lambda one: one.samples)
     tar = copied / f"{shard.name}.tar"
     tar.write_bytes(tar.read_bytes().replace(b"\xff\xd8\xff", b"\0\0\0"))
-    say_again(copied, shard.name)
+    update_checksum(copied, shard.name)
     total = sum(one.samples for one in manifest.shards)
     assert embed_gallery(settings_of(copied, out), network_of_colours()) == total
     footer = read_footer(storage.join(out, f"{shard.name}.parquet"))

@@ -17,7 +17,7 @@ from pipeline.index.build import IndexSettings, build_index
 from pipeline.index.searcher import Index
 from pipeline.index.units import checksum_ok, write_checksum
 from pipeline.index.update import extend_index, verify_index
-from tests.damaging import damages, found_or_equal, look_or_say_gone
+from tests.damaging import count_detected, damaged_versions, raising_if_missing
 from tests.index.index_tables import write_gallery
 
 
@@ -56,7 +56,7 @@ def test_a_damaged_file_of_an_index_is_refused_before_it_is_opened(
     name: str, table: str, built: Path, tmp_path: Path
 ) -> None:
     out = Path(shutil.copytree(built, tmp_path / "index"))
-    assert found_or_equal(out / name, lambda: answers(out, table), 40) == 41
+    assert count_detected(out / name, lambda: answers(out, table), 40) == 41
 
 
 def test_the_trained_index_is_looked_at_where_it_is_used(
@@ -64,7 +64,7 @@ def test_the_trained_index_is_looked_at_where_it_is_used(
 ) -> None:
     out = Path(shutil.copytree(built, tmp_path / "index"))
     path = out / "trained.faiss"
-    assert found_or_equal(path, lambda: verify_index(str(out)).rows, 20) == 21
+    assert count_detected(path, lambda: verify_index(str(out)).rows, 20) == 21
     good = path.read_bytes()
     path.write_bytes(good[:100] + bytes([good[100] ^ 1]) + good[101:])
     more = Path(shutil.copytree(table, tmp_path / "table"))
@@ -111,7 +111,7 @@ def test_damage_to_what_a_killed_build_left_costs_work_and_nothing_else(
         with pytest.raises(Killed):
             build_index(settings(table, left))
     good = (left / "_building" / name).read_bytes()
-    *_, cut = damages(good, 10)
+    *_, cut = damaged_versions(good, 10)
     for number, data in enumerate(
         (None, good[: len(good) // 2] + b"?" + good[len(good) // 2 + 1 :], cut)
     ):
@@ -129,10 +129,10 @@ def test_a_file_is_whole_as_long_as_it_is_what_was_vouched_for(tmp_path: Path) -
     path.write_bytes(np.random.default_rng(0).bytes(500))
     assert not checksum_ok(str(path))
     write_checksum(str(path))
-    look = look_or_say_gone(path, lambda: checksum_ok(str(path)))
+    look = raising_if_missing(path, lambda: checksum_ok(str(path)))
     assert look()
     good = path.read_bytes()
-    for data in damages(good, 40):
+    for data in damaged_versions(good, 40):
         if data is not None:
             path.write_bytes(data)
             assert checksum_ok(str(path)) == (data == good)

@@ -26,8 +26,8 @@ from model.pvda import FeatureEncoder
 from model.training import Training
 from pipeline.core import storage
 from pipeline.core.errors import Incomplete, InputError
-from tests.launcher import Job, Launcher
-from tests.processes import below, named, strike
+from tests.launcher import Launcher, RunningJob
+from tests.processes import command_line, descendants, send_signal
 
 TIMES = {"seconds", "images_per_second"}
 FLAGS = (
@@ -126,7 +126,7 @@ def test_a_run_that_was_killed_goes_on_to_the_same_bits(
 def test_a_process_killed_at_a_random_moment_and_run_again_ends_as_if_nothing_had_happened(
     tiny_shards: str, tmp_path: Path, prepared: Launcher
 ) -> None:
-    def begin(out: Path) -> Job:
+    def begin(out: Path) -> RunningJob:
         flags = (
             "--shards",
             tiny_shards,
@@ -190,9 +190,11 @@ def test_a_ray_worker_killed_is_replaced_and_the_run_goes_on_from_the_last_check
     def murder() -> None:
         while not (out / "last.pt").exists():
             time.sleep(0.01)
-        ours = below(os.getpid())  # another session's Ray may run on this machine
+        ours = descendants(os.getpid())  # another session's Ray may run on this machine
         victims.extend(
-            one for one in ours if "RayTrainWorker" in named(one) and strike(one, signal.SIGKILL)
+            one
+            for one in ours
+            if "RayTrainWorker" in command_line(one) and send_signal(one, signal.SIGKILL)
         )
 
     killer = threading.Thread(target=murder, daemon=True)

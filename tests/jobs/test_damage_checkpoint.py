@@ -12,7 +12,7 @@ import torch
 from model.checkpoint import SEAL_BYTES, Checkpoint, CheckpointError, dumps, loads, refuse_damaged
 from model.pvda import FeatureEncoder, PVDAConfig
 from model.weights.load import read_state_dict
-from tests.damaging import damages, found_or_equal, look_or_say_gone, sentence_of
+from tests.damaging import count_detected, damaged_versions, error_message, raising_if_missing
 
 
 @pytest.fixture
@@ -47,19 +47,19 @@ def plain(value: Any) -> Any:
 def test_a_damaged_checkpoint_is_refused(held: Checkpoint, tmp_path: Path) -> None:
     path = tmp_path / "last.pt"
     path.write_bytes(dumps(held))
-    look = look_or_say_gone(
+    look = raising_if_missing(
         path, lambda: plain(loads(path.read_bytes(), str(path))), CheckpointError
     )
-    assert found_or_equal(path, look, 120, CheckpointError) == 121
+    assert count_detected(path, look, 120, CheckpointError) == 121
 
 
 def test_damaged_bytes_of_the_zips_own_directory_are_found(held: Checkpoint) -> None:
     """No checksum of the zip covers them, and torch takes other weights for them without a word."""
     data = dumps(held)
     end = data[zipfile.ZipFile(BytesIO(data)).start_dir :]
-    for number, damaged in enumerate(damages(end, 300)):
+    for number, damaged in enumerate(damaged_versions(end, 300)):
         if damaged is not None and damaged != end:
-            said = sentence_of(
+            said = error_message(
                 partial(refuse_damaged, data[: -len(end)] + damaged, "x"), CheckpointError
             )
             assert said is not None, number
@@ -89,11 +89,11 @@ def test_others_read_a_sealed_checkpoint(held: Checkpoint, tmp_path: Path) -> No
 def test_damaged_weights_to_start_from_are_refused(held: Checkpoint, tmp_path: Path) -> None:
     path = tmp_path / "resnet.pth"
     torch.save(held.encoder_weights, path)
-    look = look_or_say_gone(path, lambda: plain(read_state_dict(str(path))), CheckpointError)
+    look = raising_if_missing(path, lambda: plain(read_state_dict(str(path))), CheckpointError)
     good, expected, refused = path.read_bytes(), look(), 0
     for place in range(len(good) // 2, len(good) // 2 + 40):
         path.write_bytes(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :])
-        refused += sentence_of(look, CheckpointError) is not None
+        refused += error_message(look, CheckpointError) is not None
     assert refused == 40
     path.write_bytes(good)
     assert look() == expected

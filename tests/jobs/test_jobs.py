@@ -10,7 +10,7 @@ from pathlib import Path
 import faiss
 import pytest
 
-from tests.launcher import Ended, Launcher
+from tests.launcher import JobResult, Launcher
 
 ROOT = Path(__file__).parents[2]
 JOBS = [
@@ -31,7 +31,7 @@ JOBS = [
 def test_every_job_has_help(prepared: Launcher, job: str) -> None:
     ended = prepared.start(job, ["--help"]).end()
     assert ended.code == 0
-    assert "--out" in ended.said
+    assert "--out" in ended.output
 
 
 def test_every_job_runs_as_a_module_too() -> None:
@@ -142,8 +142,8 @@ def test_a_wrong_call_gets_a_sentence_and_exit_code_2(
 ) -> None:
     ended = prepared.start(job, [argument.format(tmp_path) for argument in arguments]).end()
     assert ended.code == 2
-    assert said in ended.said
-    assert "Traceback" not in ended.said
+    assert said in ended.output
+    assert "Traceback" not in ended.output
     assert not (tmp_path / "o").exists()
 
 
@@ -154,7 +154,7 @@ def test_the_road_by_command_lines_and_again(
     and says so.
     """
 
-    def forked(job: str, *arguments: object) -> Ended:
+    def forked(job: str, *arguments: object) -> JobResult:
         return prepared.start(job, list(map(str, arguments)), RAY_ADDRESS=ray_address).end()
 
     run, table, index, out = (tmp_path / name for name in ("run", "table", "index", "evaluation"))
@@ -173,7 +173,7 @@ def test_the_road_by_command_lines_and_again(
     ]
     for job, arguments in calls:
         ended = forked(job, *arguments)
-        assert ended.code == 0, ended.said
+        assert ended.code == 0, ended.output
     packing = [
         "--source",
         "university1652",
@@ -186,8 +186,8 @@ def test_the_road_by_command_lines_and_again(
     ]
     for job, arguments in [("make_shards", packing), *calls]:
         ended = forked(job, *arguments)
-        assert ended.code == 0, ended.said
-        assert "nothing to do" in ended.said
+        assert ended.code == 0, ended.output
+        assert "nothing to do" in ended.output
     assert faiss.read_index(str(index / "index.faiss")).ntotal == 5
     metrics = json.loads((out / "metrics.json").read_text())
     assert [(row["task"], row["multi_query"]) for row in metrics] == [
@@ -236,4 +236,4 @@ def test_the_road_by_command_lines_and_again(
         table,
     )
     assert mixed.code == 2
-    assert "choose another --out" in mixed.said
+    assert "choose another --out" in mixed.output

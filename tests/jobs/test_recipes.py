@@ -189,9 +189,9 @@ def test_recipe_paper_trains_a_whole_resnet50_from_torchvisions_weights(
         str(tmp_path / "resnet50.pth"),
     ]
     ended = prepared.start("train", ["paper", *paths, *small, "--workers", "0"]).end()
-    assert ended.code == 0, ended.said
-    assert "recipe paper, 4 changed (*)" in ended.said
-    assert "*image_size=128 (not 256)" in ended.said
+    assert ended.code == 0, ended.output
+    assert "recipe paper, 4 changed (*)" in ended.output
+    assert "*image_size=128 (not 256)" in ended.output
     checkpoint = loads((tmp_path / "run" / "last.pt").read_bytes())
     shutil.rmtree(tmp_path / "run")  # hundreds of megabytes, which pytest would keep
     assert (checkpoint.network.depth, checkpoint.network.width, checkpoint.network.parts) == (

@@ -248,7 +248,7 @@ def test_a_job_that_is_stopped_says_so_leaves_nothing_running_and_goes_on(
     assert "Traceback" not in log.read_text()
     assert wait_for(lambda: not running(mark), LINGERS), running(mark)
     ended = prepared.start(job.split()[0], arguments, RAY_ADDRESS="local").end()
-    assert ended.code == 0, ended.said
+    assert ended.code == 0, ended.output
 
 
 def test_ctrl_c_while_the_libraries_are_imported_says_so_too(tmp_path: Path) -> None:

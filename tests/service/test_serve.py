@@ -33,7 +33,7 @@ from pipeline.service import replicas
 from pipeline.service.engine import NotReady
 from pipeline.service.replicas import Replica
 from tests.jobs.test_photo_encoder import facts, photo
-from tests.processes import below, named
+from tests.processes import command_line, descendants
 
 ROOT = Path(__file__).parents[2]
 
@@ -114,7 +114,7 @@ def wait_ready(address: str) -> dict[str, Any]:
 def replica_of(process: subprocess.Popen[str]) -> int:
     """The process number of the service's replica, by the name that Ray gives it."""
     name = f"ray::ServeReplica:pvda-{process.pid}:Replica"
-    return next(one for one in below(os.getpid()) if named(one).startswith(name))
+    return next(one for one in descendants(os.getpid()) if command_line(one).startswith(name))
 
 
 def serve_actors() -> list[str]:

@@ -24,7 +24,13 @@ from pipeline.shards.pack import PackingSettings, pack
 from pipeline.shards.samples import read_shard
 from pipeline.shards.verify import check_shard, verify
 from pipeline.sources.university1652 import University1652
-from tests.damaging import MENDS, damages, found_or_equal, look_or_say_gone, sentence_of
+from tests.damaging import (
+    REMEDIES,
+    count_detected,
+    damaged_versions,
+    error_message,
+    raising_if_missing,
+)
 
 SOURCE = University1652()
 
@@ -80,11 +86,11 @@ def a_shard(out: Path) -> tuple[Shard, Path]:
 
 def test_verification_and_embedding_find_each_damage_of_a_tar(out: Path) -> None:
     shard, tar = a_shard(out)
-    look = look_or_say_gone(
+    look = raising_if_missing(
         tar, lambda: list(read_shard(str(out), shard.name, shard.split, shard.view, shard.sha256))
     )
-    assert found_or_equal(tar, look, 200) == 201
-    for data in damages(tar.read_bytes(), 60, seed=1):
+    assert count_detected(tar, look, 200) == 201
+    for data in damaged_versions(tar.read_bytes(), 60, seed=1):
         tar.write_bytes(data or b"")
         assert any(str(tar) in sentence for sentence in check_shard(str(out), shard))
 
@@ -99,14 +105,14 @@ def test_training_refuses_a_damaged_tar_or_leaves_the_damaged_image_out(out: Pat
         return list(TrainingStream(str(out), reading).epoch(0))
 
     expected = batches()
-    for data in damages(good, 100):
+    for data in damaged_versions(good, 100):
         if data is None or len(data) != len(good):
             continue
         tar.write_bytes(data)
         found: list[Any] = []
-        told = sentence_of(lambda found=found: found.extend(batches()))  # type: ignore[misc]
+        told = error_message(lambda found=found: found.extend(batches()))  # type: ignore[misc]
         refused += told is not None
-        assert told is None or ("shards" in told and MENDS.search(told)), told
+        assert told is None or ("shards" in told and REMEDIES.search(told)), told
         for now, then in zip(
             (b for pair in found for b in pair),
             (b for pair in expected for b in pair),
