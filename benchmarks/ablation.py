@@ -29,9 +29,10 @@ from torch import Tensor
 
 from jobs.training.probes import view_gap
 from jobs.training.recipes import RECIPES, Recipe, smoke
+from model.config import Optimization
 from model.inference.embed import embed
-from model.schedule import phase
-from model.training import Optimisation, Training
+from model.schedule import schedule_at
+from model.training import Training
 from model.weights.load import load_backbone
 from pipeline.batches.ordered import decode_samples
 from pipeline.batches.training import StreamConfig, TrainingStream
@@ -40,9 +41,11 @@ from pipeline.images.transforms import Augmentation
 from pipeline.retrieval.metrics import summarise
 from pipeline.retrieval.ranking import Side, rank, side_of_array
 from pipeline.shards.manifest import read_manifest
-from pipeline.shards.pack import PackingSettings, pack
+from pipeline.shards.pack import pack
 from pipeline.shards.samples import read_shard
-from pipeline.simulation.simulate import SimulationSettings, simulate
+from pipeline.shards.settings import PackingSettings
+from pipeline.simulation.settings import SimulationSettings
+from pipeline.simulation.simulate import simulate
 from pipeline.sources.university1652 import University1652
 
 Watch = Callable[[Training, int, dict[str, float]], None]
@@ -56,7 +59,7 @@ VARIED = ("period", "alpha_scale", "discriminator_rate", "other_sensor", "joint_
 "Arguments that a row of the results is for, beside recipe and seed."
 
 
-def scaled(name: str, period: int, alpha_scale: float, discriminator_rate: float) -> Recipe:
+def scaled(name: str, period: int, alpha_scale: float, discriminator_lr: float) -> Recipe:
     """A recipe of the paper with its schedule shrunk to four periods of `period` epochs, on the
     small network.
     """
@@ -74,17 +77,17 @@ def scaled(name: str, period: int, alpha_scale: float, discriminator_rate: float
         decay_epochs=tuple(shrunk(epoch) for epoch in of_paper.decay_epochs),
     )
     # The paper's rates of the encoder times ten: a thirtieth of its steps have to do.
-    rates = Optimisation(
-        backbone_rate=0.01,
-        head_rate=0.1,
-        classifier_rate=0.1,
-        discriminator_rate=discriminator_rate,
+    rates = Optimization(
+        backbone_lr=0.01,
+        head_lr=0.1,
+        classifier_lr=0.1,
+        discriminator_lr=discriminator_lr,
     )
     return replace(
         smoke(),
         name=name,
         schedule=schedule,
-        optimisation=rates,
+        optimization=rates,
         augmentation=Augmentation(pad=4, rotation=180),
     )
 
@@ -189,7 +192,7 @@ def run(recipe: Recipe, shards: str, backbone: dict[str, Tensor] | None, watch: 
     stream = TrainingStream(shards, reading)
     training = Training(
         recipe.network,
-        recipe.optimisation,
+        recipe.optimization,
         len(stream.classes),
         adversary=recipe.adversary,
         joint_bn=recipe.joint_bn,
@@ -199,7 +202,7 @@ def run(recipe: Recipe, shards: str, backbone: dict[str, Tensor] | None, watch: 
     for epoch in range(recipe.schedule.epochs):
         sums: dict[str, float] = {}
         for step, (drone, satellite) in enumerate(stream.epoch(epoch)):
-            now = phase(recipe.schedule, epoch + step / stream.steps)
+            now = schedule_at(recipe.schedule, epoch + step / stream.steps)
             images = [torch.from_numpy(batch.images_B3HW) for batch in (drone, satellite)]
             labels = [torch.from_numpy(batch.location_B) for batch in (drone, satellite)]
             for name, value in training.step(
@@ -263,7 +266,7 @@ def main() -> None:
             known = {"recipe": name, "seed": seed} | varied
             if any(known.items() <= row.items() for row in rows):
                 continue
-            recipe = scaled(name, given.period, given.alpha_scale, given.discriminator_rate)
+            recipe = scaled(name, given.period, given.alpha_scale, given.discriminator_lr)
             recipe = replace(recipe, seed=seed, joint_bn=given.joint_bn)
             began, curve = time.monotonic(), []
 

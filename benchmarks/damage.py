@@ -19,8 +19,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import torch
 
-from model.checkpoint import Checkpoint, dumps, refuse_damaged
-from model.pvda import FeatureEncoder, PVDAConfig
+from model.checkpoint import Checkpoint, check_integrity, dumps
+from model.config import PVDAConfig
+from model.pvda import FeatureEncoder
 from pipeline.core import parquet as parquet_files
 from pipeline.features.part import (
     PAGE_BYTES,
@@ -142,11 +143,11 @@ def checkpoint() -> None:
     data = dumps(
         Checkpoint(
             network=PVDAConfig(depth=50), recipe={}, locations=[], epoch=1, history=[],
-            state={"modules": {"encoder": weights}, "optimisers": momentum},
+            state={"modules": {"encoder": weights}, "optimizers": momentum},
         )
     )  # fmt: skip
     plain = seconds(lambda: torch.load(io.BytesIO(data), weights_only=True))
-    look = seconds(lambda: refuse_damaged(data, "it"))
+    look = seconds(lambda: check_integrity(data, "it"))
     megabytes = len(data) / 1e6
     print(
         f"a checkpoint of {megabytes:.0f} MB: looked at in {look:.3f} s, {100 * look / megabytes:.3f} s per 100 MB"

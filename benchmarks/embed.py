@@ -15,10 +15,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model.checkpoint import load_encoder
-from model.inference.embed import FastEncoder, Precision, embed
+from model.config import PVDAConfig
+from model.inference.embed import FastEncoder, embed
 from model.inference.int8 import PrecisionError
-from model.inference.optimise import LEAST_COSINE, make_fast
-from model.pvda import FeatureEncoder, PVDAConfig
+from model.inference.optimise import MIN_COSINE, optimise_encoder
+from model.inference.precision import Precision
+from model.pvda import FeatureEncoder
 
 CHOICES: dict[str, tuple[Precision, bool]] = {
     "folded": ("float32", False),
@@ -84,15 +86,15 @@ def encoders(encoder: FeatureEncoder, arguments: argparse.Namespace) -> None:
         "plain": lambda images: embed(plain, images.to(device), mirror)
     }
     made: dict[str, FastEncoder] = {}
-    asked = dict(LEAST_COSINE)
-    LEAST_COSINE.update(
+    asked = dict(MIN_COSINE)
+    MIN_COSINE.update(
         {"bfloat16": -1, "int8": -1}
     )  # what would be refused is timed too, and said to be so
     for name in arguments.ways:
         precision, compiled = CHOICES[name]
         start = time.perf_counter()
         try:
-            made[name] = ways[name] = make_fast(
+            made[name] = ways[name] = optimise_encoder(
                 plain,
                 precision=precision,
                 mirror=mirror,

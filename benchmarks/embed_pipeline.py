@@ -23,18 +23,15 @@ import numpy as np
 import ray
 from synthetic import jpegs
 
-from jobs.encoding.encoder import (
-    CALIBRATION_IMAGES,
-    PROBE_IMAGES,
-    EncoderSettings,
-    make_encoder_spec,
-)
+from jobs.encoding.encoder import CALIBRATION_IMAGES, PROBE_IMAGES, make_encoder_spec
+from jobs.encoding.settings import EncoderSettings
 from model.checkpoint import Checkpoint, dumps
-from model.pvda import FeatureEncoder, PVDAConfig
+from model.config import PVDAConfig
+from model.pvda import FeatureEncoder
 from pipeline.core import cluster
 from pipeline.core.records import Split, View
-from pipeline.features.embed import EmbeddingSettings
 from pipeline.features.embed_worker import IN_FLIGHT, EmbedJob, EncoderSpec, ShardEmbedder
+from pipeline.features.settings import EmbeddingSettings
 from pipeline.shards.manifest import Shard
 
 SOURCE_SIDE = 512

@@ -34,7 +34,7 @@ from synthetic import jpegs
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from jobs.encoding.encoder import EncoderSettings
+from jobs.encoding.settings import EncoderSettings
 from model.checkpoint import build_encoder, loads
 from pipeline.core import cluster
 from pipeline.core.arrays import Floats

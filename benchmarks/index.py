@@ -22,9 +22,10 @@ import numpy as np
 
 from pipeline.core.records import Split
 from pipeline.features.table import Floats, PartFooter, PartRows, open_table, write_part
-from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.build import build_index
 from pipeline.index.recall import RECALL_QUERIES, exact_search
 from pipeline.index.searcher import Index
+from pipeline.index.settings import IndexSettings
 
 PART_ROWS = 16_384
 IMAGES_OF_PLACE = 20

@@ -31,10 +31,12 @@ from pipeline.core import cluster, storage
 from pipeline.core.arrays import Doubles
 from pipeline.core.geo import haversine_m
 from pipeline.core.records import Split, View
-from pipeline.features.embed import EmbeddingSettings, embed_gallery
+from pipeline.features.embed import embed_gallery
+from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table
-from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.build import build_index
 from pipeline.index.searcher import Index
+from pipeline.index.settings import IndexSettings
 from pipeline.locate.calibrate import CalibrationExample
 from pipeline.locate.calibration import Calibration
 from pipeline.locate.calibration_data import LabelledImages, make_examples
@@ -48,8 +50,10 @@ from pipeline.locate.reliability import (
     reliability_diagram,
 )
 from pipeline.locate.track import TRACK_CANDIDATES, TrackStart
-from pipeline.shards.pack import PackingSettings, pack
-from pipeline.simulation.simulate import SimulationSettings, simulate
+from pipeline.shards.pack import pack
+from pipeline.shards.settings import PackingSettings
+from pipeline.simulation.settings import SimulationSettings
+from pipeline.simulation.simulate import simulate
 from pipeline.sources.university1652 import University1652
 
 SPEED, WITHIN_M = 15.0, 25.0

@@ -21,7 +21,8 @@ import numpy as np
 from PIL import Image
 
 from pipeline.core import cluster
-from pipeline.shards.pack import PackingSettings, pack
+from pipeline.shards.pack import pack
+from pipeline.shards.settings import PackingSettings
 from pipeline.sources.university1652 import University1652
 
 PER_LOCATION = 50

@@ -17,11 +17,11 @@ import numpy as np
 import torch
 from PIL import Image
 
-from jobs.training.checkpoints import Run
-from jobs.training.loop import Place, Tensors, Worker
+from jobs.training.loop import BatchTensors, Worker, WorkerContext
 from jobs.training.recipes import Recipe, paper, smoke
+from jobs.training.settings import RunConfig
 from model.losses import adversarial_terms, location_terms
-from model.schedule import Phase
+from model.schedule import ScheduleState
 from pipeline.core import storage
 from pipeline.core.records import ImageRecord, Split, View
 from pipeline.shards.manifest import MANIFEST, Manifest
@@ -29,7 +29,7 @@ from pipeline.shards.plan import ShardPlan
 from pipeline.shards.writer import write_shard
 from pipeline.sources.university1652 import University1652
 
-NOW = Phase(alpha=0.9, rate_scale=0.01)
+NOW = ScheduleState(alpha=0.9, lr_scale=0.01)
 ROUNDS = 3
 "Streamed and resident steps take turns, so that whatever else the machine does meets both."
 
@@ -83,7 +83,7 @@ def streamed(worker: Worker, epoch: int, steps: int) -> tuple[float, float]:
     return (finished(worker.training.device) - began) / steps, waited / steps
 
 
-def resident(worker: Worker, batch: Tensors, steps: int) -> float:
+def resident(worker: Worker, batch: BatchTensors, steps: int) -> float:
     """Seconds of a step on a batch that is on the device."""
     began = finished(worker.training.device)
     for _ in range(steps):
@@ -91,12 +91,12 @@ def resident(worker: Worker, batch: Tensors, steps: int) -> float:
     return (finished(worker.training.device) - began) / steps
 
 
-def step(worker: Worker, batch: Tensors) -> None:
+def step(worker: Worker, batch: BatchTensors) -> None:
     images, labels, _ = batch
     worker.training.step(images[0], labels[0], images[1], labels[1], NOW)
 
 
-def parts(worker: Worker, batch: Tensors, steps: int) -> dict[str, float]:
+def parts(worker: Worker, batch: BatchTensors, steps: int) -> dict[str, float]:
     """Seconds of each part of a step: the same computations, one after the other and each waited
     for.
     """
@@ -128,10 +128,10 @@ def parts(worker: Worker, batch: Tensors, steps: int) -> dict[str, float]:
             loss = adversarial_terms(*verdict_B2.tensor_split([len(maps1_BCHW)])).sum()
             [pushed] = torch.autograd.grad(loss, both_BCHW, retain_graph=True)
         with part("encoder"):
-            training.optimisers[0].zero_grad(set_to_none=True)
+            training.optimizers[0].zero_grad(set_to_none=True)
             torch.autograd.backward([located, both_BCHW], [None, NOW.alpha * pushed])
         with part("optimiser"):
-            training.optimisers[0].step()
+            training.optimizers[0].step()
     return spent
 
 
@@ -139,8 +139,8 @@ def measure(name: str, recipe: Recipe, side: int, steps: int, device: str, compi
     wanted = recipe.batch_size * (steps + 2)
     with tempfile.TemporaryDirectory() as folder:
         shards = made_shards(folder, side, wanted)
-        run = Run(shards=shards, out=folder, recipe=recipe, compile=compiled)
-        worker = Worker(run, Place(device=device), lambda told: print(told["note"]))
+        run = RunConfig(shards=shards, out=folder, recipe=recipe, compile=compiled)
+        worker = Worker(run, WorkerContext(device=device), lambda told: print(told["note"]))
         batch = next(iter(worker.batches(0)))
         resident(worker, batch, 3)  # warm
         rounds = [

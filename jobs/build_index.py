@@ -10,7 +10,8 @@ import sys
 import tyro
 
 from jobs.command_line.cli import run
-from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.build import build_index
+from pipeline.index.settings import IndexSettings
 from pipeline.index.update import extend_index, remove_locations, verify_index
 
 

@@ -26,22 +26,27 @@ from jobs.locate import Settings as LocateSettings
 from jobs.locate import locate_photos
 from jobs.train import Settings as TrainSettings
 from jobs.train import train
-from jobs.training.checkpoints import Run
-from jobs.training.loop import untrained
+from jobs.training.loop import initial_checkpoint
 from jobs.training.recipes import smoke
+from jobs.training.settings import RunConfig
 from pipeline.core import cluster, storage
 from pipeline.core.errors import InputError
 from pipeline.core.progress import console, results
 from pipeline.core.records import Split, View
-from pipeline.evaluation.evaluate import EvaluationSettings, evaluate
-from pipeline.features.embed import EmbeddingSettings, embed_gallery
+from pipeline.evaluation.evaluate import evaluate
+from pipeline.evaluation.settings import EvaluationSettings
+from pipeline.features.embed import embed_gallery
+from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table
-from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.build import build_index
 from pipeline.index.searcher import Index
+from pipeline.index.settings import IndexSettings
 from pipeline.locate.geojson import LocatedPhoto
 from pipeline.locate.page import LatLon, distance_to_m, format_distance
-from pipeline.shards.pack import PackingSettings, pack
-from pipeline.simulation.simulate import SimulationSettings, simulate
+from pipeline.shards.pack import pack
+from pipeline.shards.settings import PackingSettings
+from pipeline.simulation.settings import SimulationSettings
+from pipeline.simulation.simulate import simulate
 from pipeline.sources.university1652 import University1652
 
 
@@ -95,7 +100,9 @@ def demo(settings: Settings) -> list[dict[str, Any]]:
         checkpoint = train(TrainSettings(recipe=recipe, shards=shards, out=trained))
         start = storage.join(out, "untrained.pt")
         if not storage.exists(start):
-            storage.write_bytes(start, untrained(Run(shards=shards, out=trained, recipe=recipe)))
+            storage.write_bytes(
+                start, initial_checkpoint(RunConfig(shards=shards, out=trained, recipe=recipe))
+            )
     rows: dict[str, list[dict[str, Any]]] = {}
     for number, (name, file) in enumerate({"untrained": start, "trained": checkpoint}.items()):
         table, results = (

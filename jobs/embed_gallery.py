@@ -5,9 +5,11 @@ TABLE`.
 from dataclasses import dataclass, fields
 
 from jobs.command_line.cli import run
-from jobs.encoding.encoder import EncoderSettings, make_encoder_spec, read_checkpoint_bytes
+from jobs.encoding.encoder import make_encoder_spec, read_checkpoint_bytes
+from jobs.encoding.settings import EncoderSettings
 from pipeline.core import storage
-from pipeline.features.embed import EmbeddingSettings, embed_gallery
+from pipeline.features.embed import embed_gallery
+from pipeline.features.settings import EmbeddingSettings
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,8 @@ from rich.table import Table
 from jobs.command_line.cli import run
 from pipeline.core.progress import results
 from pipeline.evaluation.compare import ABLATION, TABLE
-from pipeline.evaluation.evaluate import EvaluationSettings, evaluate
+from pipeline.evaluation.evaluate import evaluate
+from pipeline.evaluation.settings import EvaluationSettings
 from pipeline.report.inputs import read_besides
 from pipeline.retrieval.parts import part_label
 

@@ -6,7 +6,8 @@ Takes the file that University-1652's test.py and its descendants save (pytorch_
 
 from jobs.command_line.cli import run
 from pipeline.core.progress import console
-from pipeline.features.import_mat import ImportSettings, import_features
+from pipeline.features.import_mat import import_features
+from pipeline.features.settings import ImportSettings
 
 
 def main(settings: ImportSettings) -> None:

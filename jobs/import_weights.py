@@ -16,10 +16,12 @@ import torch
 from torch import Tensor
 
 from jobs.command_line.cli import run
-from model.checkpoint import Checkpoint, CheckpointError, dumps, loads
+from model.checkpoint import Checkpoint, dumps, loads
+from model.errors import CheckpointError
 from model.weights.lpn import convert_lpn
-from model.pvda import FeatureEncoder, PVDAConfig
-from model.weights.load import TORCHVISION, load_backbone, measure_backbone, parse_state_dict
+from model.pvda import FeatureEncoder
+from model.config import PVDAConfig
+from model.weights.load import TORCHVISION_HINT, load_backbone, infer_backbone, parse_state_dict
 from pipeline.core import storage
 from pipeline.core.progress import console
 from pipeline.core.errors import InputError
@@ -62,7 +64,7 @@ def import_weights(settings: Settings) -> str:
     """
     if not storage.exists(settings.source):
         expected = (
-            TORCHVISION
+            TORCHVISION_HINT
             if settings.kind == "torchvision"
             else "the net_*.pth of a training run of the LPN code"
         )
@@ -79,7 +81,7 @@ def import_weights(settings: Settings) -> str:
     }
     out = storage.absolute(settings.out)
     if storage.exists(out):
-        refuse_others(out, made_of)
+        require_same_origin(out, made_of)
         console.print(f"{out} is complete: made of {settings.source}; nothing to do")
         return out
     convert: Callable[..., Checkpoint] = (
@@ -100,7 +102,7 @@ def import_weights(settings: Settings) -> str:
     return out
 
 
-def refuse_others(out: str, made_of: dict[str, Any]) -> None:
+def require_same_origin(out: str, made_of: dict[str, Any]) -> None:
     """Raise InputError where `out` is anything but a checkpoint made of the same."""
     try:
         held = loads(storage.read_bytes(out), out).recipe.get("made_of")
@@ -118,7 +120,7 @@ def from_torchvision(
     """The paper's encoder before training: torchvision's backbone, a refinement of random numbers,
     no classifier.
     """
-    depth, width = measure_backbone(state, settings.source)
+    depth, width = infer_backbone(state, settings.source)
     network = PVDAConfig(depth=depth, width=width, image_size=settings.image_size)
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(0)  # the same file gives the same embeddings
@@ -127,7 +129,7 @@ def from_torchvision(
     console.print(
         "the refinement of the rings is untrained: train before judging by the embeddings"
     )
-    return imported(network, {"encoder": encoder.state_dict()}, [], made_of)
+    return make_checkpoint(network, {"encoder": encoder.state_dict()}, [], made_of)
 
 
 def from_lpn(state: dict[str, Tensor], settings: Settings, made_of: dict[str, Any]) -> Checkpoint:
@@ -142,10 +144,10 @@ def from_lpn(state: dict[str, Tensor], settings: Settings, made_of: dict[str, An
     # names.
     digits = len(str(converted.locations - 1))
     names = [f"unnamed-{number:0{digits}}" for number in range(converted.locations)]
-    return imported(converted.network, converted.modules, names, made_of)
+    return make_checkpoint(converted.network, converted.modules, names, made_of)
 
 
-def imported(
+def make_checkpoint(
     network: PVDAConfig,
     modules: dict[str, dict[str, Tensor]],
     locations: list[str],

@@ -15,7 +15,8 @@ from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.progress import console
 from pipeline.shards import record_table
 from pipeline.shards.manifest import read_manifest
-from pipeline.shards.pack import PackingSettings, pack
+from pipeline.shards.pack import pack
+from pipeline.shards.settings import PackingSettings
 from pipeline.shards.verify import verify as verify_shards
 from pipeline.sources import SOURCES
 from pipeline.sources.base import Source

@@ -13,7 +13,7 @@ from aiohttp import web
 
 from jobs.command_line.cli import run
 from jobs.encoding.photo_encoder import PhotoEncoder
-from model.checkpoint import CheckpointError
+from model.errors import CheckpointError
 from pipeline.core import cluster, storage
 from pipeline.core.cluster import plan_placement
 from pipeline.core.errors import InputError

@@ -3,7 +3,8 @@ N`.
 """
 
 from jobs.command_line.cli import run
-from pipeline.simulation.simulate import SimulationSettings, simulate
+from pipeline.simulation.settings import SimulationSettings
+from pipeline.simulation.simulate import simulate
 
 
 def main(settings: SimulationSettings) -> None:

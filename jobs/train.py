@@ -16,18 +16,26 @@ from typing import TYPE_CHECKING, Any
 import torch
 import tyro
 from ray.exceptions import RayActorError
-from ray.train import RunConfig, ScalingConfig, WorkerGroupError, get_context
+from ray.train import RunConfig as RayRunConfig
+from ray.train import ScalingConfig, WorkerGroupError, get_context
 from ray.train.torch import TorchTrainer, get_device
 from ray.util.queue import Empty, Queue
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 from jobs.command_line.cli import run
-from jobs.training.config_table import show_config
+from jobs.training.config_table import print_config
 from jobs.training.recipes import RECIPES, Recipe
-from jobs.training.checkpoints import CHECKPOINT, Conduct, Run, find_checkpoint
-from jobs.training.loop import Damage, Found, Place, open_stream, train_worker
-from model.checkpoint import CheckpointError
+from jobs.training.checkpoints import CHECKPOINT_FILE, find_checkpoint
+from jobs.training.settings import RunOptions, RunConfig
+from jobs.training.loop import (
+    DamageCount,
+    FoundCheckpoint,
+    WorkerContext,
+    open_stream,
+    train_worker,
+)
+from model.errors import CheckpointError
 from model.pvda import FeatureEncoder
 from model.weights.load import load_backbone, read_state_dict
 from pipeline.core import cluster, storage
@@ -47,12 +55,12 @@ else:  # the command line's subcommands: a recipe by name, each of its settings 
         prefix_names=False,
     )
 
-SECONDS_TO_LISTEN = 1.0
+QUEUE_POLL_S = 1.0
 "For which the queue of what workers tell is asked before it is asked again."
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settings(Conduct):
+class Settings(RunOptions):
     """What is trained on what, and by how many."""
 
     recipe: RecipeChoice
@@ -78,10 +86,10 @@ class Settings(Conduct):
             raise InputError(f"--workers is {self.workers}, expected 0 (this process) or more")
 
     @property
-    def run(self) -> Run:
+    def run(self) -> RunConfig:
         """The run as every worker is told of it."""
-        conduct = {field.name: getattr(self, field.name) for field in fields(Conduct)}
-        return Run(
+        conduct = {field.name: getattr(self, field.name) for field in fields(RunOptions)}
+        return RunConfig(
             shards=storage.absolute(self.shards),
             out=storage.absolute(self.out),
             recipe=self.recipe,
@@ -97,7 +105,7 @@ def train(settings: Settings) -> str:
     Raises InputError or CheckpointError on unusable input, before any worker starts.
     """
     this = settings.run
-    path = storage.join(this.out, CHECKPOINT)
+    path = storage.join(this.out, CHECKPOINT_FILE)
     found, epochs = find_checkpoint(this, console.print), settings.recipe.schedule.epochs
     done, step = (found[1].epoch, found[1].step) if found is not None else (0, 0)
     if done == epochs:
@@ -109,7 +117,7 @@ def train(settings: Settings) -> str:
         require_intact(this.shards, None if settings.workers else 0)
     else:
         require_tars(this.shards, read_manifest(this.shards).of(Split.TRAIN))
-    steps = open_stream(this, Place(world=max(1, settings.workers))).steps
+    steps = open_stream(this, WorkerContext(world=max(1, settings.workers))).steps
     if this.weights is not None and found is None:
         load_backbone(
             FeatureEncoder(this.recipe.network).backbone,
@@ -120,7 +128,7 @@ def train(settings: Settings) -> str:
         within = f" and {step} of {steps} steps" if step else ""
         console.print(f"going on after epoch {done} of {epochs}{within}")
     del found  # as large as the networks and their optimisers
-    show_config(
+    print_config(
         settings.recipe,
         shards=this.shards,
         out=this.out,
@@ -134,14 +142,14 @@ def train(settings: Settings) -> str:
             device = (
                 "cuda" if torch.cuda.is_available() and settings.gpus_per_worker != 0 else "cpu"
             )
-            train_worker(this, Place(device=device), lambda told: show(meter, told))
+            train_worker(this, WorkerContext(device=device), lambda told: show_report(meter, told))
         else:
             train_on_ray(this, settings, meter)
     console.print(f"trained: {path}")
     return path
 
 
-def train_on_ray(this: Run, settings: Settings, meter: Meter) -> None:
+def train_on_ray(this: RunConfig, settings: Settings, meter: Meter) -> None:
     """Train with Ray Train's workers. When one dies, the group is started again and goes on from
     the last checkpoint.
 
@@ -179,7 +187,7 @@ def train_on_ray(this: Run, settings: Settings, meter: Meter) -> None:
             )
 
 
-def train_group(this: Run, scaling: ScalingConfig, cpus: int, meter: Meter) -> None:
+def train_group(this: RunConfig, scaling: ScalingConfig, cpus: int, meter: Meter) -> None:
     """Train with one group of workers; what they tell comes back through a queue.
 
     Raises what a worker gave as the reason why no other group would fare better, WorkerGroupError
@@ -194,22 +202,22 @@ def train_group(this: Run, scaling: ScalingConfig, cpus: int, meter: Meter) -> N
         scaling_config=scaling,
         # Ray Train's own records: our checkpoints are written by rank 0, so that they are the same
         # with and without Ray.
-        run_config=RunConfig(name="ray", storage_path=this.out),
+        run_config=RayRunConfig(name="ray", storage_path=this.out),
     )
     try:
         trainer.fit()
     except (WorkerGroupError, RayActorError):
-        hang_up(told, listener)  # all has been heard
+        stop_listener(told, listener)  # all has been heard
         if refused:
             raise refused[0] from None
         raise
     finally:
-        hang_up(told, listener)
+        stop_listener(told, listener)
         with suppress(RayActorError):
             told.shutdown()
 
 
-def hang_up(told: Queue, listener: threading.Thread) -> None:
+def stop_listener(told: Queue, listener: threading.Thread) -> None:
     """Let the listener hear what is still in the queue, and end. Where the queue's actor was lost,
     it has ended already.
     """
@@ -236,9 +244,11 @@ def ray_worker(config: dict[str, Any]) -> None:
     told, rank, world = config["told"], context.get_world_rank(), context.get_world_size()
     if device.type == "cuda":
         torch.cuda.set_device(device)
-    place = Place(rank=rank, world=world, device=str(device))
+    place = WorkerContext(rank=rank, world=world, device=str(device))
     if world > 1:
-        place = replace(place, distribute=distribute, share=share, gather=gather)
+        place = replace(
+            place, distribute=wrap_ddp, share=broadcast_checkpoint, gather=gather_damage
+        )
     try:
         train_worker(config["run"], place, told.put if rank == 0 else lambda facts: None)
     except (Incomplete, InputError, CheckpointError) as error:
@@ -246,22 +256,22 @@ def ray_worker(config: dict[str, Any]) -> None:
         raise
 
 
-def distribute(module: nn.Module) -> nn.Module:
+def wrap_ddp(module: nn.Module) -> nn.Module:
     # BatchNorm's running statistics stay each worker's own during training (rank 0's are kept):
     # broadcasting them would write into buffers between the two forward passes of one step.
     return DistributedDataParallel(module, broadcast_buffers=False)
 
 
-def share(found: Found) -> Found:
+def broadcast_checkpoint(found: FoundCheckpoint) -> FoundCheckpoint:
     """What rank 0 found."""
     held = [found]
     torch.distributed.broadcast_object_list(held, src=0)
     return held[0]
 
 
-def gather(damage: Damage) -> list[Damage]:
+def gather_damage(damage: DamageCount) -> list[DamageCount]:
     """What each worker found, by rank."""
-    held: list[Damage] = [(0, None)] * torch.distributed.get_world_size()
+    held: list[DamageCount] = [(0, None)] * torch.distributed.get_world_size()
     torch.distributed.all_gather_object(held, damage)
     return held
 
@@ -275,7 +285,7 @@ def listen(told: Queue, meter: Meter, refused: list[Exception]) -> None:
         try:
             # With an end: an actor that SIGTERM has told to go waits for what it was asked, and
             # answers nobody meanwhile.
-            facts = told.get(timeout=SECONDS_TO_LISTEN)
+            facts = told.get(timeout=QUEUE_POLL_S)
         except Empty:
             continue
         except RayActorError:
@@ -283,10 +293,10 @@ def listen(told: Queue, meter: Meter, refused: list[Exception]) -> None:
         if facts and "refused" in facts:
             refused.append(facts["refused"])
         elif facts:
-            show(meter, facts)
+            show_report(meter, facts)
 
 
-def show(meter: Meter, told: dict[str, Any]) -> None:
+def show_report(meter: Meter, told: dict[str, Any]) -> None:
     facts = dict(told)
     if "note" in facts:
         meter.note(facts["note"])

@@ -17,19 +17,15 @@ from typing import Any
 
 import torch
 
-from model.pvda import FeatureEncoder, PVDAConfig
+from model.config import PVDAConfig
+from model.errors import CheckpointError
+from model.pvda import FeatureEncoder
 from model.weights import torch_files
 
 FORMAT = 1
-SEAL = re.compile(rb"pvda\.seal:([0-9a-f]{64}):pvda\.seal")
-MARK = b"pvda.seal"
-SEAL_BYTES = 2 * (len(MARK) + 1) + 64
-
-
-class CheckpointError(ValueError):
-    """A file that is not a checkpoint of ours. The message says what was found, what was expected
-    and what to do.
-    """
+CHECKSUM_PATTERN = re.compile(rb"pvda\.seal:([0-9a-f]{64}):pvda\.seal")
+CHECKSUM_MARK = b"pvda.seal"
+CHECKSUM_BYTES = 2 * (len(CHECKSUM_MARK) + 1) + 64
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -68,9 +64,9 @@ def dumps(checkpoint: Checkpoint) -> bytes:
     buffer = io.BytesIO()
     torch.save(plain, buffer)
     buffer.seek(-2, io.SEEK_END)  # the length of the zip's comment, which is none
-    buffer.write(SEAL_BYTES.to_bytes(2, "little"))
+    buffer.write(CHECKSUM_BYTES.to_bytes(2, "little"))
     digest = hashlib.sha256(buffer.getbuffer()).hexdigest().encode()
-    buffer.write(b":".join([MARK, digest, MARK]))
+    buffer.write(b":".join([CHECKSUM_MARK, digest, CHECKSUM_MARK]))
     return buffer.getvalue()
 
 
@@ -79,7 +75,7 @@ def loads(data: bytes, name: str = "the checkpoint") -> Checkpoint:
 
     Raises CheckpointError.
     """
-    refuse_damaged(data, name)
+    check_integrity(data, name)
     try:
         plain = torch_files.read(data)
         if plain.pop("format") != FORMAT:
@@ -87,7 +83,7 @@ def loads(data: bytes, name: str = "the checkpoint") -> Checkpoint:
         network = PVDAConfig(**json.loads(plain.pop("network")))
         recipe, history = json.loads(plain.pop("recipe")), json.loads(plain.pop("history"))
         held = Checkpoint(network=network, recipe=recipe, history=history, **plain)
-        _refuse_strange(held)
+        _check_fields(held)
         return held
     # torch raises many kinds over a damaged file, struct.error and IndexError among them
     except Exception as error:
@@ -97,21 +93,21 @@ def loads(data: bytes, name: str = "the checkpoint") -> Checkpoint:
         ) from error
 
 
-def refuse_damaged(data: bytes, name: str) -> None:
+def check_integrity(data: bytes, name: str) -> None:
     """Raise CheckpointError where the bytes of a checkpoint, or of any file of torch.save's, are
     not what was written.
 
     0.1 s per 100 MB. Of bytes that are no zip nothing is said.
     """
     view = memoryview(data)
-    seal = SEAL.fullmatch(view[-SEAL_BYTES:])
+    seal = CHECKSUM_PATTERN.fullmatch(view[-CHECKSUM_BYTES:])
     if seal is not None:
-        whole = hashlib.sha256(view[:-SEAL_BYTES]).hexdigest().encode() == seal[1]
+        whole = hashlib.sha256(view[:-CHECKSUM_BYTES]).hexdigest().encode() == seal[1]
         reason = "its bytes have not the hash at its end"
-    elif MARK in data[-SEAL_BYTES:]:
+    elif CHECKSUM_MARK in data[-CHECKSUM_BYTES:]:
         whole, reason = False, "the hash at its end is damaged"
     elif data[:2] == b"PK":
-        whole, reason = _zip_is_whole(data)
+        whole, reason = _zip_is_intact(data)
     else:
         return
     if not whole:
@@ -121,17 +117,17 @@ def refuse_damaged(data: bytes, name: str) -> None:
         )
 
 
-def _zip_is_whole(data: bytes) -> tuple[bool, str]:
+def _zip_is_intact(data: bytes) -> tuple[bool, str]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as held:
-            torch_files.refuse_packed(held, len(data))
+            torch_files.require_uncompressed(held, len(data))
             bad = held.testzip()
     except Exception as error:  # zipfile raises many kinds over a damaged directory
         return False, f"{type(error).__name__}"
     return bad is None, f"the checksum of {bad} in it is another"
 
 
-def _refuse_strange(held: Checkpoint) -> None:
+def _check_fields(held: Checkpoint) -> None:
     """Raise ValueError where a field is of another type, or the weights are of another network than
     is said.
 

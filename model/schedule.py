@@ -44,15 +44,15 @@ class Schedule:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Phase:
+class ScheduleState:
     """What holds at one moment of training."""
 
     alpha: float
-    rate_scale: float
+    lr_scale: float
     "Every learning rate is its start times this."
 
 
-def phase(schedule: Schedule, epoch: float) -> Phase:
+def schedule_at(schedule: Schedule, epoch: float) -> ScheduleState:
     """Alpha and learning-rate scale after `epoch` passes; fractions of an epoch matter to warm-up
     and cosine only.
     """
@@ -67,4 +67,4 @@ def phase(schedule: Schedule, epoch: float) -> Phase:
     if epoch < schedule.warmup_epochs:
         scale *= epoch / schedule.warmup_epochs
     # Ten digits, so that 0.9 + 2 * 0.1 prints and compares as 1.1.
-    return Phase(alpha=round(alpha, 10), rate_scale=scale)
+    return ScheduleState(alpha=round(alpha, 10), lr_scale=scale)

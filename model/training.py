@@ -6,45 +6,23 @@ locations.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
 from torch.optim import SGD, Adam, AdamW, Optimizer
 
+from model.config import Optimization, Precision, PVDAConfig
 from model.losses import adversarial_terms, feature_loss, location_terms, view_terms
-from model.pvda import FeatureEncoder, LocationClassifier, PVDAConfig, ViewDiscriminator
-from model.schedule import Phase
+from model.pvda import FeatureEncoder, LocationClassifier, ViewDiscriminator
+from model.schedule import ScheduleState
 
 Module = TypeVar("Module", bound=nn.Module)
 VIEWS = ("drone", "satellite")
-Precision = Literal["auto", "float32", "bfloat16"]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Optimisation:
-    """How the weights are moved. The defaults are the paper's."""
-
-    kind: Literal["sgd", "adamw"] = "sgd"
-    """Of the encoder and classifier: SGD with Nesterov momentum [LPN], or AdamW for short runs from
-    scratch."""
-    backbone_rate: float = 0.001
-    "Learning rate of the backbone [paper]."
-    head_rate: float = 0.01
-    "Learning rate of the rings' refinement [paper]."
-    classifier_rate: float = 0.01
-    "Learning rate of the location classifier [paper]."
-    discriminator_rate: float = 0.002
-    "Learning rate of D, which Adam moves [paper]."
-    momentum: float = 0.9
-    "Of SGD [LPN]."
-    weight_decay: float = 5e-4
-    "Of encoder and classifier [LPN]; D has none [chosen]."
-
-
-class Learner(nn.Module):
+class EncoderWithClassifier(nn.Module):
     """Encoder and classifier as one module: one forward pass an iteration, which is what DDP wants
     to see.
 
@@ -86,7 +64,7 @@ class Training:
     def __init__(
         self,
         config: PVDAConfig,
-        optimisation: Optimisation,
+        optimization: Optimization,
         locations: int,
         *,
         adversary: bool = True,
@@ -101,22 +79,24 @@ class Training:
         self.bfloat16 = precision == "bfloat16" or (
             precision == "auto" and self.device.type == "cuda"
         )
-        self.learner = _placed(Learner(config, locations, joint_bn), self.device, sync_bn)
+        self.learner = _to_device(
+            EncoderWithClassifier(config, locations, joint_bn), self.device, sync_bn
+        )
         self.discriminator: ViewDiscriminator | None = None
         if adversary:
             discriminator = ViewDiscriminator(config, self.learner.encoder.backbone.channels)
-            self.discriminator = _placed(discriminator, self.device, sync_bn)
+            self.discriminator = _to_device(discriminator, self.device, sync_bn)
         for module in self.modules.values():
             module.train()
-        self.not_compiled = (
+        self.compile_error = (
             None if compile_for is None else self._compile(config.image_size, compile_for)
         )
         "Why the networks are not compiled though they should be."
         self._learner = distribute(self.learner)
         self._discriminator = None if self.discriminator is None else distribute(self.discriminator)
-        self.optimisers = self._optimisers(optimisation)
+        self.optimizers = self._optimisers(optimization)
 
-    def _optimisers(self, rates: Optimisation) -> list[Optimizer]:
+    def _optimisers(self, rates: Optimization) -> list[Optimizer]:
         """Of encoder and classifier, and of D where there is one; every group knows the rate that
         it starts with.
         """
@@ -125,11 +105,11 @@ class Training:
             return {"params": list(module.parameters()), "start": rate, "name": name}
 
         groups = [
-            group("backbone", self.learner.encoder.backbone, rates.backbone_rate),
-            group("head", self.learner.encoder.refine, rates.head_rate),
-            group("classifier", self.learner.classifier, rates.classifier_rate),
+            group("backbone", self.learner.encoder.backbone, rates.backbone_lr),
+            group("head", self.learner.encoder.refine, rates.head_lr),
+            group("classifier", self.learner.classifier, rates.classifier_lr),
         ]
-        optimisers: list[Optimizer] = [
+        optimizers: list[Optimizer] = [
             SGD(
                 groups,
                 lr=0.0,
@@ -141,10 +121,10 @@ class Training:
             else AdamW(groups, lr=0.0, weight_decay=rates.weight_decay)
         ]
         if self.discriminator is not None:
-            optimisers.append(
-                Adam([group("discriminator", self.discriminator, rates.discriminator_rate)], lr=0.0)
+            optimizers.append(
+                Adam([group("discriminator", self.discriminator, rates.discriminator_lr)], lr=0.0)
             )
-        return optimisers
+        return optimizers
 
     @property
     def modules(self) -> dict[str, nn.Module]:
@@ -162,7 +142,7 @@ class Training:
         """Learning rates in force, by group."""
         return {
             group["name"]: group["lr"]
-            for optimiser in self.optimisers
+            for optimiser in self.optimizers
             for group in optimiser.param_groups
         }
 
@@ -172,7 +152,7 @@ class Training:
         location1_B: Tensor,
         images2_B3HW: Tensor,
         location2_B: Tensor,
-        now: Phase,
+        now: ScheduleState,
     ) -> dict[str, Tensor]:
         """One iteration: D takes a step on Eq. 2, then encoder and classifier one on Eq. 4.
 
@@ -181,16 +161,16 @@ class Training:
         detached scalars that are still on the device: each loss, whole and by view (and ring), how
         often D was right, and the length of each network's gradient.
         """
-        for optimiser in self.optimisers:
+        for optimiser in self.optimizers:
             for group in optimiser.param_groups:
-                group["lr"] = group["start"] * now.rate_scale
+                group["lr"] = group["start"] * now.lr_scale
         with self._autocast():
             maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = self._learner(
                 images1_B3HW, images2_B3HW
             )
         located_VP = location_terms(logits1_BPL, location1_B, logits2_BPL, location2_B)
         total = located_VP.sum()
-        measures = {"location_loss": total} | _named("location_loss", located_VP)
+        measures = {"location_loss": total} | _by_view("location_loss", located_VP)
         if self.discriminator is not None:
             both_BCHW = torch.cat([maps1_BCHW, maps2_BCHW])
             measures |= self.discriminate(both_BCHW.detach(), len(maps1_BCHW))
@@ -202,17 +182,17 @@ class Training:
             adversarial_V = adversarial_terms(*verdict_B2.tensor_split([len(maps1_BCHW)]))
             adversarial = adversarial_V.sum()
             total = feature_loss(total, adversarial, now.alpha)
-            measures |= {"adversarial_loss": adversarial} | _named(
+            measures |= {"adversarial_loss": adversarial} | _by_view(
                 "adversarial_loss", adversarial_V
             )
-        self.optimisers[0].zero_grad(set_to_none=True)
+        self.optimizers[0].zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
         for name, module in (
             ("encoder", self.learner.encoder),
             ("classifier", self.learner.classifier),
         ):
             measures[f"gradient_norm/{name}"] = gradient_norm(module)
-        self.optimisers[0].step()
+        self.optimizers[0].step()
         return {name: measure.detach() for name, measure in measures.items()}
 
     def discriminate(self, both_BCHW: Tensor, drones: int) -> dict[str, Tensor]:
@@ -223,18 +203,20 @@ class Training:
         verdicts = verdict_B2.tensor_split([drones])
         terms_V = view_terms(*verdicts)
         loss = terms_V.sum()
-        self.optimisers[1].zero_grad(set_to_none=True)
+        self.optimizers[1].zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         norm = gradient_norm(self._discriminator)
-        self.optimisers[1].step()
+        self.optimizers[1].step()
         right_V = [
             (verdict_B2.argmax(1) == view).float() for view, verdict_B2 in enumerate(verdicts)
         ]
         return (
             {"view_loss": loss, "discriminator_accuracy": torch.cat(right_V).mean()}
             | {"gradient_norm/discriminator": norm}
-            | _named("view_loss", terms_V)
-            | _named("discriminator_accuracy", torch.stack([right_B.mean() for right_B in right_V]))
+            | _by_view("view_loss", terms_V)
+            | _by_view(
+                "discriminator_accuracy", torch.stack([right_B.mean() for right_B in right_V])
+            )
         )
 
     def _compile(self, size: int, count: int) -> str | None:
@@ -275,15 +257,15 @@ class Training:
         """
         return {
             "modules": {name: module.state_dict() for name, module in self.modules.items()},
-            "optimisers": [optimiser.state_dict() for optimiser in self.optimisers],
+            "optimizers": [optimiser.state_dict() for optimiser in self.optimizers],
             "rng": torch.get_rng_state(),
         }
 
-    def load_state(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on where `state` was taken."""
         for name, module in self.modules.items():
             module.load_state_dict(state["modules"][name])
-        for optimiser, held in zip(self.optimisers, state["optimisers"], strict=True):
+        for optimiser, held in zip(self.optimizers, state["optimizers"], strict=True):
             optimiser.load_state_dict(held)
         torch.set_rng_state(state["rng"])
 
@@ -295,13 +277,13 @@ def gradient_norm(module: nn.Module) -> Tensor:
     )
 
 
-def _placed(module: Module, device: torch.device, sync_bn: bool) -> Module:
+def _to_device(module: Module, device: torch.device, sync_bn: bool) -> Module:
     if sync_bn:
         module = nn.SyncBatchNorm.convert_sync_batchnorm(module)  # type: ignore[no-untyped-call]
     return module.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
-def _named(name: str, terms: Tensor) -> dict[str, Tensor]:
+def _by_view(name: str, terms: Tensor) -> dict[str, Tensor]:
     """The terms of a measure by view (V,), and by ring where it has any (V, P)."""
     if terms.dim() == 1:
         return {f"{name}/{view}": term for view, term in zip(VIEWS, terms.unbind(), strict=True)}
@@ -310,4 +292,4 @@ def _named(name: str, terms: Tensor) -> dict[str, Tensor]:
         for view, terms_P in zip(VIEWS, terms.unbind(), strict=True)
         for ring, term in enumerate(terms_P.unbind(), start=1)
     }
-    return _named(name, terms.sum(1)) | rings
+    return _by_view(name, terms.sum(1)) | rings

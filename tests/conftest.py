@@ -62,7 +62,8 @@ def tiny_world(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) -> P
     """A data set in University-1652's layout: 6 training locations, 3 test locations, 2
     distractors, 3 views of 64 px.
     """
-    from pipeline.simulation.simulate import SimulationSettings, simulate
+    from pipeline.simulation.settings import SimulationSettings
+    from pipeline.simulation.simulate import simulate
 
     out = tmp_path_factory.mktemp("world")
     return simulate(
@@ -75,7 +76,8 @@ def tiny_world(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) -> P
 @pytest.fixture(scope="session")
 def tiny_shards(tmp_path_factory: pytest.TempPathFactory, tiny_world: Path) -> str:
     """That data set as shards of 8 images."""
-    from pipeline.shards.pack import PackingSettings, pack
+    from pipeline.shards.pack import pack
+    from pipeline.shards.settings import PackingSettings
     from pipeline.sources.university1652 import University1652
 
     out = str(tmp_path_factory.mktemp("shards"))
@@ -109,7 +111,8 @@ def lively_encoder() -> "FeatureEncoder":
     import torch
     from torch import nn
 
-    from model.pvda import FeatureEncoder, PVDAConfig
+    from model.config import PVDAConfig
+    from model.pvda import FeatureEncoder
 
     torch.manual_seed(0)
     encoder = FeatureEncoder(

@@ -14,7 +14,7 @@ import tyro
 
 from jobs import STOPPED
 from jobs.command_line.signals import interruptible
-from model.checkpoint import CheckpointError
+from model.errors import CheckpointError
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.progress import console
 
@@ -23,7 +23,8 @@ SECONDS_TO_END = 15.0
 
 
 def run(
-    job: Callable[..., Any], reword: Callable[[list[str]], list[str]] = lambda arguments: arguments
+    job: Callable[..., Any],
+    preprocess_argv: Callable[[list[str]], list[str]] = lambda arguments: arguments,
 ) -> None:
     """Parse the command line for `job` (its parameters, or its one settings dataclass) and run it.
 
@@ -37,17 +38,17 @@ def run(
     )  # fmt: skip
     with interruptible() as received:
         try:
-            tyro.cli(job, args=reword(sys.argv[1:]), config=config)
+            tyro.cli(job, args=preprocess_argv(sys.argv[1:]), config=config)
         except (InputError, CheckpointError) as error:
-            _say(str(error))
+            _print_error(str(error))
             sys.exit(2)
         except OSError as error:  # the system's word: no right to, no room for, a folder for a file
             where = f"{error.filename}: " if error.filename else ""
             asked = "check the path, its rights and the room on its disk, and run the same command again to go on"
-            _say(f"{where}{error.strerror or error}; {asked}")
+            _print_error(f"{where}{error.strerror or error}; {asked}")
             sys.exit(1)
         except Incomplete as error:
-            _say(str(error))
+            _print_error(str(error))
             sys.exit(1)
         except (Exception, KeyboardInterrupt) as error:
             if received or isinstance(
@@ -56,7 +57,7 @@ def run(
                 _stop(128 + (received or [signal.SIGINT])[0])  # as shells count
             if not _is_loss(error):
                 raise
-            _say(
+            _print_error(
                 f"lost Ray's cluster or a worker ({type(error).__name__}); run the same command again to go on"
             )
             sys.exit(1)
@@ -66,7 +67,7 @@ def _stop(code: int) -> NoReturn:
     console.print(STOPPED)
     # Ray, interrupted while it starts workers, may wait for them for ever; its processes end with
     # this one.
-    threading.Thread(target=_end, args=(code,), daemon=True).start()
+    threading.Thread(target=_exit_later, args=(code,), daemon=True).start()
     sys.exit(code)
 
 
@@ -81,12 +82,12 @@ def _is_loss(error: BaseException) -> bool:
     return isinstance(error, RayError) and not isinstance(error, RayTaskError)
 
 
-def _end(code: int) -> None:
+def _exit_later(code: int) -> None:
     time.sleep(SECONDS_TO_END)
     os._exit(code)
 
 
-def _say(sentence: str) -> None:
+def _print_error(sentence: str) -> None:
     console.print("error:", style="bold red", end=" ")
     console.print(
         sentence.replace("\n", "\\n")

@@ -40,7 +40,7 @@ def interruptible() -> Iterator[list[int]]:
         signal.setitimer(signal.ITIMER_REAL, SECONDS_TO_REPEAT)
         if number != signal.SIGALRM:
             received.append(number)
-        elif _on_its_way():
+        elif _is_raising():
             return
         raise KeyboardInterrupt
 
@@ -57,7 +57,7 @@ def interruptible() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def _on_its_way() -> bool:
+def _is_raising() -> bool:
     """Whether a KeyboardInterrupt is being handled: what tidies up after it is not to be
     interrupted.
     """

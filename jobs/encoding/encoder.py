@@ -9,20 +9,25 @@ has the same ones.
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
+from jobs.encoding.settings import EncoderSettings
 from model.checkpoint import build_encoder, fingerprint, loads
-from model.inference.embed import InEffect, Precision, effective_precision, with_precision
 from model.inference.int8 import PrecisionError, calibration_digest, require_int8
-from model.inference.optimise import make_fast
+from model.inference.optimise import optimise_encoder
+from model.inference.precision import (
+    EffectivePrecision,
+    describe_preprocessing,
+    effective_precision,
+)
 from pipeline.batches.ordered import CHANGED, decode_samples, stack
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.features.embed import EmbeddingSettings, EncoderSpec
+from pipeline.features.embed import EncoderSpec
+from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import Floats
 from pipeline.images.decode import DecodeError, Pixels
 from pipeline.images.transforms import Resizer, preprocessing_name
@@ -32,24 +37,7 @@ from pipeline.shards.samples import Sample, read_shard
 
 PROBE_IMAGES, CALIBRATION_IMAGES = 16, 128
 "Images by which the fast encoder is checked, and by which int8 is calibrated."
-Compiling = Literal["auto", "always", "never"]
 Bytes = npt.NDArray[np.uint8]
-
-
-@dataclass(frozen=True, kw_only=True)
-class EncoderSettings:
-    """How images become embeddings. All but `compiling` is part of the fingerprint."""
-
-    mirror: bool = True
-    "Whether the embeddings of an image and its mirror image are summed [LPN]."
-    resizer: Resizer = "torch"
-    """Whose bicubic resizes the images: torch's, or pillow's, which is faster on CPUs without AVX2;
-    tables do not mix."""
-    precision: Precision = "auto"
-    """float32; bfloat16; int8, for CPUs that multiply 8-bit integers fast, calibrated by images of
-    the shards; auto: bfloat16 on GPUs, else float32."""
-    compiling: Compiling = "auto"
-    "Whether torch compiles the encoder; auto: where it saves more time than it takes."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +46,7 @@ class EncoderRecipe:
 
     checkpoint: bytes
     settings: EncoderSettings
-    precision: InEffect
+    precision: EffectivePrecision
     batch_size: int
     images: int
     "That each worker will embed, about."
@@ -91,7 +79,7 @@ class WorkerEncoder:
             device, memory_format=torch.channels_last
         )  # type: ignore[call-overload]
         calibration = blueprint.calibration_B3HW
-        self._fast = make_fast(
+        self._fast = optimise_encoder(
             encoder,
             probe_B3HW=torch.from_numpy(blueprint.probe_B3HW),
             batch_size=blueprint.batch_size,
@@ -134,7 +122,7 @@ def make_encoder_spec(
     digest = (
         None if calibration_B3HW is None else calibration_digest(torch.from_numpy(calibration_B3HW))
     )
-    said = with_precision(
+    said = describe_preprocessing(
         f"{preprocessing_name(settings.resizer)}, mirror {settings.mirror}", precision, digest
     )
     blueprint = EncoderRecipe(

@@ -16,9 +16,9 @@ import torch
 
 from jobs.encoding.encoder import CALIBRATION_IMAGES, PROBE_IMAGES, Bytes, first_images
 from model.checkpoint import Checkpoint, build_encoder, fingerprint, loads
-from model.inference.embed import InEffect, with_precision
 from model.inference.int8 import calibration_digest, require_int8
-from model.inference.optimise import make_fast
+from model.inference.optimise import optimise_encoder
+from model.inference.precision import EffectivePrecision, describe_preprocessing
 from pipeline.batches.ordered import stack
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch_map
@@ -41,7 +41,7 @@ class EncodingConfig:
 
     mirror: bool
     resizer: Resizer
-    precision: InEffect
+    precision: EffectivePrecision
     probe_B3HW: Bytes
     "Images to check the encoder by."
     calibration_B3HW: Bytes | None = None
@@ -50,7 +50,7 @@ class EncodingConfig:
         calibration = self.calibration_B3HW
         digest = None if calibration is None else calibration_digest(torch.from_numpy(calibration))
         said = f"{preprocessing_name(self.resizer)}, mirror {self.mirror}"
-        return fingerprint(checkpoint, with_precision(said, self.precision, digest))
+        return fingerprint(checkpoint, describe_preprocessing(said, self.precision, digest))
 
 
 class PhotoEncoder:
@@ -83,7 +83,7 @@ class PhotoEncoder:
                 f"{name} did not make this index: none of its fingerprints is {self.fingerprint[:12]}..., expected the "
                 f"checkpoint that the gallery was embedded with; name that one{int8}"
             )
-        self.precision: InEffect = way.precision
+        self.precision: EffectivePrecision = way.precision
         self.remarks: list[str] = []
         "What the encoder's check had to say."
         self._resizer: Resizer = way.resizer
@@ -92,7 +92,7 @@ class PhotoEncoder:
             require_int8(device)
         encoder = build_encoder(opened).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         calibration = way.calibration_B3HW
-        self._encode = make_fast(
+        self._encode = optimise_encoder(
             encoder,
             probe_B3HW=torch.from_numpy(way.probe_B3HW),
             batch_size=FORWARD_BATCH,
@@ -140,7 +140,7 @@ class PhotoEncoder:
 
 def candidate_configs(shards: str | None, size: int) -> Iterator[EncodingConfig]:
     """All ways to embed, the likely ones first."""
-    precisions: tuple[InEffect, ...] = ("float32", "bfloat16")
+    precisions: tuple[EffectivePrecision, ...] = ("float32", "bfloat16")
     resizers: tuple[Resizer, ...] = ("torch", "pillow")
     made_B3HW = synthetic_images(size)
     for precision, mirror, resizer in product(precisions, (True, False), resizers):

@@ -8,71 +8,34 @@ import json
 import re
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
-from jobs.training.recipes import Recipe
-from model.checkpoint import Checkpoint, CheckpointError, dumps, loads
+from jobs.training.settings import RunConfig
+from model.checkpoint import Checkpoint, dumps, loads
+from model.errors import CheckpointError
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 
-CHECKPOINT, CURVES = "last.pt", "metrics.jsonl"
+CHECKPOINT_FILE, METRICS_FILE = "last.pt", "metrics.jsonl"
 BEFORE = {"resizer": "pillow"}
 """What a recipe did before it had that setting: a checkpoint from then goes on where the setting
 says the same."""
-OLDER = re.compile(r"checkpoint-(\d+)-(\d+)\.pt")
+ARCHIVE_PATTERN = re.compile(r"checkpoint-(\d+)-(\d+)\.pt")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Conduct:
-    """How a run is carried out. Nothing of it changes what is trained, so a run may go on with
-    another.
-    """
-
-    checkpoint_epochs: int = 1
-    "A checkpoint is written at the end of every so many epochs, and of the last one."
-    checkpoint_minutes: float = 10.0
-    "And whenever so many minutes have passed since the last one, within an epoch too."
-    keep: int = 2
-    "Checkpoints that are kept: last.pt and the ones before it, which stand in where it is damaged."
-    probe_epochs: int = 10
-    "Epochs between two looks at the view gap and at the places held out; 0 never looks."
-    compile: bool = False
-    """Whether the networks are compiled by torch; where that fails, training says so and goes on
-    without."""
-
-    def __post_init__(self) -> None:
-        for name in ("checkpoint_epochs", "keep"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}, expected at least 1")
-        for name in ("checkpoint_minutes", "probe_epochs"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name} is {getattr(self, name)}, expected 0 or more")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Run(Conduct):
-    """One training run: what is trained on what, and where it is kept."""
-
-    shards: str
-    "Folder or URI of the shards, as every worker can open it."
-    out: str
-    "Folder or URI of the run, likewise."
-    recipe: Recipe
-    weights: str | None = None
-    "State dict of torchvision's ResNet to start from."
-
-
-def older_name(checkpoint: Checkpoint) -> str:
+def archive_name(checkpoint: Checkpoint) -> str:
     """What a checkpoint is called once another is the last."""
     return f"checkpoint-{checkpoint.epoch:04d}-{checkpoint.step:05d}.pt"
 
 
-def older_names(out: str) -> list[str]:
+def list_archived(out: str) -> list[str]:
     """The checkpoints before the last one, newest first."""
-    found = [match for name in storage.list_names(out) if (match := OLDER.fullmatch(name))]
+    found = [
+        match for name in storage.list_names(out) if (match := ARCHIVE_PATTERN.fullmatch(name))
+    ]
     return [
         match[0]
         for match in sorted(found, key=lambda match: (int(match[1]), int(match[2])), reverse=True)
@@ -80,7 +43,7 @@ def older_names(out: str) -> list[str]:
 
 
 def find_checkpoint(
-    run: Run, say: Callable[[str], None] = lambda word: None
+    run: RunConfig, say: Callable[[str], None] = lambda word: None
 ) -> tuple[str, Checkpoint] | None:
     """Name and content of the run's newest checkpoint that can be read, if it has any; `say` is
     told of those that cannot.
@@ -89,11 +52,13 @@ def find_checkpoint(
     """
     names = [
         name
-        for name in (CHECKPOINT, *older_names(run.out))
+        for name in (CHECKPOINT_FILE, *list_archived(run.out))
         if storage.exists(storage.join(run.out, name))
     ]
-    if names and names[0] != CHECKPOINT:
-        say(f"{storage.join(run.out, CHECKPOINT)} is missing; taking {names[0]}, the one before it")
+    if names and names[0] != CHECKPOINT_FILE:
+        say(
+            f"{storage.join(run.out, CHECKPOINT_FILE)} is missing; taking {names[0]}, the one before it"
+        )
     for number, name in enumerate(names, start=1):
         path = storage.join(run.out, name)
         try:
@@ -103,12 +68,12 @@ def find_checkpoint(
                 raise
             say(f"{error}; taking {names[number]}, the one before it")
             continue
-        refuse_other_recipe(run, held, path)
+        require_same_recipe(run, held, path)
         return name, held
     return None
 
 
-def read_checkpoint(run: Run) -> Checkpoint | None:
+def read_checkpoint(run: RunConfig) -> Checkpoint | None:
     """The run's newest checkpoint that can be read, if it has any. Raises as `find_checkpoint`
     does.
     """
@@ -116,7 +81,7 @@ def read_checkpoint(run: Run) -> Checkpoint | None:
     return None if found is None else found[1]
 
 
-def refuse_other_recipe(run: Run, held: Checkpoint, path: str) -> None:
+def require_same_recipe(run: RunConfig, held: Checkpoint, path: str) -> None:
     # Through JSON, as the checkpoint has it: tuples become lists.
     recipe, trained = json.loads(json.dumps(asdict(run.recipe))), BEFORE | held.recipe
     changed = sorted(name for name in recipe | trained if trained.get(name) != recipe.get(name))
@@ -127,44 +92,44 @@ def refuse_other_recipe(run: Run, held: Checkpoint, path: str) -> None:
         )
 
 
-class Checkpoints:
+class CheckpointWriter:
     """Writes a run's checkpoints: last.pt is always there and whole, the ones before it keep names
     of their own.
     """
 
-    def __init__(self, run: Run, found: tuple[str, Checkpoint] | None) -> None:
+    def __init__(self, run: RunConfig, found: tuple[str, Checkpoint] | None) -> None:
         self._run = run
         # The name under which last.pt lives on; none where it was damaged.
         self._latest = (
-            older_name(found[1]) if found is not None and found[0] == CHECKPOINT else None
+            archive_name(found[1]) if found is not None and found[0] == CHECKPOINT_FILE else None
         )
 
     def write(self, checkpoint: Checkpoint) -> None:
-        last = storage.join(self._run.out, CHECKPOINT)
+        last = storage.join(self._run.out, CHECKPOINT_FILE)
         if self._latest is not None and self._run.keep > 1:
             storage.link_or_copy(last, storage.join(self._run.out, self._latest))
         storage.write_bytes(last, dumps(checkpoint))
-        self._latest = older_name(checkpoint)
-        for name in older_names(self._run.out)[self._run.keep - 1 :]:
+        self._latest = archive_name(checkpoint)
+        for name in list_archived(self._run.out)[self._run.keep - 1 :]:
             storage.remove(storage.join(self._run.out, name))
 
 
-class Keeper:
+class RunRecorder:
     """What rank 0 does when a step or an epoch is over, so that a kill costs little and people can
     watch.
     """
 
-    def __init__(self, run: Run, found: tuple[str, Checkpoint] | None) -> None:
-        self._run, self._checkpoints = run, Checkpoints(run, found)
-        self._curves = Curves(run.out, [] if found is None else found[1].history)
+    def __init__(self, run: RunConfig, found: tuple[str, Checkpoint] | None) -> None:
+        self._run, self._checkpoints = run, CheckpointWriter(run, found)
+        self._curves = MetricsLogger(run.out, [] if found is None else found[1].history)
         self._saved = time.monotonic()
 
-    def step_over(self, now: Callable[[], Checkpoint]) -> None:
+    def after_step(self, now: Callable[[], Checkpoint]) -> None:
         """Within an epoch: write what `now` gives where it is time."""
         if time.monotonic() - self._saved >= 60 * self._run.checkpoint_minutes:
             self._write(now())
 
-    def epoch_over(self, now: Callable[[], Checkpoint], history: list[dict[str, Any]]) -> None:
+    def after_epoch(self, now: Callable[[], Checkpoint], history: list[dict[str, Any]]) -> None:
         """After an epoch, whose row is the last of `history`."""
         epoch = len(history)
         # Before its checkpoint: a row without one is dropped by the next run, an epoch without its
@@ -173,7 +138,7 @@ class Keeper:
         if epoch % self._run.checkpoint_epochs == 0 or epoch == self._run.recipe.schedule.epochs:
             self._write(now())
         else:
-            self.step_over(now)
+            self.after_step(now)
 
     def _write(self, checkpoint: Checkpoint) -> None:
         self._checkpoints.write(checkpoint)
@@ -183,13 +148,13 @@ class Keeper:
         self._curves.close()
 
 
-class Curves:
+class MetricsLogger:
     """The run's curves for people: RUN/metrics.jsonl whole after each epoch, and TensorBoard where
     RUN is on a disk.
     """
 
     def __init__(self, out: str, history: list[dict[str, Any]]) -> None:
-        self._path = storage.join(out, CURVES)
+        self._path = storage.join(out, METRICS_FILE)
         self._board: SummaryWriter | None = None
         # What a killed run wrote after its last checkpoint is dropped, here and there.
         if storage.exists(self._path):

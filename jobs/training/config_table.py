@@ -13,7 +13,7 @@ from jobs.training.recipes import RECIPES, Recipe
 from pipeline.core.progress import console
 
 
-def show_config(recipe: Recipe, **run: object) -> None:
+def print_config(recipe: Recipe, **run: object) -> None:
     """Print all settings of a recipe, and those of the `run` besides (shards, out, ...), on
     standard error.
     """
@@ -27,9 +27,9 @@ def config_table(recipe: Recipe, run: dict[str, object]) -> Table:
 
     A recipe that is not in RECIPES has nothing to differ from.
     """
-    held = groups(recipe)
+    held = settings_by_group(recipe)
     known = recipe.name in RECIPES
-    own = groups(RECIPES[recipe.name]()) if known else held
+    own = settings_by_group(RECIPES[recipe.name]()) if known else held
     changed = sum(
         value != own[group][name] for group in held for name, value in held[group].items()
     )
@@ -51,7 +51,7 @@ def config_table(recipe: Recipe, run: dict[str, object]) -> Table:
     return table
 
 
-def groups(recipe: Recipe) -> dict[str, dict[str, Any]]:
+def settings_by_group(recipe: Recipe) -> dict[str, dict[str, Any]]:
     """The recipe's settings by part: network, optimisation, ...; those of no part under `training`."""
     plain = asdict(recipe)
     parts = {name: value for name, value in plain.items() if isinstance(value, dict)}

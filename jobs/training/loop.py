@@ -14,11 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from jobs.training.checkpoints import CHECKPOINT, Keeper, Run, find_checkpoint
-from jobs.training.metrics import DAMAGED, NotFinite, Tally
-from jobs.training.probes import look
-from model.checkpoint import Checkpoint, CheckpointError, dumps
-from model.schedule import phase
+from jobs.training.checkpoints import CHECKPOINT_FILE, RunRecorder, find_checkpoint
+from jobs.training.metrics import DAMAGED, MetricAccumulator, NotFinite
+from jobs.training.probes import probe
+from jobs.training.settings import RunConfig
+from model.checkpoint import Checkpoint, dumps
+from model.errors import CheckpointError
+from model.schedule import schedule_at
 from model.training import Training
 from model.weights.load import load_backbone, read_state_dict
 from pipeline.batches.training import Batch, StreamConfig, TrainingStream
@@ -27,33 +29,33 @@ from pipeline.core.errors import Incomplete
 from pipeline.core.prefetch import prefetch
 
 SECONDS_BETWEEN_REPORTS = 1.0
-BATCHES_READY = 2
+PREFETCHED_BATCHES = 2
 "Pairs of batches that wait for the step; decoding runs further ahead."
-Tensors = tuple[list[Tensor], list[Tensor], tuple[str, ...]]
+BatchTensors = tuple[list[Tensor], list[Tensor], tuple[str, ...]]
 Report = Callable[[dict[str, Any]], None]
 """Takes what a worker tells while it runs: `steps` done since the last time and facts to show, or a
 `note`."""
-Found = tuple[str, Checkpoint] | None
-Damage = tuple[int, str | None]
+FoundCheckpoint = tuple[str, Checkpoint] | None
+DamageCount = tuple[int, str | None]
 "How many images could not be decoded, and the key of the first."
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place:
+class WorkerContext:
     """Where in a run's group of workers this one stands, and what it computes on."""
 
     rank: int = 0
     world: int = 1
     device: str = "cpu"
     distribute: Callable[[nn.Module], nn.Module] = lambda module: module
-    share: Callable[[Found], Found] = lambda found: found
+    share: Callable[[FoundCheckpoint], FoundCheckpoint] = lambda found: found
     """Gives every worker what rank 0 has: all go on from one checkpoint, whatever each of them sees
     of the storage."""
-    gather: Callable[[Damage], list[Damage]] = lambda damage: [damage]
+    gather: Callable[[DamageCount], list[DamageCount]] = lambda damage: [damage]
     "Gives every worker what each of them has, by rank."
 
 
-def train_worker(run: Run, place: Place, report: Report) -> None:
+def train_worker(run: RunConfig, place: WorkerContext, report: Report) -> None:
     """Train to the end of the recipe's schedule, from the run's checkpoint where there is one.
 
     Raises Unfinished when training diverges; the last checkpoint is then one from before.
@@ -61,7 +63,9 @@ def train_worker(run: Run, place: Place, report: Report) -> None:
     worker, epochs = Worker(run, place, report), run.recipe.schedule.epochs
     with ExitStack() as stack:
         keeper = (
-            stack.enter_context(closing(Keeper(run, worker.found))) if place.rank == 0 else None
+            stack.enter_context(closing(RunRecorder(run, worker.found)))
+            if place.rank == 0
+            else None
         )
         for epoch in range(len(worker.history), epochs):
             row = worker.epoch(epoch, keeper)
@@ -69,67 +73,70 @@ def train_worker(run: Run, place: Place, report: Report) -> None:
                 worker.over(row)
                 continue
             if run.probe_epochs and ((epoch + 1) % run.probe_epochs == 0 or epoch + 1 == epochs):
-                row |= look(worker.training.learner.encoder, worker.stream)
+                row |= probe(worker.training.learner.encoder, worker.stream)
             worker.over(row)
-            keeper.epoch_over(worker.checkpoint, worker.history)
+            keeper.after_epoch(worker.checkpoint, worker.history)
 
 
 class Worker:
     """One training worker and where in the run it is."""
 
-    def __init__(self, run: Run, place: Place, report: Report) -> None:
+    def __init__(self, run: RunConfig, place: WorkerContext, report: Report) -> None:
         self.run, self.place, self._report = run, place, report
         self.stream = open_stream(run, place)
-        self.training = fresh(run, place, len(self.stream.classes))
-        if self.training.not_compiled is not None:
+        self.training = build_training(run, place, len(self.stream.classes))
+        if self.training.compile_error is not None:
             report(
-                {"note": f"not compiled, training goes on without: {self.training.not_compiled}"}
+                {"note": f"not compiled, training goes on without: {self.training.compile_error}"}
             )
         self.found = place.share(find_checkpoint(run) if place.rank == 0 else None)
         self.history: list[dict[str, Any]] = []
         "The rows of the epochs that are over."
-        self.tally = Tally()
+        self.metrics = MetricAccumulator()
         if self.found is not None:
             name, held = self.found
             try:
-                self.training.load_state(held.state)
+                self.training.load_state_dict(held.state)
             # torch's, over another's state
             except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
                 raise CheckpointError(
                     f"{name} of {run.out} is not of this training ({type(error).__name__}); expected one that jobs/train.py "
                     "wrote on these shards; choose another --out, or take it away to go on from the one before"
                 ) from error
-            self.history, self.tally = list(held.history), Tally(held.step, held.running)
+            self.history, self.metrics = (
+                list(held.history),
+                MetricAccumulator(held.step, held.running),
+            )
             if place.rank > 0:  # the checkpoint's count is rank 0's
-                self.tally.damaged = 0
+                self.metrics.damaged = 0
 
-    def epoch(self, epoch: int, keeper: Keeper | None) -> dict[str, Any]:
+    def epoch(self, epoch: int, keeper: RunRecorder | None) -> dict[str, Any]:
         """The steps of one pass over the satellite view that are still to do; returns the epoch's
         row of metrics.jsonl.
         """
         recipe, steps, first = self.run.recipe, self.stream.steps, None
-        told_at, told_steps = time.monotonic(), self.tally.steps
+        told_at, told_steps = time.monotonic(), self.metrics.steps
         for images, labels, damaged in self.batches(epoch):
-            step = self.tally.steps
-            self.tally.damaged += len(damaged)
+            step = self.metrics.steps
+            self.metrics.damaged += len(damaged)
             first = first or next(iter(damaged), None)
-            now = phase(recipe.schedule, epoch + step / steps)
+            now = schedule_at(recipe.schedule, epoch + step / steps)
             # Dropout's random numbers are a function of seed, epoch, step and rank, however often a
             # run was resumed.
             seeds = np.random.SeedSequence([recipe.seed, epoch, step, self.place.rank])
             torch.manual_seed(int(seeds.generate_state(1)[0]))
-            self.tally.add(self.training.step(images[0], labels[0], images[1], labels[1], now))
+            self.metrics.add(self.training.step(images[0], labels[0], images[1], labels[1], now))
             if time.monotonic() - told_at >= SECONDS_BETWEEN_REPORTS or step + 1 == steps:
                 facts = {"epoch": f"{epoch + 1}/{recipe.schedule.epochs}", "alpha": now.alpha}
-                self._tell(facts, self.tally.steps - told_steps)
-                told_at, told_steps = time.monotonic(), self.tally.steps
+                self._tell(facts, self.metrics.steps - told_steps)
+                told_at, told_steps = time.monotonic(), self.metrics.steps
             if keeper is not None and step + 1 < steps:
-                keeper.step_over(self.checkpoint)
+                keeper.after_step(self.checkpoint)
         damage = self._damage(epoch, first)
         return {
             "epoch": epoch + 1, "step": (epoch + 1) * steps, "alpha": now.alpha,
-            "learning_rate_scale": now.rate_scale, "learning_rates": self.training.rates,
-            **self.means(), "images_per_second": self.speed, "seconds": self.tally.seconds,
+            "learning_rate_scale": now.lr_scale, "learning_rates": self.training.rates,
+            **self.means(), "images_per_second": self.speed, "seconds": self.metrics.seconds,
             DAMAGED: damage,
         }  # fmt: skip
 
@@ -137,7 +144,7 @@ class Worker:
         """Images of all workers that could not be decoded in this epoch; said once where there are
         any.
         """
-        told = self.place.gather((self.tally.damaged, first))
+        told = self.place.gather((self.metrics.damaged, first))
         count, first = (
             sum(count for count, _ in told),
             next((key for _, key in told if key is not None), None),
@@ -157,24 +164,24 @@ class Worker:
     def over(self, row: dict[str, Any]) -> None:
         """The epoch of this row is over."""
         self.history.append(row)
-        self.tally = Tally()
+        self.metrics = MetricAccumulator()
 
     def checkpoint(self) -> Checkpoint:
         """All that going on from here needs. Raises Unfinished where it would hold the ruins of a
         diverged run.
         """
         self.means()
-        made = checkpoint(self.run, self.training, self.stream, self.history)
-        return replace(made, step=self.tally.steps, running=self.tally.running())
+        made = make_checkpoint(self.run, self.training, self.stream, self.history)
+        return replace(made, step=self.metrics.steps, running=self.metrics.running())
 
     def means(self) -> dict[str, float]:
         """Means of the epoch's measures so far; raises Unfinished where one is not finite."""
         try:
-            return self.tally.means()
+            return self.metrics.means()
         except NotFinite as error:
-            last = storage.join(self.run.out, CHECKPOINT)
+            last = storage.join(self.run.out, CHECKPOINT_FILE)
             raise Incomplete(
-                f"training diverged in epoch {len(self.history) + 1}, by step {self.tally.steps} of {self.stream.steps}: "
+                f"training diverged in epoch {len(self.history) + 1}, by step {self.metrics.steps} of {self.stream.steps}: "
                 f"{error}, expected a finite number; {last}, where there is one, is from before; train anew into another --out "
                 "with lower learning rates or --precision float32"
             ) from None
@@ -183,11 +190,11 @@ class Worker:
     def speed(self) -> float:
         """Images per second of all workers, over the epoch so far."""
         return (
-            self.tally.steps
+            self.metrics.steps
             * 2
             * self.run.recipe.batch_size
             * self.place.world
-            / self.tally.seconds
+            / self.metrics.seconds
         )
 
     def _tell(self, facts: dict[str, Any], steps: int) -> None:
@@ -195,13 +202,13 @@ class Worker:
         whole = {name: mean for name, mean in self.means().items() if "/" not in name}
         self._report({"steps": steps} | facts | {"rates": rates, "images/s": self.speed} | whole)
 
-    def batches(self, epoch: int) -> Iterator[Tensors]:
+    def batches(self, epoch: int) -> Iterator[BatchTensors]:
         """Images and labels of both views on the device, ready before the step asks for them; keys
         of damaged images.
         """
         device = self.training.device
 
-        def tensors(pair: tuple[Batch, Batch]) -> Tensors:
+        def tensors(pair: tuple[Batch, Batch]) -> BatchTensors:
             images = [torch.from_numpy(batch.images_B3HW) for batch in pair]
             labels = [torch.from_numpy(batch.location_B) for batch in pair]
             if device.type == "cuda":  # from pinned memory the copy runs beside the computation
@@ -210,7 +217,7 @@ class Worker:
             return images, labels, pair[0].damaged + pair[1].damaged
 
         for images, labels, damaged in prefetch(
-            map(tensors, self.stream.epoch(epoch, self.tally.steps)), BATCHES_READY
+            map(tensors, self.stream.epoch(epoch, self.metrics.steps)), PREFETCHED_BATCHES
         ):
             images, labels = (
                 [tensor.to(device, non_blocking=True) for tensor in both]
@@ -219,7 +226,7 @@ class Worker:
             yield images, labels, damaged
 
 
-def open_stream(run: Run, place: Place) -> TrainingStream:
+def open_stream(run: RunConfig, place: WorkerContext) -> TrainingStream:
     """The training images as this worker sees them.
 
     Raises InputError when the shards cannot be trained on.
@@ -237,13 +244,13 @@ def open_stream(run: Run, place: Place) -> TrainingStream:
     return TrainingStream(run.shards, reading, place.rank, place.world)
 
 
-def fresh(run: Run, place: Place, locations: int) -> Training:
+def build_training(run: RunConfig, place: WorkerContext, locations: int) -> Training:
     """Networks and optimisers before the first step, the same on every worker."""
     recipe = run.recipe
     torch.manual_seed(recipe.seed)
     training = Training(
         recipe.network,
-        recipe.optimisation,
+        recipe.optimization,
         locations,
         adversary=recipe.adversary,
         device=place.device,
@@ -258,8 +265,8 @@ def fresh(run: Run, place: Place, locations: int) -> Training:
     return training
 
 
-def checkpoint(
-    run: Run, training: Training, stream: TrainingStream, history: list[dict[str, Any]]
+def make_checkpoint(
+    run: RunConfig, training: Training, stream: TrainingStream, history: list[dict[str, Any]]
 ) -> Checkpoint:
     """The run at the end of its last epoch in `history`."""
     return Checkpoint(
@@ -268,9 +275,11 @@ def checkpoint(
     )  # fmt: skip
 
 
-def untrained(run: Run) -> bytes:
+def initial_checkpoint(run: RunConfig) -> bytes:
     """The checkpoint of a run before its first step, however far it is: what training starts from,
     to compare with.
     """
-    stream = open_stream(run, Place())
-    return dumps(checkpoint(run, fresh(run, Place(), len(stream.classes)), stream, []))
+    stream = open_stream(run, WorkerContext())
+    return dumps(
+        make_checkpoint(run, build_training(run, WorkerContext(), len(stream.classes)), stream, [])
+    )

@@ -18,7 +18,7 @@ class NotFinite(ArithmeticError):
     """A measure that is infinite or not a number. The message says which and its value."""
 
 
-class Tally:
+class MetricAccumulator:
     """What the steps of one epoch add up to. `running` and `steps` go on with those of a
     checkpoint.
     """
@@ -56,7 +56,7 @@ class Tally:
         """
         sums = [] if self._sums is None else self._sums.tolist()
         means = {name: total / self.steps for name, total in zip(self._names, sums, strict=True)}
-        wrong = worst(means.items())
+        wrong = first_not_finite(means.items())
         if wrong is not None:
             raise NotFinite(f"{wrong} is {means[wrong]}")
         return means
@@ -76,6 +76,6 @@ class Tally:
         }
 
 
-def worst(means: Iterable[tuple[str, float]]) -> str | None:
+def first_not_finite(means: Iterable[tuple[str, float]]) -> str | None:
     """The first measure that is not finite."""
     return next((name for name, mean in means if not math.isfinite(mean)), None)

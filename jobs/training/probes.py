@@ -34,7 +34,7 @@ RIDGE = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Seen:
+class ProbeFeatures:
     """What the encoder makes of some images of one view."""
 
     locations: list[str]
@@ -43,31 +43,31 @@ class Seen:
     embedding_NE: Floats
 
 
-def look(encoder: FeatureEncoder, stream: TrainingStream) -> dict[str, float]:
+def probe(encoder: FeatureEncoder, stream: TrainingStream) -> dict[str, float]:
     """The view gap and, where locations are held out, how well these are found in either direction.
 
     The held-out locations' images are all looked at; without any, the first training images, in the
     shards' order. What cannot be decoded is left out; where that leaves no image of a view, an
     InputError is raised.
     """
-    drone, satellite = (see(encoder, stream, view) for view in (View.DRONE, View.SATELLITE))
+    drone, satellite = (embed_view(encoder, stream, view) for view in (View.DRONE, View.SATELLITE))
     found = view_gap(drone.pooled_NC, satellite.pooled_NC)
     if stream.held_out:
         for name, queries, gallery in (
             ("drone_to_satellite", drone, satellite),
             ("satellite_to_drone", satellite, drone),
         ):
-            ranking = rank(side(queries), side(gallery), top=1)
+            ranking = rank(embedding_set(queries), embedding_set(gallery), top=1)
             scores = summarise(ranking.first_rank_Q, ranking.ap_Q, len(gallery.locations))
             found |= {f"held_out/{name}/r1": scores.r1, f"held_out/{name}/ap": scores.ap}
     return found
 
 
-def see(encoder: FeatureEncoder, stream: TrainingStream, view: View) -> Seen:
+def embed_view(encoder: FeatureEncoder, stream: TrainingStream, view: View) -> ProbeFeatures:
     """The images of one view through the encoder as it is, in evaluation mode for that long."""
     device = next(encoder.parameters()).device
     was_training, locations, pooled, embeddings = encoder.training, [], [], []
-    images = pictures(stream, view)
+    images = probe_images(stream, view)
     encoder.eval()
     with torch.no_grad():
         while group := list(islice(images, BATCH)):
@@ -85,14 +85,14 @@ def see(encoder: FeatureEncoder, stream: TrainingStream, view: View) -> Seen:
         raise InputError(
             f"not one {view} image of {stream.shards} that the probes look at can be decoded, expected some; pack again"
         )
-    return Seen(
+    return ProbeFeatures(
         locations=locations,
         pooled_NC=np.concatenate(pooled),
         embedding_NE=np.concatenate(embeddings),
     )
 
 
-def pictures(stream: TrainingStream, view: View) -> Iterator[Decoded]:
+def probe_images(stream: TrainingStream, view: View) -> Iterator[Decoded]:
     """The images that are looked at, as they are when tested: resized and nothing else."""
     reading, held_out = stream.reading, stream.held_out
     samples = (
@@ -108,7 +108,7 @@ def pictures(stream: TrainingStream, view: View) -> Iterator[Decoded]:
     return decode_samples(chosen, reading.image_size, reading.threads, 2 * BATCH, reading.resizer)
 
 
-def side(seen: Seen) -> Side:
+def embedding_set(seen: ProbeFeatures) -> Side:
     keys = np.arange(len(seen.locations)).astype(np.str_)
     return side_of_array(keys, np.array(seen.locations, np.str_), seen.embedding_NE)
 

@@ -3,9 +3,8 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from model.pvda import PVDAConfig
+from model.config import Optimization, Precision, PVDAConfig
 from model.schedule import Schedule
-from model.training import Optimisation, Precision
 from pipeline.core.errors import InputError
 from pipeline.images.transforms import Augmentation, Resizer
 
@@ -17,7 +16,7 @@ class Recipe:
     name: str = "paper"
     "Under which it is known."
     network: PVDAConfig = field(default_factory=PVDAConfig)
-    optimisation: Optimisation = field(default_factory=Optimisation)
+    optimization: Optimization = field(default_factory=Optimization)
     schedule: Schedule = field(default_factory=Schedule)
     augmentation: Augmentation = field(default_factory=Augmentation)
     resizer: Resizer = "torch"
@@ -72,7 +71,7 @@ def lpn() -> Recipe:
     """
     return Recipe(
         name="lpn",
-        optimisation=Optimisation(backbone_rate=0.001, head_rate=0.01, classifier_rate=0.01),
+        optimization=Optimization(backbone_lr=0.001, head_lr=0.01, classifier_lr=0.01),
         schedule=Schedule(
             epochs=120,
             alpha=0.0,
@@ -92,22 +91,17 @@ def constant_alpha() -> Recipe:
 
 
 def no_restart() -> Recipe:
-    """Ablation: alpha grows as in `paper`, the rates only fall, by 0.8 after epochs 140, 280 and
-    420 [paper].
-    """
+    """Ablation: alpha grows as in `paper`, the rates only fall, by 0.8 at 140, 280, 420 [paper]."""
     return Recipe(name="no_restart", schedule=Schedule(restart=False, decay_epochs=(140, 280, 420)))
 
 
 def alpha_zero() -> Recipe:
-    """Control: `paper` with alpha = 0, so D learns but nothing makes the encoder deceive it
-    [chosen].
-    """
+    """Control: `paper` with alpha = 0: D learns, nothing makes the encoder deceive it [chosen]."""
     return Recipe(name="alpha_zero", schedule=Schedule(alpha=0.0, alpha_step=0.0))
 
 
 def smoke(epochs: int = 80) -> Recipe:
-    """Minutes on two cores, from scratch: a thin ResNet-18 with AdamW, one cosine and a gentle
-    adversary.
+    """Minutes on two cores, from scratch: a thin ResNet-18, AdamW, one cosine, a gentle adversary.
 
     The paper's rates suppose ImageNet weights and days of training; from scratch they learn nothing
     in minutes. It stays the two-step method on the same code.
@@ -123,12 +117,12 @@ def smoke(epochs: int = 80) -> Recipe:
             dropout=0.0,
             discriminator_channels=64,
         ),
-        optimisation=Optimisation(
+        optimization=Optimization(
             kind="adamw",
-            backbone_rate=3e-3,
-            head_rate=3e-3,
-            classifier_rate=3e-3,
-            discriminator_rate=1e-3,
+            backbone_lr=3e-3,
+            head_lr=3e-3,
+            classifier_lr=3e-3,
+            discriminator_lr=1e-3,
         ),
         schedule=Schedule(
             epochs=epochs, shape="cosine", warmup_epochs=4, alpha=0.1, alpha_step=0.0

@@ -17,7 +17,7 @@ BLOCKS: dict[Depth, tuple[int, int, int, int]] = {
 }
 STRIDE = 16
 "Pixels of the image per cell of the maps: layer4's own halving is removed (PVDA, section 3; LPN)."
-LEAST_CHANNELS = 16
+MIN_CHANNELS = 16
 """Into a strided 1x1 shortcut. In the backward pass of a thinner one, channels last, oneDNN writes
 past its memory on CPUs with AVX-512 (its issue 6035; seen with torch 2.13), and the process crashes
 sooner or later."""

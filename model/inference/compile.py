@@ -16,14 +16,14 @@ import torch
 import torch._inductor.config
 from torch import Tensor, nn
 
-Run = Callable[[Tensor], Tensor]
+EmbedBatch = Callable[[Tensor], Tensor]
 
 
 class NotCompiled(RuntimeError):
     """What cannot be compiled here. The message is the first line of the reason."""
 
 
-def compile_frozen(module: nn.Module, images_B3HW: Tensor) -> Run:
+def compile_frozen(module: nn.Module, images_B3HW: Tensor) -> EmbedBatch:
     """`module` compiled and tried on a batch, whose sizes are the only ones that it should be
     given.
 
@@ -41,7 +41,7 @@ def compile_frozen(module: nn.Module, images_B3HW: Tensor) -> Run:
         return embeddings_BE
 
     try:
-        with quiet():
+        with ignore_deprecations():
             run(images_B3HW)
     except Exception as error:  # the compiler's own kinds, the C++ compiler's, the driver's
         lines = str(error).strip().splitlines()
@@ -52,7 +52,7 @@ def compile_frozen(module: nn.Module, images_B3HW: Tensor) -> Run:
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
+def ignore_deprecations() -> Iterator[None]:
     """Without the deprecation that torch 2.13's own import of its compiler gives rise to. Anything
     else is told.
     """

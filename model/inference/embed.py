@@ -12,11 +12,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model.inference.precision import EffectivePrecision
 from model.pvda import FeatureEncoder
 
-InEffect = Literal["float32", "bfloat16", "int8"]
-Precision = Literal["auto"] | InEffect
-Kind = Literal["plain", "folded", "compiled"]
+EncoderKind = Literal["plain", "folded", "compiled"]
 
 
 def unit_embedding(g_BPD: Tensor) -> Tensor:
@@ -41,33 +40,7 @@ def embed(encoder: FeatureEncoder, images_B3HW: Tensor, mirror: bool = True) -> 
     return unit_embedding(g_BPD.float())
 
 
-def effective_precision(precision: Precision, device: str) -> InEffect:
-    """`auto` is bfloat16 on CUDA and float32 elsewhere; a function of the kind of device, so that
-    all workers agree.
-    """
-    if precision == "auto":
-        return "bfloat16" if device == "cuda" else "float32"
-    return precision
-
-
-def with_precision(preprocessing: str, precision: InEffect, calibration: str | None = None) -> str:
-    """What a model's fingerprint says of preprocessing, and of the precision where it changes the
-    embeddings.
-
-    float32 adds nothing: plain, folded and compiled embeddings are the same up to rounding, and may
-    share a table. For int8 `calibration` names the images it was calibrated by
-    (`calibration_digest`); ValueError without.
-    """
-    if precision == "int8":
-        if not calibration:
-            raise ValueError(
-                "int8 without its calibration; expected the digest of the images; see calibration_digest"
-            )
-        return f"{preprocessing}, int8 calibrated by {calibration}"
-    return preprocessing if precision == "float32" else f"{preprocessing}, {precision}"
-
-
-class OneBatch(nn.Module):
+class MirroredEncoder(nn.Module):
     """Images as bytes -> unit embeddings in one pass: the mirror images are the second half of the
     batch.
     """
@@ -94,9 +67,9 @@ class FastEncoder:
     device.
     """
 
-    kind: Kind
+    kind: EncoderKind
     "How it computes."
-    precision: InEffect
+    precision: EffectivePrecision
     "What it computes in; part of the fingerprint."
     agreement: float = 1.0
     "The least cosine between its embedding and the plain encoder's, over the probe images."

@@ -13,7 +13,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 from model.pvda import FeatureEncoder
 
 
-def fold(encoder: FeatureEncoder) -> FeatureEncoder:
+def fuse_batchnorm(encoder: FeatureEncoder) -> FeatureEncoder:
     """A copy of `encoder` whose BatchNorms are folded into convolutions and linear layers, without
     gradients.
 
@@ -32,7 +32,7 @@ def fold(encoder: FeatureEncoder) -> FeatureEncoder:
         )
     folded = copy.deepcopy(encoder).requires_grad_(False)
     for parent in list(folded.modules()):
-        _fold_children(parent)
+        _fuse_children(parent)
     left = [
         name
         for name, module in folded.named_modules()
@@ -46,7 +46,7 @@ def fold(encoder: FeatureEncoder) -> FeatureEncoder:
     return folded
 
 
-def _fold_children(parent: nn.Module) -> None:
+def _fuse_children(parent: nn.Module) -> None:
     """Fold each BatchNorm into the child registered just before it: in our networks that is the
     layer it normalises.
     """

@@ -15,15 +15,15 @@ from importlib import import_module
 import torch
 from torch import Tensor
 
-from model.inference.compile import quiet
+from model.inference.compile import ignore_deprecations
 from model.pvda import FeatureEncoder
 
-STEPS = "torchao.quantization.pt2e.quantize_pt2e"
-QUANTIZER = "torchao.quantization.pt2e.quantizer.x86_inductor_quantizer"
+QUANTIZE_MODULE = "torchao.quantization.pt2e.quantize_pt2e"
+QUANTIZER_MODULE = "torchao.quantization.pt2e.quantizer.x86_inductor_quantizer"
 "Imported when they are needed: torchao is optional, and its import takes seconds."
 CALIBRATION_BATCH = 8
 "Images at a time, whatever the batch size of embedding: the ranges must not depend on it."
-INSTRUCTIONS = ("avx512_vnni", "avx_vnni", "amx_int8")
+INT8_INSTRUCTIONS = ("avx512_vnni", "avx_vnni", "amx_int8")
 "Any one of these multiplies 8-bit integers, as torch names them."
 
 
@@ -42,14 +42,14 @@ def require_int8(device: str) -> None:
         raise PrecisionError(
             f"int8 is for CPUs and the device is {device}; choose --precision bfloat16"
         )
-    if not any(has.get(name) for name in INSTRUCTIONS):
+    if not any(has.get(name) for name in INT8_INSTRUCTIONS):
         raise PrecisionError(
-            f"this CPU ({has.get('architecture', 'unknown')}) has no {', '.join(INSTRUCTIONS)}, so int8 would be slower than "
+            f"this CPU ({has.get('architecture', 'unknown')}) has no {', '.join(INT8_INSTRUCTIONS)}, so int8 would be slower than "
             "float32; choose --precision float32"
         )
     try:
-        with _quiet_torchao():
-            import_module(QUANTIZER)
+        with _filter_torchao_logs():
+            import_module(QUANTIZER_MODULE)
     except ImportError as error:
         raise PrecisionError(
             f"int8 needs torchao, which cannot be imported here ({error}); pip install 'pvda[int8]', or choose "
@@ -65,8 +65,8 @@ def quantise(encoder: FeatureEncoder, size: int, calibrate: Callable[[], None]) 
     order give other ranges in their last digit, and workers would round differently.
     """
     threads = torch.get_num_threads()
-    with _quiet_torchao(), torch.no_grad():
-        pt2e, x86 = import_module(STEPS), import_module(QUANTIZER)
+    with _filter_torchao_logs(), torch.no_grad():
+        pt2e, x86 = import_module(QUANTIZE_MODULE), import_module(QUANTIZER_MODULE)
         example_B3HW = torch.zeros(CALIBRATION_BATCH, 3, size, size).to(
             memory_format=torch.channels_last
         )
@@ -96,7 +96,7 @@ def calibration_digest(images_B3HW: Tensor) -> str:
 
 
 @contextmanager
-def _quiet_torchao() -> Iterator[None]:
+def _filter_torchao_logs() -> Iterator[None]:
     """Without what torchao 0.18 says on a machine without CUDA, and of its own future. Anything
     else is told.
     """
@@ -111,7 +111,7 @@ def _quiet_torchao() -> Iterator[None]:
     for logger in loggers:
         logger.addFilter(wanted)
     try:
-        with quiet():
+        with ignore_deprecations():
             yield
     finally:
         for logger in loggers:

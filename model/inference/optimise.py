@@ -15,30 +15,23 @@ import torch
 from torch import Tensor
 
 from model.inference.compile import NotCompiled, compile_frozen
-from model.inference.embed import (
-    FastEncoder,
-    InEffect,
-    Kind,
-    OneBatch,
-    Precision,
-    effective_precision,
-    embed,
-)
-from model.inference.fuse_batchnorm import fold
+from model.inference.embed import EncoderKind, FastEncoder, MirroredEncoder, embed
+from model.inference.fuse_batchnorm import fuse_batchnorm
 from model.inference.int8 import CALIBRATION_BATCH, PrecisionError, quantise, require_int8
+from model.inference.precision import EffectivePrecision, Precision, effective_precision
 from model.pvda import FeatureEncoder
 
-LEAST_COSINE: dict[InEffect, float] = {"float32": 0.9999, "bfloat16": 0.999, "int8": 0.99}
+MIN_COSINE: dict[EffectivePrecision, float] = {"float32": 0.9999, "bfloat16": 0.999, "int8": 0.99}
 """Between the fast and the plain embedding of a probe image: of the worst image, for int8 of their
 mean."""
-COMPILING_PAYS_FROM = 120.0
+COMPILE_BREAK_EVEN_S = 120.0
 """Seconds that the folded encoder would need for all images. Compiling ResNet-50 for 256 px took 13
 to 25 s on two busy cores and saved a quarter of each image's time, so from two minutes on it has
 paid; slower machines compile slower, too."""
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 
 
-def make_fast(
+def optimise_encoder(
     encoder: FeatureEncoder,
     *,
     probe_B3HW: Tensor,
@@ -48,7 +41,7 @@ def make_fast(
     compiled: bool | Literal["auto"] = "auto",
     images: int | None = None,
     calibration_B3HW: Tensor | None = None,
-    say: Say = print,
+    say: Log = print,
 ) -> FastEncoder:
     """The fastest encoder that computes what `embed` does with `encoder`, which is in evaluation
     mode on its device.
@@ -66,7 +59,7 @@ def make_fast(
     wanted = effective_precision(precision, device.type)
     if wanted == "int8":
         require_int8(device.type)
-    check = _Check(
+    check = _AgreementCheck(
         probe_B3HW=probe_B3HW,
         expected_BE=torch.cat(
             [
@@ -78,23 +71,23 @@ def make_fast(
         batch_size=batch_size,
         device=device,
     )
-    module = OneBatch(fold(encoder), mirror, wanted == "bfloat16")
+    module = MirroredEncoder(fuse_batchnorm(encoder), mirror, wanted == "bfloat16")
     module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if wanted == "int8":
         return _int8(module, check, calibration_B3HW, say)
     fast = check.measured("folded", module)
-    if not fast.agreement >= LEAST_COSINE[wanted]:  # NaN agrees with nothing
+    if not fast.agreement >= MIN_COSINE[wanted]:  # NaN agrees with nothing
         say(
             f"the folded encoder disagrees with the plain one ({check.told(fast)}); the plain one is used"
         )
-        fast = check.measured("plain", partial(_embed, encoder, mirror, wanted == "bfloat16"))
-        if wanted != "float32" and not fast.agreement >= LEAST_COSINE[wanted]:
+        fast = check.measured("plain", partial(_embed_plain, encoder, mirror, wanted == "bfloat16"))
+        if wanted != "float32" and not fast.agreement >= MIN_COSINE[wanted]:
             raise PrecisionError(
                 f"{wanted} embeddings agree with the float32 ones by a cosine of {fast.agreement:.4f}, expected at least "
-                f"{LEAST_COSINE[wanted]}; choose --precision float32"
+                f"{MIN_COSINE[wanted]}; choose --precision float32"
             )
     elif compiled is True or (
-        compiled == "auto" and images is not None and _is_long(fast, probe_B3HW, images)
+        compiled == "auto" and images is not None and _compiling_pays(fast, probe_B3HW, images)
     ):
         fast = _compiled(module, check, fast, say)
     say(f"{fast.kind} encoder in {wanted}: {check.told(fast)}")
@@ -102,17 +95,17 @@ def make_fast(
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Check:
+class _AgreementCheck:
     """What a candidate is measured by."""
 
     probe_B3HW: Tensor
     expected_BE: Tensor
     "The plain encoder's embeddings of these, in float32."
-    precision: InEffect
+    precision: EffectivePrecision
     batch_size: int
     device: torch.device
 
-    def measured(self, kind: Kind, run: Callable[[Tensor], Tensor]) -> FastEncoder:
+    def measured(self, kind: EncoderKind, run: Callable[[Tensor], Tensor]) -> FastEncoder:
         """The candidate, with its agreement."""
         fast = FastEncoder(
             kind=kind,
@@ -136,7 +129,9 @@ class _Check:
         return black_B3HW.to(memory_format=torch.channels_last)
 
 
-def _compiled(module: OneBatch, check: _Check, folded: FastEncoder, say: Say) -> FastEncoder:
+def _compiled(
+    module: MirroredEncoder, check: _AgreementCheck, folded: FastEncoder, say: Log
+) -> FastEncoder:
     """`module` compiled, or `folded`, which it is, with the reason told."""
     say(
         f"compiling the encoder for batches of {check.batch_size}: this takes a while, less where it was done before"
@@ -148,7 +143,7 @@ def _compiled(module: OneBatch, check: _Check, folded: FastEncoder, say: Say) ->
         say(f"the encoder cannot be compiled here ({error}); it goes on uncompiled")
         return folded
     say(f"compiled in {time.perf_counter() - start:.0f} s")
-    if not fast.agreement >= LEAST_COSINE[check.precision]:
+    if not fast.agreement >= MIN_COSINE[check.precision]:
         say(
             f"the compiled encoder disagrees with the plain one ({check.told(fast)}); it goes on uncompiled"
         )
@@ -157,7 +152,7 @@ def _compiled(module: OneBatch, check: _Check, folded: FastEncoder, say: Say) ->
 
 
 def _int8(
-    module: OneBatch, check: _Check, calibration_B3HW: Tensor | None, say: Say
+    module: MirroredEncoder, check: _AgreementCheck, calibration_B3HW: Tensor | None, say: Log
 ) -> FastEncoder:
     """`module` quantised and compiled. Raises PrecisionError."""
     if calibration_B3HW is None or not len(calibration_B3HW):
@@ -181,23 +176,25 @@ def _int8(
             f"int8 needs a compiler and torch.compile failed ({error}); install g++, or choose --precision float32"
         ) from error
     say(f"int8 encoder, made in {time.perf_counter() - start:.0f} s: {check.told(fast)}")
-    if not fast.mean_agreement >= LEAST_COSINE["int8"]:
+    if not fast.mean_agreement >= MIN_COSINE["int8"]:
         raise PrecisionError(
             f"int8 embeddings agree with the float32 ones by a mean cosine of {fast.mean_agreement:.4f}, expected at least "
-            f"{LEAST_COSINE['int8']}; calibrate by more images that are like the gallery's, or choose --precision float32"
+            f"{MIN_COSINE['int8']}; calibrate by more images that are like the gallery's, or choose --precision float32"
         )
     return fast
 
 
-def _is_long(fast: FastEncoder, probe_B3HW: Tensor, images: int) -> bool:
+def _compiling_pays(fast: FastEncoder, probe_B3HW: Tensor, images: int) -> bool:
     """Whether `images` of them would take `fast` long enough for compiling to pay. The probe has
     warmed it up.
     """
     start = time.perf_counter()
     fast(probe_B3HW).cpu()  # waits for the device
-    return (time.perf_counter() - start) / len(probe_B3HW) * images >= COMPILING_PAYS_FROM
+    return (time.perf_counter() - start) / len(probe_B3HW) * images >= COMPILE_BREAK_EVEN_S
 
 
-def _embed(encoder: FeatureEncoder, mirror: bool, bfloat16: bool, images_B3HW: Tensor) -> Tensor:
+def _embed_plain(
+    encoder: FeatureEncoder, mirror: bool, bfloat16: bool, images_B3HW: Tensor
+) -> Tensor:
     with torch.autocast(images_B3HW.device.type, torch.bfloat16, enabled=bfloat16):
         return embed(encoder, images_B3HW, mirror)

@@ -8,10 +8,11 @@ import safetensors.torch
 from torch import Tensor, nn
 
 from model.backbones.resnet import BLOCKS, Depth
-from model.checkpoint import CheckpointError, refuse_damaged
+from model.checkpoint import check_integrity
+from model.errors import CheckpointError
 from model.weights import torch_files
 
-TORCHVISION = (
+TORCHVISION_HINT = (
     "a state dict of torchvision's ResNet: on a machine with a network, "
     "torchvision.models.resnet50(weights='IMAGENET1K_V1').state_dict() saved with torch.save"
 )
@@ -27,7 +28,7 @@ def read_state_dict(path: str) -> dict[str, Tensor]:
     try:
         data = Path(path).read_bytes()
     except FileNotFoundError:
-        raise CheckpointError(f"no weights at {path}; expected {TORCHVISION}") from None
+        raise CheckpointError(f"no weights at {path}; expected {TORCHVISION_HINT}") from None
     except OSError as error:
         raise CheckpointError(
             f"{path} is no state dict ({error}); expected .pth or .safetensors"
@@ -41,7 +42,7 @@ def parse_state_dict(data: bytes, name: str) -> dict[str, Tensor]:
 
     Raises CheckpointError.
     """
-    refuse_damaged(data, name)
+    check_integrity(data, name)
     try:
         if name.endswith(".safetensors"):
             return safetensors.torch.load(data)
@@ -59,7 +60,7 @@ def parse_state_dict(data: bytes, name: str) -> dict[str, Tensor]:
     return state
 
 
-def measure_backbone(state: dict[str, Tensor], name: str) -> tuple[Depth, float]:
+def infer_backbone(state: dict[str, Tensor], name: str) -> tuple[Depth, float]:
     """Depth and width of the ResNet that a state dict with torchvision's names is of.
 
     Raises CheckpointError when it is of none that we build.
@@ -92,7 +93,7 @@ def load_backbone(backbone: nn.Module, state: dict[str, Tensor], name: str) -> N
     Raises CheckpointError that lists the names which are missing, unexpected or of another shape.
     """
     given = {key: tensor for key, tensor in state.items() if not key.startswith("fc.")}
-    load_by_name(
+    load_renamed(
         backbone,
         given,
         f"{name} does not fit this backbone",
@@ -100,7 +101,7 @@ def load_backbone(backbone: nn.Module, state: dict[str, Tensor], name: str) -> N
     )
 
 
-def load_by_name(
+def load_renamed(
     module: nn.Module,
     given: dict[str, Tensor],
     complaint: str,

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from model.checkpoint import CheckpointError
-from model.pvda import PVDAConfig
-from model.training import Learner
-from model.weights.load import load_by_name, measure_backbone
+from model.config import PVDAConfig
+from model.errors import CheckpointError
+from model.training import EncoderWithClassifier
+from model.weights.load import infer_backbone, load_renamed
 
 OURS_TO_LPN = {
     r"encoder\.backbone\.": "model_1.model.",
@@ -29,7 +29,7 @@ OURS_TO_LPN = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Converted:
+class ConvertedWeights:
     """LPN's network as ours."""
 
     network: PVDAConfig
@@ -42,7 +42,7 @@ class Converted:
     "LPN's backbone of a view that we do not have, where it is another than the one that is taken."
 
 
-def convert_lpn(state: dict[str, Tensor], name: str, image_size: int = 256) -> Converted:
+def convert_lpn(state: dict[str, Tensor], name: str, image_size: int = 256) -> ConvertedWeights:
     """Encoder and classifier that embed and classify as LPN's do, its rings averaged over their
     boxes.
 
@@ -61,19 +61,21 @@ def convert_lpn(state: dict[str, Tensor], name: str, image_size: int = 256) -> C
             f"{name} is no three_view_net of LPN: its classifiers are numbered {numbers or 'not at all'} and its names begin "
             f"with {', '.join(list(state)[:3]) or 'nothing'}; expected classifier0, classifier1, ... and model_1.model.*"
         )
-    depth, width = measure_backbone(backbone_of(state, "model_1"), f"{name} (model_1.model)")
-    left_out = check_views(state, name)
+    depth, width = infer_backbone(backbone_of(state, "model_1"), f"{name} (model_1.model)")
+    left_out = check_shared_backbone(state, name)
     network = PVDAConfig(
         depth=depth, width=width, image_size=image_size, parts=len(numbers),
-        part_dim=rows(state, "classifier0.add_block.0.weight", name), ring_divisor="box",
+        part_dim=linear_outputs(state, "classifier0.add_block.0.weight", name), ring_divisor="box",
     )  # fmt: skip
-    learner = Learner(network, locations := rows(state, "classifier0.classifier.0.weight", name))
+    learner = EncoderWithClassifier(
+        network, locations := linear_outputs(state, "classifier0.classifier.0.weight", name)
+    )
     given = {
         key: tensor
         for key, tensor in state.items()
         if not re.match(r"model_[23]\.model\.|model_1\.model\.fc\.", key)
     }
-    load_by_name(
+    load_renamed(
         learner, given, f"{name} does not fit a ResNet-{depth} with {len(numbers)} rings",
         "expected a three_view_net of LPN with average pooling", lpn_name,
     )  # fmt: skip
@@ -81,7 +83,9 @@ def convert_lpn(state: dict[str, Tensor], name: str, image_size: int = 256) -> C
         "encoder": learner.encoder.state_dict(),
         "classifier": learner.classifier.state_dict(),
     }
-    return Converted(network=network, modules=modules, locations=locations, left_out=left_out)
+    return ConvertedWeights(
+        network=network, modules=modules, locations=locations, left_out=left_out
+    )
 
 
 def lpn_name(ours: str) -> str:
@@ -100,22 +104,22 @@ def backbone_of(state: dict[str, Tensor], view: str) -> dict[str, Tensor]:
     return {key: tensor for key, tensor in held.items() if not key.startswith("fc.")}
 
 
-def check_views(state: dict[str, Tensor], name: str) -> str | None:
+def check_shared_backbone(state: dict[str, Tensor], name: str) -> str | None:
     """Which backbone is left out: the street view's, where it is one of its own.
 
     The UAV's must be the satellite's (in a file of two views, the second the first): PVDA's encoder
     is shared by both. Raises CheckpointError where it is not.
     """
     other = "model_3" if backbone_of(state, "model_3") else "model_2"
-    if differing := differences(state, other):
+    if differing := differing_tensors(state, other):
         raise CheckpointError(
             f"{name} has a backbone per view: model_1 and {other} differ in {len(differing)} tensors, {differing[0]} first; "
             "expected one for satellite and UAV images; train LPN with --share"
         )
-    return "model_2" if differences(state, "model_2") else None
+    return "model_2" if differing_tensors(state, "model_2") else None
 
 
-def differences(state: dict[str, Tensor], other: str) -> list[str]:
+def differing_tensors(state: dict[str, Tensor], other: str) -> list[str]:
     """Names of what differs between the backbones of model_1 and another view; nothing where the
     other is not there.
     """
@@ -124,15 +128,15 @@ def differences(state: dict[str, Tensor], other: str) -> list[str]:
     return [
         key
         for key in names
-        if not (key in first and key in second and same(first[key], second[key]))
+        if not (key in first and key in second and tensors_equal(first[key], second[key]))
     ]
 
 
-def same(one: Tensor, other: Tensor) -> bool:
+def tensors_equal(one: Tensor, other: Tensor) -> bool:
     return one.shape == other.shape and one.dtype == other.dtype and torch.equal(one, other)
 
 
-def rows(state: dict[str, Tensor], key: str, name: str) -> int:
+def linear_outputs(state: dict[str, Tensor], key: str, name: str) -> int:
     """Outputs of a Linear. Raises CheckpointError where it is none."""
     if key not in state or state[key].ndim != 2:
         found = f"of shape {tuple(state[key].shape)}" if key in state else "missing"

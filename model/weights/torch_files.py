@@ -17,13 +17,13 @@ def read(data: bytes) -> Any:
     """What `torch.save` wrote. Raises ValueError, and whatever torch does."""
     if zipfile.is_zipfile(io.BytesIO(data)):
         with zipfile.ZipFile(io.BytesIO(data)) as parts:
-            refuse_packed(parts, len(data))
+            require_uncompressed(parts, len(data))
     found = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    refuse_hollow(found)
+    require_full_tensors(found)
     return found
 
 
-def refuse_packed(parts: zipfile.ZipFile, size: int) -> None:
+def require_uncompressed(parts: zipfile.ZipFile, size: int) -> None:
     """Raise ValueError where a zip of `size` bytes holds more than these.
 
     torch writes records as they are: one that inflates may be of any size, and so may many that
@@ -37,7 +37,7 @@ def refuse_packed(parts: zipfile.ZipFile, size: int) -> None:
         raise ValueError("it is packed in another way than torch does")
 
 
-def refuse_hollow(value: Any) -> None:
+def require_full_tensors(value: Any) -> None:
     """Raise ValueError where a tensor says that it is larger than what is there: one number may be
     strided into any shape.
     """

@@ -8,7 +8,7 @@ one of each task where there are several.
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,15 +18,15 @@ from pipeline.core import storage
 from pipeline.core.progress import progress
 from pipeline.core.records import View
 from pipeline.evaluation import breakdowns, exports
+from pipeline.evaluation.settings import Export
 from pipeline.features.table import FeatureTable
 from pipeline.retrieval import view_gap
+from pipeline.retrieval.metrics import Protocol
 from pipeline.retrieval.parts import measure_parts
 from pipeline.retrieval.results import GAP, GROUPS, PARTS, VIEWS
 from pipeline.retrieval.subsets import taken
-from pipeline.retrieval.tasks import Protocol, Task, sides_of
+from pipeline.retrieval.tasks import Task, sides_of
 from pipeline.retrieval.views import view_curve
-
-Export = Literal["answer", "mat"]
 
 
 @dataclass(frozen=True, kw_only=True)

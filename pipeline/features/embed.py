@@ -9,7 +9,6 @@ killed, the table ends up with the same bytes: a part is a function of its shard
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import ray
@@ -21,7 +20,6 @@ from pipeline.core.cluster import Node, Placement, plan_placement
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.lock import locks_output
 from pipeline.core.progress import console, progress
-from pipeline.core.records import Split, View
 from pipeline.features import expected_parts
 from pipeline.features.embed_worker import (
     IN_FLIGHT,
@@ -41,54 +39,12 @@ from pipeline.features.part import (
     verify_part,
     write_rejected,
 )
+from pipeline.features.settings import EmbeddingSettings
 from pipeline.shards.external import open_manifest
 from pipeline.shards.manifest import MANIFEST, Manifest, Shard, missing_tars, repair_hint
 from pipeline.shards.verify import require_intact
 
 __all__ = ["EmbeddingSettings", "Encoder", "EncoderSpec", "IncompleteEmbedding", "embed_gallery"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class EmbeddingSettings:
-    """Which shards are embedded into which table, and how the work is spread."""
-
-    shards: str
-    "Folder or URI of the shards."
-    out: str
-    "Folder or URI of the feature table."
-    split: Split | None = None
-    "Only this split; of shards that others made, which have no manifest, what they are."
-    view: View | None = None
-    "Only this view; likewise."
-    batch_size: int = 32
-    "Images per forward pass."
-    dtype: str = "float32"
-    "Of the stored embeddings: float32, or float16 for half the space."
-    workers: int | None = None
-    "Actors; by default one per GPU, or where there is none one per eight CPU cores."
-    cpus_per_worker: int | None = None
-    "CPU cores of an actor; by default as many as let all actors fit on the nodes that are up."
-    gpus_per_worker: float | None = None
-    "GPUs of an actor; by default 1 where the cluster has any, else 0."
-    decode_threads: int | None = None
-    """Threads of an actor that decode; by default its cores but one beside a GPU, else one per four
-    cores."""
-    patience: float = 600.0
-    "Seconds to wait for the first actor to start, before giving up."
-    verify: bool = False
-    """Look at every byte of the shards first, and of the parts that are done: damaged parts are
-    embedded again."""
-
-    def __post_init__(self) -> None:
-        if self.batch_size < 1:
-            raise InputError(f"--batch-size is {self.batch_size}, expected at least 1")
-        if self.dtype not in ("float32", "float16"):
-            raise InputError(f"--dtype is {self.dtype!r}, expected float32 or float16")
-        for name in ("workers", "cpus_per_worker", "decode_threads"):
-            if (value := getattr(self, name)) is not None and value < 1:
-                raise InputError(f"--{name.replace('_', '-')} is {value}, expected at least 1")
-        if self.gpus_per_worker is not None and self.gpus_per_worker < 0:
-            raise InputError(f"--gpus-per-worker is {self.gpus_per_worker}, expected 0 or more")
 
 
 class IncompleteEmbedding(Incomplete):

@@ -8,7 +8,7 @@ and one of the gallery.
 
 import hashlib
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -17,25 +17,11 @@ from pipeline.core.errors import InputError
 from pipeline.core.lock import locks_output
 from pipeline.core.records import Split, View, make_key
 from pipeline.features.mat_file import NUMBERS, IsHdf5, Unreadable, read_mat
+from pipeline.features.settings import ImportSettings
 from pipeline.features.table import Floats, PartFooter, PartRows, write_part
 
 PART_ROWS = 8_192
 JUNK_LABEL = -1  # the official evaluation takes gallery rows of this label out of the ranking
-ViewName = Literal["drone", "satellite", "street", "google"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImportSettings:
-    """Features to import."""
-
-    mat: str
-    "The .mat file (MATLAB 5, as scipy.io.savemat writes it); a path or a URI."
-    out: str
-    "Folder for the tables: queries and gallery appear in it."
-    query_view: ViewName = "drone"
-    "View of the queries, where the file holds no paths that say it."
-    gallery_view: ViewName = "satellite"
-    "View of the gallery, where the file holds no paths that say it."
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,8 @@ from pipeline.images.decode import DecodeError, decode
 from pipeline.images.thumbnails import ImageLoader
 from pipeline.report import figure_charts
 from pipeline.report.error_map import error_map
-from pipeline.report.inputs import Extras, Findings, Format
+from pipeline.report.inputs import Extras, Findings
+from pipeline.report.options import Format
 from pipeline.report.panels import ANSWERS, is_hit
 from pipeline.report.tasks import Choice, choose, task_view
 from pipeline.retrieval.parts import part_label

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -16,8 +16,6 @@ from pipeline.core.errors import InputError
 from pipeline.features.table import Floats
 from pipeline.retrieval.results import GAP, GROUPS, METRICS, PARTS, RESULTS, VIEWS, read_rows
 
-Format = Literal["png", "pdf"]
-"Of the figures for a paper."
 Vectors = Callable[[Iterable[str]], dict[str, Floats]]
 "Embeddings (D,) by key; keys that are not known are absent."
 COLUMNS = frozenset({"query", "task", "protocol", "multi_query", "first_match_rank", "ap"})

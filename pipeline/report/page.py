@@ -18,7 +18,8 @@ from pipeline.report import charts, map_sheet, svg
 from pipeline.report.charts import scatter, scores_chart, views_chart
 from pipeline.report.error_map import distance_chart, error_map
 from pipeline.report.inputs import Extras, Findings, Vectors, no_vectors
-from pipeline.report.panels import PANELS, make_panel
+from pipeline.report.options import PANELS
+from pipeline.report.panels import make_panel
 from pipeline.report.tables import group_tables, part_tables
 from pipeline.report.tasks import MEASURES, Choice, choose, task_view
 from pipeline.retrieval.subsets import evenly

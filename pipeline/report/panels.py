@@ -14,7 +14,6 @@ from pipeline.images.thumbnails import ANSWER_PX, QUERY_PX, ThumbnailCache
 from pipeline.retrieval.parts import cosines_by_part
 from pipeline.retrieval.subsets import evenly
 
-PANELS = 4  # hits and as many misses for each task
 ANSWERS = 5
 MOSAIC, MOSAIC_PX = 9, 96  # images that stand for a merged query, three a row
 

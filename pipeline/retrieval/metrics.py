@@ -13,10 +13,15 @@ belongs to; both arrays are ordered by query, then by rank.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from pipeline.core.arrays import Doubles, Ints
+
+Protocol = Literal["full", "queried-only"]
+"""full: the official one, the whole gallery with its distractors. queried-only: gallery rows of
+queried locations alone."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,8 +17,9 @@ import numpy as np
 
 from pipeline.features.table import FeatureTable, Floats
 from pipeline.retrieval.bootstrap import measures_of
+from pipeline.retrieval.metrics import Protocol
 from pipeline.retrieval.ranking import Blocks, Side, rank_spread
-from pipeline.retrieval.tasks import Protocol, Task, sides_of
+from pipeline.retrieval.tasks import Task, sides_of
 
 MOST_PARTS = (
     16  # twice what the field's networks have; a vector of signs would else pass for D parts

@@ -7,7 +7,7 @@ block, Q queries, L locations, D dimensions.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,12 +19,10 @@ from pipeline.core.records import Split, View
 from pipeline.features.table import FeatureTable, Floats
 from pipeline.retrieval import geo_metrics, metrics
 from pipeline.retrieval.bootstrap import intervals
+from pipeline.retrieval.metrics import Protocol
 from pipeline.retrieval.ranking import Blocks, Ranking, Side, rank_spread
 from pipeline.retrieval.subsets import mean_by_location
 
-Protocol = Literal["full", "queried-only"]
-"""full: the official one, the whole gallery with its distractors. queried-only: gallery rows of
-queried locations alone."""
 TOP = 10
 MEASURES = ("r1", "r5", "r10", "r1p", "ap")
 

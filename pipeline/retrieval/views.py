@@ -14,9 +14,10 @@ import pyarrow as pa
 from pipeline.features.table import FeatureTable
 from pipeline.retrieval import metrics
 from pipeline.retrieval.bootstrap import intervals
+from pipeline.retrieval.metrics import Protocol
 from pipeline.retrieval.ranking import Blocks, rank_spread
 from pipeline.retrieval.subsets import mean_by_views, views_possible
-from pipeline.retrieval.tasks import Protocol, Task, sides_of
+from pipeline.retrieval.tasks import Task, sides_of
 
 VIEWS_SCHEMA = pa.schema(
     [

@@ -10,7 +10,7 @@ import json
 import tarfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import IO, Any, Literal
+from typing import IO, Any
 
 from pipeline.core import storage
 from pipeline.core.prefetch import prefetch_map
@@ -21,11 +21,10 @@ from pipeline.shards import record_table
 from pipeline.shards.manifest import Shard
 from pipeline.shards.plan import ShardPlan
 from pipeline.shards.record_table import Packed
+from pipeline.shards.settings import Check
 from pipeline.sources import name_of
 from pipeline.sources.base import Source
 
-Check = Literal["quick", "full"]
-"How an image is judged: by its headers and its end, or by decoding it."
 READERS, REMOTE_READERS, READ_AHEAD = 1, 16, 64
 """Threads that read and judge images ahead of the tar, from a disk of this machine (more only get
 in each other's way) and over a network, and how many images they may be ahead."""

@@ -83,7 +83,7 @@ def training_content(folder: Path) -> Content:
             for key, inner in value.items():
                 add(f"{name}/{key}", inner)
 
-    add("state", {name: checkpoint.state[name] for name in ("modules", "optimisers")})
+    add("state", {name: checkpoint.state[name] for name in ("modules", "optimizers")})
     return found
 
 

@@ -11,7 +11,8 @@ import pytest
 
 from pipeline.core.errors import InputError
 from pipeline.evaluation.compare import compare, latex, markdown
-from pipeline.evaluation.evaluate import EvaluationSettings, evaluate
+from pipeline.evaluation.evaluate import evaluate
+from pipeline.evaluation.settings import EvaluationSettings
 from pipeline.report.inputs import Findings, read_findings
 from pipeline.retrieval.tasks import RESULTS_SCHEMA
 from tests.evaluation.test_evaluate import TEST_SET, made_table

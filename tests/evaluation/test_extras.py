@@ -14,7 +14,8 @@ from jobs import evaluate as job
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.evaluation import breakdowns
-from pipeline.evaluation.evaluate import EvaluationSettings, evaluate
+from pipeline.evaluation.evaluate import evaluate
+from pipeline.evaluation.settings import EvaluationSettings
 from pipeline.features.table import PartFooter, PartRows, write_part
 from pipeline.retrieval.tasks import RESULTS_SCHEMA
 from tests.evaluation.test_evaluate import TEST_SET, made_table

@@ -9,8 +9,9 @@ import pytest
 from pipeline.batches.ordered import CHANGED
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.features.embed import EmbeddingSettings, Encoder, EncoderSpec, embed_gallery
+from pipeline.features.embed import Encoder, EncoderSpec, embed_gallery
 from pipeline.features.part import read_rejected
+from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table, read_footer
 from pipeline.shards.manifest import read_manifest
 from pipeline.shards.samples import read_shard

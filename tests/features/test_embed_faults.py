@@ -21,14 +21,9 @@ import pytest
 from pipeline.core import cluster, json_files, storage
 from pipeline.core.cluster import Node
 from pipeline.core.errors import InputError
-from pipeline.features.embed import (
-    EmbeddingSettings,
-    Encoder,
-    EncoderSpec,
-    IncompleteEmbedding,
-    embed_gallery,
-)
+from pipeline.features.embed import Encoder, EncoderSpec, IncompleteEmbedding, embed_gallery
 from pipeline.features.part import part_names, read_footer, read_rejected
+from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table, verify_table
 from pipeline.shards.manifest import Shard, read_manifest
 from tests.damaging import update_checksum

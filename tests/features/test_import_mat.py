@@ -12,8 +12,10 @@ import scipy.io
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.evaluation import exports
-from pipeline.evaluation.evaluate import EvaluationSettings, evaluate
-from pipeline.features.import_mat import ImportSettings, import_features
+from pipeline.evaluation.evaluate import evaluate
+from pipeline.evaluation.settings import EvaluationSettings
+from pipeline.features.import_mat import import_features
+from pipeline.features.settings import ImportSettings
 from pipeline.features.table import PartFooter, PartRows, open_table, write_part
 from tests.evaluation.test_evaluate import TEST_SET, made_table
 

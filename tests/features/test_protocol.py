@@ -14,8 +14,9 @@ import pytest
 
 from pipeline.core.records import Split, View
 from pipeline.features.table import Floats, PartFooter, PartRows, open_table, write_part
+from pipeline.retrieval.metrics import Protocol
 from pipeline.retrieval.ranking import Blocks
-from pipeline.retrieval.tasks import Protocol, Task, retrieve
+from pipeline.retrieval.tasks import Task, retrieve
 
 Listed = list[tuple[str, Floats]]
 

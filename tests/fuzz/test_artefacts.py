@@ -43,10 +43,12 @@ from pipeline.locate.logistic import LogisticModel
 from pipeline.locate.reliability import ReliabilityBin
 from pipeline.report.inputs import read_findings, read_training
 from pipeline.shards.manifest import Manifest, Shard, read_manifest
-from pipeline.shards.pack import PackingSettings, find_finished
+from pipeline.shards.pack import find_finished
 from pipeline.shards.record_table import Packed, read_packed, read_part
 from pipeline.shards.record_table import write_part as write_records
-from pipeline.simulation.simulate import SimulationSettings, simulate
+from pipeline.shards.settings import PackingSettings
+from pipeline.simulation.settings import SimulationSettings
+from pipeline.simulation.simulate import simulate
 from tests.fuzz.bounds import bounded, examples
 from tests.fuzz.hostile import damaged, twisted
 

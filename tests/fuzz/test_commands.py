@@ -226,8 +226,10 @@ OVERRIDES = [
 
 def job_of(name: str) -> tuple[Callable[..., Any], Callable[[list[str]], list[str]]]:
     module = importlib.import_module(f"jobs.{name}")
-    reword = {"make_shards": "source_as_subcommand", "train": "known_recipe"}.get(name)
-    return module.main, getattr(module, reword) if reword else lambda arguments: arguments
+    preprocess_argv = {"make_shards": "source_as_subcommand", "train": "known_recipe"}.get(name)
+    return module.main, getattr(
+        module, preprocess_argv
+    ) if preprocess_argv else lambda arguments: arguments
 
 
 def call(
@@ -237,13 +239,13 @@ def call(
     monkeypatch: pytest.MonkeyPatch,
 ) -> tuple[int, str]:
     """Exit code, and what was said on the error stream."""
-    job, reword = job_of(name)
+    job, preprocess_argv = job_of(name)
     monkeypatch.setattr("sys.argv", [name, *arguments])
     capsys.readouterr()
     code: Any = 0
     with bounded(megabytes=600, seconds=20):
         try:
-            cli.run(job, reword)
+            cli.run(job, preprocess_argv)
         except SystemExit as ended:
             code = ended.code or 0
     return code, capsys.readouterr().err

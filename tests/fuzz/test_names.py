@@ -18,7 +18,8 @@ from pipeline.core.progress import CONTROL_CHARACTERS, console, escape_controls,
 from pipeline.core.rejections import REJECTED_FILE
 from pipeline.locate.photo_files import find_photos
 from pipeline.shards.manifest import read_manifest
-from pipeline.shards.pack import PackingSettings, pack
+from pipeline.shards.pack import pack
+from pipeline.shards.settings import PackingSettings
 from pipeline.sources.photos import Photos
 from pipeline.sources.university1652 import University1652
 from tests.fuzz.bounds import bounded, examples

@@ -18,11 +18,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jobs.import_weights import Settings, import_weights
-from model.checkpoint import Checkpoint, CheckpointError, build_encoder, dumps, fingerprint, loads
-from model.pvda import FeatureEncoder, PVDAConfig
-from model.weights.load import measure_backbone, parse_state_dict
+from model.checkpoint import Checkpoint, build_encoder, dumps, fingerprint, loads
+from model.config import PVDAConfig
+from model.errors import CheckpointError
+from model.pvda import FeatureEncoder
+from model.weights.load import infer_backbone, parse_state_dict
 from pipeline.core.errors import InputError
-from pipeline.features.import_mat import ImportSettings, import_features
+from pipeline.features.import_mat import import_features
+from pipeline.features.settings import ImportSettings
 from tests.fuzz.bounds import bounded, examples
 from tests.fuzz.hostile import VALUES, damaged, twisted, values
 
@@ -140,7 +143,7 @@ def test_a_tensor_that_is_not_there(tensor: torch.Tensor) -> None:
     open_all(saved(plain() | {"state": {"modules": {"encoder": state | {name: tensor}}}}))
     open_all(saved(plain() | {"running": {"x": tensor}}))
     with bounded(CheckpointError):
-        measure_backbone(
+        infer_backbone(
             parse_state_dict(
                 saved({"conv1.weight": tensor, "layer1.0.conv1.weight": tensor}), "x.pth"
             ),

@@ -23,10 +23,11 @@ from pipeline.core.records import Split, View
 from pipeline.features.table import open_table
 from pipeline.index import build as index_build
 from pipeline.index import workspace
-from pipeline.index.build import IndexSettings, build_index, parse_bytes
+from pipeline.index.build import build_index
 from pipeline.index.part import read_faiss
 from pipeline.index.plan import GallerySpec, IndexPlan, plan_index
 from pipeline.index.searcher import Index
+from pipeline.index.settings import IndexSettings, parse_bytes
 from pipeline.index.units import even_groups, merge_units, plan_units
 from tests.index.index_tables import clustered, write_gallery, write_table_part
 
@@ -103,7 +104,8 @@ def test_an_index_in_parts_answers_as_one(table: str, tmp_path: Path, factory: s
 KILLED = """
     import os, signal, sys
     from pipeline.index import plan as index_plan, workspace as index_work
-    from pipeline.index.build import IndexSettings, build_index
+    from pipeline.index.build import build_index
+    from pipeline.index.settings import IndexSettings
     from pipeline.core.records import Split, View
     index_plan.LEAST_UNIT_ROWS, index_plan.UNIT_SHARE = 250, 0
     calls = 0

@@ -11,10 +11,12 @@ import pytest
 
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.evaluation.evaluate import EvaluationSettings, plan
+from pipeline.evaluation.evaluate import plan
+from pipeline.evaluation.settings import EvaluationSettings
 from pipeline.features.table import open_table
-from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.build import build_index
 from pipeline.index.searcher import Index
+from pipeline.index.settings import IndexSettings
 from pipeline.index.units import checksum_ok, write_checksum
 from pipeline.index.update import extend_index, verify_index
 from tests.damaging import count_detected, damaged_versions, raising_if_missing

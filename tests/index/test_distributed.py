@@ -10,10 +10,11 @@ from pipeline.core.errors import InputError
 from pipeline.core.geo import Circle
 from pipeline.core.records import Split, View
 from pipeline.features.table import open_table
-from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.build import build_index
 from pipeline.index.distributed import DistributedIndex
 from pipeline.index.filters import Filter
 from pipeline.index.searcher import Index
+from pipeline.index.settings import IndexSettings
 from pipeline.index.update import remove_locations
 from tests.index.index_tables import write_gallery
 

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.core.records import Split
 from pipeline.features.table import open_table
-from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.build import build_index
 from pipeline.index.metadata import SearchParams
 from pipeline.index.recall import (
     RecallQueries,
@@ -18,6 +18,7 @@ from pipeline.index.recall import (
     without_own_row,
 )
 from pipeline.index.searcher import Index
+from pipeline.index.settings import IndexSettings
 from pipeline.index.train import effective_dimension, new_index, sample_rows
 from pipeline.index.workspace import rows_by_part
 from tests.index.index_tables import clustered, write_gallery

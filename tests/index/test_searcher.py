@@ -14,11 +14,12 @@ from pipeline.core.errors import InputError
 from pipeline.core.geo import Box, Circle
 from pipeline.core.records import Split, View
 from pipeline.features.table import Floats, open_table
-from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.build import build_index
 from pipeline.index.filters import Filter
 from pipeline.index.metadata import SearchParams
 from pipeline.index.part import FILTERED_EXACT_ROWS, NO_ROW
 from pipeline.index.searcher import Index, merge_results
+from pipeline.index.settings import IndexSettings
 from tests.index.index_tables import write_gallery
 
 FACTORIES = [

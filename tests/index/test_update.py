@@ -12,9 +12,10 @@ from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.features.table import open_table
 from pipeline.index import workspace
-from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.build import build_index
 from pipeline.index.filters import Filter
 from pipeline.index.searcher import Index
+from pipeline.index.settings import IndexSettings
 from pipeline.index.update import extend_index, remove_locations, verify_index
 from tests.index.index_tables import clustered, write_gallery, write_table_part
 

@@ -18,10 +18,12 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from jobs.train import Settings, train
-from jobs.training.checkpoints import Checkpoints, Conduct, Run, find_checkpoint, older_names
-from jobs.training.metrics import NotFinite, Tally
+from jobs.training.checkpoints import CheckpointWriter, find_checkpoint, list_archived
+from jobs.training.metrics import MetricAccumulator, NotFinite
 from jobs.training.recipes import Recipe, smoke
-from model.checkpoint import Checkpoint, CheckpointError, loads
+from jobs.training.settings import RunConfig, RunOptions
+from model.checkpoint import Checkpoint, loads
+from model.errors import CheckpointError
 from model.pvda import FeatureEncoder
 from model.training import Training
 from pipeline.core import storage
@@ -156,16 +158,16 @@ def test_a_process_killed_at_a_random_moment_and_run_again_ends_as_if_nothing_ha
 def test_killed_as_an_epochs_checkpoint_is_written_a_run_has_that_epochs_row_once(
     tiny_shards: str, tmp_path: Path, undisturbed: Path, written: bool
 ) -> None:
-    write = Checkpoints.write
+    write = CheckpointWriter.write
 
-    def killed(checkpoints: Checkpoints, checkpoint: Checkpoint) -> None:
+    def killed(checkpoints: CheckpointWriter, checkpoint: Checkpoint) -> None:
         if checkpoint.epoch < 1 or written:
             write(checkpoints, checkpoint)
         if checkpoint.epoch == 1:
             raise Killed
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Checkpoints, "write", killed)
+        patch.setattr(CheckpointWriter, "write", killed)
         with pytest.raises(Killed):
             train(settings(tiny_shards, tmp_path))
     time.sleep(1)  # TensorBoard orders a run's files by the second in which each was begun
@@ -215,7 +217,7 @@ def test_the_last_checkpoints_are_kept_and_a_damaged_one_gives_way_to_the_one_be
         kill_at(patch, 5)
         with pytest.raises(Killed):
             train(settings(tiny_shards, tmp_path, keep=3))
-    assert older_names(str(tmp_path)) == ["checkpoint-0001-00001.pt", "checkpoint-0001-00000.pt"]
+    assert list_archived(str(tmp_path)) == ["checkpoint-0001-00001.pt", "checkpoint-0001-00000.pt"]
     last = tmp_path / "last.pt"
     last.write_bytes(last.read_bytes()[:-1000])
     train(settings(tiny_shards, tmp_path))
@@ -224,7 +226,7 @@ def test_the_last_checkpoints_are_kept_and_a_damaged_one_gives_way_to_the_one_be
     assert "taking checkpoint-0001-00001.pt, the one before it" in said
     assert "going on after epoch 1 of 3 and 1 of 3 steps" in said
     assert_same_run(tmp_path, undisturbed)
-    assert older_names(str(tmp_path)) == ["checkpoint-0002-00002.pt"]
+    assert list_archived(str(tmp_path)) == ["checkpoint-0002-00002.pt"]
 
 
 def made(epoch: int, step: int = 0) -> Checkpoint:
@@ -242,9 +244,9 @@ def made(epoch: int, step: int = 0) -> Checkpoint:
 
 
 def test_checkpoints_are_kept_on_any_storage() -> None:
-    run = Run(shards="nowhere", out="memory://run-folder/run", recipe=tiny(), keep=2)
+    run = RunConfig(shards="nowhere", out="memory://run-folder/run", recipe=tiny(), keep=2)
     assert find_checkpoint(run) is None
-    checkpoints = Checkpoints(run, None)
+    checkpoints = CheckpointWriter(run, None)
     for epoch in (1, 2, 3):
         checkpoints.write(made(epoch, step=epoch))
     assert storage.list_names(run.out) == ["checkpoint-0002-00002.pt", "last.pt"]
@@ -254,7 +256,7 @@ def test_checkpoints_are_kept_on_any_storage() -> None:
     assert found is not None
     assert (found[0], found[1].epoch, found[1].step) == ("checkpoint-0002-00002.pt", 2, 2)
     assert len(said) == 1
-    Checkpoints(run, found).write(made(4))  # a damaged file is not kept
+    CheckpointWriter(run, found).write(made(4))  # a damaged file is not kept
     assert storage.list_names(run.out) == ["checkpoint-0002-00002.pt", "last.pt"]
     storage.remove(storage.join(run.out, "last.pt"))
     assert find_checkpoint(run, said.append) is not None
@@ -289,13 +291,13 @@ def test_a_run_that_diverges_stops_with_one_sentence_and_keeps_the_last_good_che
 
 def test_a_tally_goes_on_to_the_same_sums_and_tells_what_is_not_finite() -> None:
     steps = [{"a": torch.tensor(0.1 * n), "b": torch.tensor(1.0 / (n + 1))} for n in range(6)]
-    whole, first = Tally(), Tally()
+    whole, first = MetricAccumulator(), MetricAccumulator()
     for step in steps:
         whole.add(step)
     for step in steps[:3]:
         first.add(step)
     held = first.running()
-    second = Tally(first.steps, held)
+    second = MetricAccumulator(first.steps, held)
     for step in steps[3:]:
         second.add(step)
     assert whole.means() == second.means()
@@ -311,4 +313,4 @@ def test_a_tally_goes_on_to_the_same_sums_and_tells_what_is_not_finite() -> None
 )
 def test_a_conduct_that_keeps_nothing_is_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=r"expected (at least 1|0 or more)"):
-        Conduct(**wrong)
+        RunOptions(**wrong)

@@ -9,8 +9,10 @@ from typing import Any
 import pytest
 import torch
 
-from model.checkpoint import SEAL_BYTES, Checkpoint, CheckpointError, dumps, loads, refuse_damaged
-from model.pvda import FeatureEncoder, PVDAConfig
+from model.checkpoint import CHECKSUM_BYTES, Checkpoint, check_integrity, dumps, loads
+from model.config import PVDAConfig
+from model.errors import CheckpointError
+from model.pvda import FeatureEncoder
 from model.weights.load import read_state_dict
 from tests.damaging import count_detected, damaged_versions, error_message, raising_if_missing
 
@@ -32,7 +34,7 @@ def held() -> Checkpoint:
 
 def unsealed(data: bytes) -> bytes:
     """As it was written before there were seals."""
-    return data[: -SEAL_BYTES - 2] + bytes(2)
+    return data[: -CHECKSUM_BYTES - 2] + bytes(2)
 
 
 def plain(value: Any) -> Any:
@@ -60,7 +62,7 @@ def test_damaged_bytes_of_the_zips_own_directory_are_found(held: Checkpoint) -> 
     for number, damaged in enumerate(damaged_versions(end, 300)):
         if damaged is not None and damaged != end:
             said = error_message(
-                partial(refuse_damaged, data[: -len(end)] + damaged, "x"), CheckpointError
+                partial(check_integrity, data[: -len(end)] + damaged, "x"), CheckpointError
             )
             assert said is not None, number
 

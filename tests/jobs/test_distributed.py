@@ -12,16 +12,16 @@ import torch
 from torch import Tensor, nn
 from torch.multiprocessing import spawn  # type: ignore[attr-defined]
 
-from jobs.train import distribute, share
+from jobs.train import broadcast_checkpoint, wrap_ddp
 from model.checkpoint import Checkpoint
-from model.pvda import PVDAConfig
-from model.schedule import Phase
-from model.training import Optimisation, Training
+from model.config import Optimization, PVDAConfig
+from model.schedule import ScheduleState
+from model.training import Training
 
 CONFIG = PVDAConfig(
     depth=18, width=0.25, image_size=64, parts=2, part_dim=8, dropout=0.0, discriminator_channels=16
 )
-STILL = Phase(alpha=0.9, rate_scale=0.0)
+STILL = ScheduleState(alpha=0.9, lr_scale=0.0)
 """Rates of zero: gradients are computed and nothing moves, so D's first Adam step cannot blow up a
 last bit."""
 WORKERS, EACH, LOCATIONS = 2, 3, 5
@@ -66,13 +66,13 @@ def work(rank: int, port: int, out: str) -> None:
     address = f"tcp://127.0.0.1:{port}"
     torch.distributed.init_process_group("gloo", init_method=address, rank=rank, world_size=WORKERS)
     torch.manual_seed(rank)  # DDP gives all workers the weights of rank 0
-    training = frozen(Training(CONFIG, Optimisation(), LOCATIONS, distribute=distribute))
+    training = frozen(Training(CONFIG, Optimization(), LOCATIONS, distribute=wrap_ddp))
     drone, location1_B, satellite, location2_B = (
         tensor[rank * EACH : (rank + 1) * EACH] for tensor in batch()
     )
     for _ in range(2):  # a second step: nothing of the first one's bookkeeping is left over
         training.step(drone, location1_B, satellite, location2_B, STILL)
-    found = share(("last.pt", checkpoint(epoch=7)) if rank == 0 else None)
+    found = broadcast_checkpoint(("last.pt", checkpoint(epoch=7)) if rank == 0 else None)
     assert found is not None
     torch.save((gradients(training), found[1].epoch), f"{out}/{rank}.pt")
     torch.distributed.destroy_process_group()
@@ -86,7 +86,7 @@ def test_gradients_of_two_workers_are_those_of_one_with_all_their_images_and_all
         port = int(free.getsockname()[1])
     spawn(work, (port, str(tmp_path)), nprocs=WORKERS)  # type: ignore[no-untyped-call]
     torch.manual_seed(0)
-    alone = frozen(Training(CONFIG, Optimisation(), LOCATIONS))
+    alone = frozen(Training(CONFIG, Optimization(), LOCATIONS))
     for _ in range(2):
         alone.step(*batch(), STILL)
     wanted = gradients(alone)

@@ -11,16 +11,18 @@ import pytest
 import torch
 
 from jobs.encoding import encoder as encoders
-from jobs.encoding.encoder import PROBE_IMAGES, EncoderSettings, first_images, make_encoder_spec
-from jobs.training.checkpoints import Run
-from jobs.training.loop import untrained
+from jobs.encoding.encoder import PROBE_IMAGES, first_images, make_encoder_spec
+from jobs.encoding.settings import EncoderSettings
+from jobs.training.loop import initial_checkpoint
 from jobs.training.recipes import smoke
+from jobs.training.settings import RunConfig
 from model.checkpoint import build_encoder, loads
 from model.inference.embed import embed
 from model.inference.int8 import PrecisionError
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split
-from pipeline.features.embed import EmbeddingSettings, embed_gallery
+from pipeline.features.embed import embed_gallery
+from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table
 from pipeline.images.transforms import Resizer
 from pipeline.shards.external import open_manifest
@@ -28,7 +30,9 @@ from pipeline.shards.external import open_manifest
 
 @pytest.fixture(scope="module")
 def checkpoint(tiny_shards: str) -> bytes:
-    return untrained(Run(shards=tiny_shards, out="none", recipe=replace(smoke(1), batch_size=2)))
+    return initial_checkpoint(
+        RunConfig(shards=tiny_shards, out="none", recipe=replace(smoke(1), batch_size=2))
+    )
 
 
 def asked(shards: str, **changes: object) -> EmbeddingSettings:

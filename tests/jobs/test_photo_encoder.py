@@ -10,8 +10,10 @@ from PIL import Image
 
 from jobs.encoding.photo_encoder import PhotoEncoder
 from model.checkpoint import Checkpoint, dumps, fingerprint, loads
-from model.inference.embed import embed, with_precision
-from model.pvda import FeatureEncoder, PVDAConfig
+from model.config import PVDAConfig
+from model.inference.embed import embed
+from model.inference.precision import describe_preprocessing
+from model.pvda import FeatureEncoder
 from pipeline.batches.ordered import stack
 from pipeline.core.errors import InputError
 from pipeline.images.decode import decode
@@ -30,7 +32,7 @@ def checkpoint(lively_encoder: FeatureEncoder) -> bytes:
 def facts(
     checkpoint: bytes, resizer: Resizer = "torch", mirror: bool = True, precision: Any = "float32"
 ) -> dict[str, Any]:
-    said = with_precision(f"{preprocessing_name(resizer)}, mirror {mirror}", precision)
+    said = describe_preprocessing(f"{preprocessing_name(resizer)}, mirror {mirror}", precision)
     return {"fingerprint": fingerprint(loads(checkpoint), said)}
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from jobs.training.probes import look, see, view_gap
+from jobs.training.probes import embed_view, probe, view_gap
 from jobs.training.recipes import smoke
 from model.pvda import FeatureEncoder
 from pipeline.batches.training import StreamConfig, TrainingStream
@@ -60,7 +60,7 @@ def test_a_look_at_training_places_leaves_the_encoder_as_it_was(
     encoder = FeatureEncoder(replace(smoke().network, part_dim=16)).train()
     before = {name: tensor.clone() for name, tensor in encoder.state_dict().items()}
     stream = TrainingStream(tiny_shards, StreamConfig(batch_size=2, image_size=64, hold_out=share))
-    found = look(encoder, stream)
+    found = probe(encoder, stream)
     assert encoder.training
     assert all(torch.equal(before[name], tensor) for name, tensor in encoder.state_dict().items())
     names = {"view_gap/accuracy", "view_gap/distance"}
@@ -69,7 +69,7 @@ def test_a_look_at_training_places_leaves_the_encoder_as_it_was(
         names |= {f"held_out/{task}/{measure}" for task in tasks for measure in ("r1", "ap")}
     assert set(found) == names
     assert all(value >= 0 for value in found.values())
-    assert found == look(encoder, stream)
+    assert found == probe(encoder, stream)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
@@ -80,7 +80,7 @@ def test_a_look_leaves_out_damaged_images_and_says_where_all_are(
     stream = TrainingStream(
         tiny_shards, StreamConfig(batch_size=2, image_size=64, hold_out=share, threads=1)
     )
-    whole = see(encoder, stream, View.DRONE)
+    whole = embed_view(encoder, stream, View.DRONE)
     drawn, every = count(), 2
 
     def failing(data: bytes) -> Pixels:
@@ -89,9 +89,9 @@ def test_a_look_leaves_out_damaged_images_and_says_where_all_are(
         return decode(data)
 
     monkeypatch.setattr("pipeline.batches.ordered.decode", failing)
-    found = see(encoder, stream, View.DRONE)
+    found = embed_view(encoder, stream, View.DRONE)
     assert found.locations == whole.locations[1::2]
     assert np.allclose(found.pooled_NC, whole.pooled_NC[1::2], atol=1e-5)
     every = 1
     with pytest.raises(InputError, match="not one drone image"):
-        see(encoder, stream, View.DRONE)
+        embed_view(encoder, stream, View.DRONE)

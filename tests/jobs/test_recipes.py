@@ -12,7 +12,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from jobs.training.config_table import config_table, show_config
+from jobs.training.config_table import config_table, print_config
 from jobs.training.recipes import (
     RECIPES,
     Recipe,
@@ -26,8 +26,8 @@ from jobs.training.recipes import (
 )
 from model.backbones.resnet import ResNet
 from model.checkpoint import loads
-from model.pvda import PVDAConfig
-from model.schedule import phase
+from model.config import PVDAConfig
+from model.schedule import schedule_at
 from model.training import Training
 from tests.launcher import Launcher
 
@@ -70,17 +70,17 @@ def test_lpn_has_no_discriminator_and_ends_after_120_epochs_with_a_tenth_of_its_
     recipe = lpn()
     assert not recipe.adversary
     tiny = PVDAConfig(depth=18, width=0.25, part_dim=8)
-    training = Training(tiny, recipe.optimisation, 3, adversary=recipe.adversary)
+    training = Training(tiny, recipe.optimization, 3, adversary=recipe.adversary)
     assert list(training.rates) == ["backbone", "head", "classifier"]
-    rates = recipe.optimisation
-    assert (rates.kind, rates.backbone_rate, rates.head_rate, rates.classifier_rate) == (
+    rates = recipe.optimization
+    assert (rates.kind, rates.backbone_lr, rates.head_lr, rates.classifier_lr) == (
         "sgd",
         0.001,
         0.01,
         0.01,
     )
     assert recipe.schedule.epochs == 120
-    scales = [phase(recipe.schedule, epoch).rate_scale for epoch in range(120)]
+    scales = [schedule_at(recipe.schedule, epoch).lr_scale for epoch in range(120)]
     assert scales == pytest.approx([1.0] * 80 + [0.1] * 40)
     assert differing(recipe) == {"schedule", "adversary"}
 
@@ -88,9 +88,9 @@ def test_lpn_has_no_discriminator_and_ends_after_120_epochs_with_a_tenth_of_its_
 def test_constant_alpha_keeps_alpha_and_restarts() -> None:
     schedule = constant_alpha().schedule
     assert differing(constant_alpha()) == {"schedule"}
-    assert {phase(schedule, epoch).alpha for epoch in range(560)} == {0.9}
-    assert [phase(schedule, epoch).rate_scale for epoch in range(560)] == [
-        phase(paper().schedule, epoch).rate_scale for epoch in range(560)
+    assert {schedule_at(schedule, epoch).alpha for epoch in range(560)} == {0.9}
+    assert [schedule_at(schedule, epoch).lr_scale for epoch in range(560)] == [
+        schedule_at(paper().schedule, epoch).lr_scale for epoch in range(560)
     ]
 
 
@@ -98,8 +98,8 @@ def test_no_restart_grows_alpha_as_the_paper_does_and_its_rates_only_fall() -> N
     schedule = no_restart().schedule
     assert differing(no_restart()) == {"schedule"}
     for epoch in range(560):
-        assert phase(schedule, epoch).alpha == phase(paper().schedule, epoch).alpha
-        assert phase(schedule, epoch).rate_scale == pytest.approx(0.8 ** (epoch // 140))
+        assert schedule_at(schedule, epoch).alpha == schedule_at(paper().schedule, epoch).alpha
+        assert schedule_at(schedule, epoch).lr_scale == pytest.approx(0.8 ** (epoch // 140))
 
 
 def test_the_control_is_the_paper_with_alpha_zero_throughout() -> None:
@@ -107,15 +107,17 @@ def test_the_control_is_the_paper_with_alpha_zero_throughout() -> None:
     assert differing(alpha_zero()) == {"schedule"}
     assert alpha_zero().adversary
     for epoch in range(560):
-        assert phase(schedule, epoch).alpha == 0
-        assert phase(schedule, epoch).rate_scale == phase(paper().schedule, epoch).rate_scale
+        assert schedule_at(schedule, epoch).alpha == 0
+        assert (
+            schedule_at(schedule, epoch).lr_scale == schedule_at(paper().schedule, epoch).lr_scale
+        )
 
 
 @pytest.mark.parametrize("name", RECIPES)
 def test_the_table_shows_every_setting_and_marks_none_of_a_recipe_as_it_is(name: str) -> None:
     recipe = RECIPES[name]()
     text = shown(recipe, shards="s3://bucket/shards", weights=None)
-    for part in (recipe, recipe.network, recipe.optimisation, recipe.schedule, recipe.augmentation):
+    for part in (recipe, recipe.network, recipe.optimization, recipe.schedule, recipe.augmentation):
         for field in fields(part):
             value = getattr(part, field.name)
             assert hasattr(value, "__dataclass_fields__") or f"{field.name}={value}" in text
@@ -146,7 +148,7 @@ def test_a_recipe_of_no_known_name_has_nothing_to_differ_from() -> None:
 def test_the_table_goes_to_standard_error_and_keeps_to_the_screen(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    show_config(paper(), shards="/data/" + "deep/" * 40)
+    print_config(paper(), shards="/data/" + "deep/" * 40)
     said = capsys.readouterr()
     assert said.out == ""
     assert "image_size=256" in said.err

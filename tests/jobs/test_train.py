@@ -19,10 +19,12 @@ from ray.util.queue import Queue
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from jobs.train import Settings, known_recipe, listen, train
-from jobs.training.checkpoints import Run, read_checkpoint
-from jobs.training.loop import Place, train_worker, untrained
+from jobs.training.checkpoints import read_checkpoint
+from jobs.training.loop import WorkerContext, initial_checkpoint, train_worker
 from jobs.training.recipes import Recipe, paper, smoke
-from model.checkpoint import CheckpointError, build_encoder, dumps, loads
+from jobs.training.settings import RunConfig
+from model.checkpoint import build_encoder, dumps, loads
+from model.errors import CheckpointError
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.progress import progress
 from pipeline.images.decode import DecodeError, Pixels, decode
@@ -93,10 +95,10 @@ def test_a_run_ends_with_a_checkpoint_curves_and_an_encoder(
 def test_the_untrained_network_is_the_one_before_the_first_step_even_when_the_run_is_over(
     tiny_shards: str, tmp_path: Path
 ) -> None:
-    run = Run(shards=tiny_shards, out=str(tmp_path), recipe=tiny(1))
-    before = loads(untrained(run))
+    run = RunConfig(shards=tiny_shards, out=str(tmp_path), recipe=tiny(1))
+    before = loads(initial_checkpoint(run))
     train(settings(tiny_shards, tmp_path, tiny(1)))
-    after = loads(untrained(run))
+    after = loads(initial_checkpoint(run))
     assert after.epoch == 0
     assert all(
         torch.equal(before.encoder_weights[name], tensor)
@@ -149,8 +151,10 @@ def test_damaged_images_are_counted_in_the_row_and_said_once_an_epoch(
 
     monkeypatch.setattr("pipeline.batches.training.decode", failing)
     told: list[dict[str, object]] = []
-    run = Run(shards=tiny_shards, out=str(tmp_path / "run"), recipe=tiny(4), probe_epochs=0)
-    train_worker(run, Place(gather=lambda damage: [damage, (2, "another-worker's")]), told.append)
+    run = RunConfig(shards=tiny_shards, out=str(tmp_path / "run"), recipe=tiny(4), probe_epochs=0)
+    train_worker(
+        run, WorkerContext(gather=lambda damage: [damage, (2, "another-worker's")]), told.append
+    )
     counts = [row["damaged_images"] for row in rows(tmp_path / "run")]
     assert set(counts) == {
         2,
@@ -192,13 +196,13 @@ def test_synchronised_batchnorm_without_gpus_is_refused(
 def test_what_a_ray_worker_refuses_comes_back_as_it_was_said_and_is_not_tried_again(
     tiny_shards: str, tmp_path: Path, ray_cluster: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    rates = replace(tiny(1).optimisation, backbone_rate=1e30, head_rate=1e30, classifier_rate=1e30)
+    rates = replace(tiny(1).optimization, backbone_lr=1e30, head_lr=1e30, classifier_lr=1e30)
     with pytest.raises(Incomplete, match="training diverged in epoch 1"):
         train(
             settings(
                 tiny_shards,
                 tmp_path,
-                replace(tiny(1), optimisation=rates),
+                replace(tiny(1), optimization=rates),
                 workers=1,
                 checkpoint_minutes=60.0,
             )
@@ -244,10 +248,10 @@ def test_two_ray_workers_train_one_network(
 
 def test_training_starts_from_given_weights(tiny_shards: str, tmp_path: Path) -> None:
     recipe = tiny(1)
-    run = Run(shards=tiny_shards, out=str(tmp_path), recipe=replace(recipe, seed=9))
-    other = build_encoder(loads(untrained(run))).backbone.state_dict()
+    run = RunConfig(shards=tiny_shards, out=str(tmp_path), recipe=replace(recipe, seed=9))
+    other = build_encoder(loads(initial_checkpoint(run))).backbone.state_dict()
     torch.save(other | {"fc.weight": torch.zeros(3)}, tmp_path / "other.pth")
-    still = replace(recipe, optimisation=replace(recipe.optimisation, backbone_rate=0.0))
+    still = replace(recipe, optimization=replace(recipe.optimization, backbone_lr=0.0))
     train(settings(tiny_shards, tmp_path / "run", still, weights=str(tmp_path / "other.pth")))
     trained = weights(tmp_path / "run")
     assert torch.equal(trained["backbone.layer4.0.conv1.weight"], other["layer4.0.conv1.weight"])
@@ -258,7 +262,7 @@ def test_training_starts_from_given_weights(tiny_shards: str, tmp_path: Path) ->
 def test_a_damaged_checkpoint_is_named(tiny_shards: str, tmp_path: Path) -> None:
     (tmp_path / "last.pt").write_bytes(b"PK\x03\x04 torn")
     with pytest.raises(CheckpointError, match=r"last.pt is damaged .*copy it again"):
-        read_checkpoint(Run(shards=tiny_shards, out=str(tmp_path), recipe=tiny()))
+        read_checkpoint(RunConfig(shards=tiny_shards, out=str(tmp_path), recipe=tiny()))
 
 
 def test_too_few_images_for_a_batch_are_told_before_anything_starts(
@@ -297,13 +301,13 @@ def test_the_paper_recipe_is_the_papers() -> None:
         recipe.network.dropout,
         recipe.network.discriminator_channels,
     ) == (512, 0.75, 1024)
-    rates = recipe.optimisation
+    rates = recipe.optimization
     assert (rates.kind, rates.momentum, rates.weight_decay) == ("sgd", 0.9, 5e-4)
     assert (
-        rates.backbone_rate,
-        rates.head_rate,
-        rates.classifier_rate,
-        rates.discriminator_rate,
+        rates.backbone_lr,
+        rates.head_lr,
+        rates.classifier_lr,
+        rates.discriminator_lr,
     ) == (
         0.001,
         0.01,

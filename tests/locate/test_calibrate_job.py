@@ -15,13 +15,16 @@ from PIL import Image
 from jobs.calibrate import Settings, calibrate_index
 from jobs.encoding.photo_encoder import PhotoEncoder
 from model.checkpoint import Checkpoint, dumps, fingerprint, loads
-from model.pvda import FeatureEncoder, PVDAConfig
+from model.config import PVDAConfig
+from model.pvda import FeatureEncoder
 from pipeline.core.errors import InputError
 from pipeline.features.table import PartFooter, PartRows, write_part
 from pipeline.images.transforms import preprocessing_name, resize
-from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.build import build_index
+from pipeline.index.settings import IndexSettings
 from pipeline.locate.calibration import find_calibration
-from pipeline.shards.pack import PackingSettings, pack
+from pipeline.shards.pack import pack
+from pipeline.shards.settings import PackingSettings
 from pipeline.sources.university1652 import University1652
 
 HELD, TRAINED, GALLERY = 20, 3, 40

@@ -7,8 +7,9 @@ import pytest
 
 from pipeline.core.geo import EARTH_RADIUS_M
 from pipeline.core.records import Split
-from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.build import build_index
 from pipeline.index.searcher import Index
+from pipeline.index.settings import IndexSettings
 from pipeline.index.update import remove_locations
 from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
 from tests.index.index_tables import write_gallery

@@ -15,13 +15,15 @@ from PIL import Image
 from jobs.encoding.photo_encoder import PhotoEncoder
 from jobs.locate import Settings, locate_photos, main
 from model.checkpoint import Checkpoint, dumps, fingerprint, loads
-from model.pvda import FeatureEncoder, PVDAConfig
+from model.config import PVDAConfig
+from model.pvda import FeatureEncoder
 from pipeline.core import storage
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.geo import Circle
 from pipeline.features.table import PartFooter, PartRows, write_part
 from pipeline.images.transforms import preprocessing_name, resize
-from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.build import build_index
+from pipeline.index.settings import IndexSettings
 from pipeline.locate.calibration import Calibration, write_calibration
 from pipeline.locate.logistic import LogisticModel
 

@@ -11,17 +11,11 @@ from typing import Any
 import pytest
 import torch
 
-from model.checkpoint import (
-    Checkpoint,
-    CheckpointError,
-    build_encoder,
-    dumps,
-    fingerprint,
-    load_encoder,
-    loads,
-)
+from model.checkpoint import Checkpoint, build_encoder, dumps, fingerprint, load_encoder, loads
+from model.config import PVDAConfig
+from model.errors import CheckpointError
 from model.inference.embed import embed
-from model.pvda import FeatureEncoder, PVDAConfig
+from model.pvda import FeatureEncoder
 
 TINY = PVDAConfig(
     depth=18, width=0.25, image_size=64, parts=2, part_dim=8, discriminator_channels=8
@@ -166,7 +160,7 @@ def test_the_fingerprint_knows_nothing_of_history_recipe_and_the_layout_in_memor
         name: tensor.to(memory_format=torch.channels_last) if tensor.ndim == 4 else tensor
         for name, tensor in held.encoder_weights.items()
     }
-    optimised = {"modules": {"encoder": turned, "discriminator": {}}, "optimisers": [1]}
+    optimised = {"modules": {"encoder": turned, "discriminator": {}}, "optimizers": [1]}
     assert fingerprint(replace(held, state=optimised), "bicubic") == found
 
 

@@ -5,8 +5,9 @@ import torch
 from torch import Tensor, nn
 
 from model.backbones.resnet import Depth, ResNet
-from model.inference.fuse_batchnorm import fold
-from model.pvda import FeatureEncoder, PVDAConfig
+from model.config import PVDAConfig
+from model.inference.fuse_batchnorm import fuse_batchnorm
+from model.pvda import FeatureEncoder
 
 
 def images(count: int) -> Tensor:
@@ -18,7 +19,7 @@ def images(count: int) -> Tensor:
 def test_a_folded_encoder_has_no_batch_norm_and_computes_the_same(
     lively_encoder: FeatureEncoder,
 ) -> None:
-    folded = fold(lively_encoder)
+    folded = fuse_batchnorm(lively_encoder)
     kinds = {type(module) for module in folded.modules()}
     assert not kinds & {nn.BatchNorm1d, nn.BatchNorm2d}
     for own, other in zip(folded(images(4)), lively_encoder(images(4)), strict=True):
@@ -46,13 +47,13 @@ def test_bottlenecks_are_folded_too() -> None:
     encoder(images(4))  # statistics of a batch
     encoder.eval()
     torch.testing.assert_close(
-        fold(encoder)(images(4))[1], encoder(images(4))[1], rtol=1e-4, atol=1e-4
+        fuse_batchnorm(encoder)(images(4))[1], encoder(images(4))[1], rtol=1e-4, atol=1e-4
     )
 
 
 def test_folding_leaves_the_encoder_as_it_was(lively_encoder: FeatureEncoder) -> None:
     before = {name: tensor.clone() for name, tensor in lively_encoder.state_dict().items()}
-    fold(lively_encoder)
+    fuse_batchnorm(lively_encoder)
     after = lively_encoder.state_dict()
     assert list(before) == list(after)
     assert all(torch.equal(before[name], after[name]) for name in before)
@@ -63,13 +64,13 @@ def test_an_encoder_in_training_mode_and_a_norm_that_cannot_be_folded_are_refuse
     lively_encoder: FeatureEncoder,
 ) -> None:
     with pytest.raises(ValueError, match=r"is in training mode, .*; call eval\(\)"):
-        fold(lively_encoder.train())
+        fuse_batchnorm(lively_encoder.train())
     lively_encoder.eval().backbone.maxpool = nn.Sequential(nn.BatchNorm2d(16).eval())  # type: ignore[assignment]
     with pytest.raises(
         ValueError,
         match=r"backbone\.maxpool\.0 cannot be folded; expected each BatchNorm straight after",
     ):
-        fold(lively_encoder)
+        fuse_batchnorm(lively_encoder)
 
 
 @pytest.mark.parametrize(("depth", "convolutions"), [(18, 20), (34, 36), (50, 53), (101, 104)])

@@ -15,14 +15,16 @@ from torch import Tensor
 
 from jobs.embed_gallery import Settings as EmbedSettings
 from jobs.embed_gallery import main as embed_gallery
-from jobs.encoding.encoder import EncoderSettings, make_encoder_spec
+from jobs.encoding.encoder import make_encoder_spec
+from jobs.encoding.settings import EncoderSettings
 from jobs.import_weights import Settings, import_weights
 from model.backbones.resnet import ResNet
-from model.checkpoint import Checkpoint, CheckpointError, build_encoder, load_encoder, loads
+from model.checkpoint import Checkpoint, build_encoder, load_encoder, loads
+from model.errors import CheckpointError
 from model.pvda import LocationClassifier
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.features.embed import EmbeddingSettings
+from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table
 
 State = dict[str, Tensor]

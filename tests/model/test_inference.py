@@ -15,10 +15,11 @@ from torch import Tensor
 
 from model.inference import int8, optimise
 from model.inference.compile import NotCompiled, compile_frozen
-from model.inference.embed import OneBatch, effective_precision, embed, with_precision
-from model.inference.fuse_batchnorm import fold
-from model.inference.int8 import INSTRUCTIONS, PrecisionError, calibration_digest, require_int8
-from model.inference.optimise import LEAST_COSINE, make_fast
+from model.inference.embed import MirroredEncoder, embed
+from model.inference.fuse_batchnorm import fuse_batchnorm
+from model.inference.int8 import INT8_INSTRUCTIONS, PrecisionError, calibration_digest, require_int8
+from model.inference.optimise import MIN_COSINE, optimise_encoder
+from model.inference.precision import describe_preprocessing, effective_precision
 from model.pvda import FeatureEncoder
 
 needs_compiler = pytest.mark.skipif(
@@ -38,12 +39,12 @@ def fast(encoder: FeatureEncoder, **settings: Any) -> tuple[Any, list[str]]:
     """The fast encoder, with what it said."""
     said: list[str] = []
     defaults: dict[str, Any] = {"probe_B3HW": images(6), "batch_size": 4, "compiled": False}
-    return make_fast(encoder, say=said.append, **(defaults | settings)), said
+    return optimise_encoder(encoder, say=said.append, **(defaults | settings)), said
 
 
-def rolled() -> Callable[[OneBatch, Tensor], Tensor]:
+def rolled() -> Callable[[MirroredEncoder, Tensor], Tensor]:
     """A forward pass that computes something else: the embedding's numbers move on by one place."""
-    forward = OneBatch.forward
+    forward = MirroredEncoder.forward
     return lambda self, images_B3HW: forward(self, images_B3HW).roll(1, dims=1)
 
 
@@ -72,7 +73,7 @@ def test_the_folded_encoder_embeds_as_the_plain_one_does(
 def test_a_fast_encoder_that_computes_something_else_is_found_and_the_plain_one_used(
     lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(OneBatch, "forward", rolled())
+    monkeypatch.setattr(MirroredEncoder, "forward", rolled())
     encoder, said = fast(lively_encoder, compiled=True)
     assert (encoder.kind, encoder.agreement) == ("plain", pytest.approx(1))
     assert said[0].startswith(
@@ -87,7 +88,7 @@ def test_a_fast_encoder_that_computes_something_else_is_found_and_the_plain_one_
 def test_a_compiled_encoder_that_computes_something_else_is_found_and_the_folded_one_used(
     lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def wrong(module: OneBatch, batch_B3HW: Tensor) -> Callable[[Tensor], Tensor]:
+    def wrong(module: MirroredEncoder, batch_B3HW: Tensor) -> Callable[[Tensor], Tensor]:
         return lambda images_B3HW: torch.full((len(images_B3HW), 32), torch.nan)
 
     monkeypatch.setattr(optimise, "compile_frozen", wrong)
@@ -105,7 +106,7 @@ def test_a_compiled_encoder_that_computes_something_else_is_found_and_the_folded
 def test_bfloat16_is_a_precision_of_its_own_and_never_falls_back_to_float32(
     lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch, least: float, error: str | None
 ) -> None:
-    monkeypatch.setitem(LEAST_COSINE, "bfloat16", least)
+    monkeypatch.setitem(MIN_COSINE, "bfloat16", least)
     if error:
         with pytest.raises(PrecisionError, match=f"{error}.*; choose --precision float32"):
             fast(lively_encoder, precision="bfloat16")
@@ -113,7 +114,7 @@ def test_bfloat16_is_a_precision_of_its_own_and_never_falls_back_to_float32(
     encoder, _ = fast(lively_encoder, precision="bfloat16")
     assert (encoder.kind, encoder.precision) == ("folded", "bfloat16")
     assert 0.999 <= encoder.agreement < 1 - 1e-7
-    monkeypatch.setattr(OneBatch, "forward", rolled())
+    monkeypatch.setattr(MirroredEncoder, "forward", rolled())
     plain, _ = fast(lively_encoder, precision="bfloat16")
     assert (plain.kind, plain.precision) == ("plain", "bfloat16")
     assert plain.agreement < 1 - 1e-7
@@ -157,7 +158,7 @@ def test_a_compiled_encoder_embeds_as_the_plain_one_does(lively_encoder: Feature
 
 
 def test_a_missing_compiler_is_a_reason_in_one_line(lively_encoder: FeatureEncoder) -> None:
-    module = OneBatch(lively_encoder, mirror=False)
+    module = MirroredEncoder(lively_encoder, mirror=False)
     with (
         torch._inductor.config.patch(
             {"cpp.cxx": ("/there/is/none",), "force_disable_caches": True}
@@ -170,7 +171,7 @@ def test_a_missing_compiler_is_a_reason_in_one_line(lively_encoder: FeatureEncod
 @needs_compiler
 def test_int8_agrees_on_images_it_was_not_calibrated_by(lively_encoder: FeatureEncoder) -> None:
     pytest.importorskip("torchao", reason="int8 is optional: pip install 'pvda[int8]'")
-    if not any(torch.cpu.get_capabilities().get(name) for name in INSTRUCTIONS):
+    if not any(torch.cpu.get_capabilities().get(name) for name in INT8_INSTRUCTIONS):
         pytest.skip("this CPU has no VNNI and no AMX")
     calibration_B3HW = images(9, seed=50)
     encoder, said = fast(lively_encoder, precision="int8", calibration_B3HW=calibration_B3HW)
@@ -192,7 +193,7 @@ def test_int8_has_the_same_ranges_whatever_the_number_of_threads(
     try:
         for count in (1, 2):
             torch.set_num_threads(count)
-            module = OneBatch(fold(lively_encoder), mirror=True)
+            module = MirroredEncoder(fuse_batchnorm(lively_encoder), mirror=True)
             int8.quantise(module.encoder, 64, partial(module, images(6)))
             assert torch.get_num_threads() == count
             found.append(str(module.encoder.backbone.code))  # the ranges are numbers in it
@@ -212,7 +213,7 @@ def test_int8_is_refused_where_it_cannot_be_had_with_the_remedy(
     monkeypatch.setattr(
         torch.cpu, "get_capabilities", lambda: {"architecture": "x86_64", "avx512_vnni": True}
     )
-    monkeypatch.setitem(sys.modules, int8.QUANTIZER, None)
+    monkeypatch.setitem(sys.modules, int8.QUANTIZER_MODULE, None)
     with pytest.raises(
         PrecisionError, match=r"int8 needs torchao, .*; pip install 'pvda\[int8\]', or choose"
     ):
@@ -250,13 +251,16 @@ def test_int8_that_agrees_too_little_stops_with_a_sentence(
 
 def test_precisions_that_change_the_embeddings_have_fingerprints_of_their_own() -> None:
     one, other = calibration_digest(images(2)), calibration_digest(images(2, seed=1))
-    texts = [with_precision("resized", "float32"), with_precision("resized", "bfloat16")]
-    texts += [with_precision("resized", "int8", digest) for digest in (one, other)]
+    texts = [
+        describe_preprocessing("resized", "float32"),
+        describe_preprocessing("resized", "bfloat16"),
+    ]
+    texts += [describe_preprocessing("resized", "int8", digest) for digest in (one, other)]
     assert len(set(texts)) == 4
     assert texts[0] == "resized"  # tables made before there was a choice stay what they are
     assert one == calibration_digest(images(2).to(memory_format=torch.channels_last))
     with pytest.raises(ValueError, match="int8 without its calibration"):
-        with_precision("resized", "int8")
+        describe_preprocessing("resized", "int8")
 
 
 def test_auto_is_decided_by_the_kind_of_device_alone() -> None:

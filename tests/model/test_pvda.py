@@ -12,8 +12,9 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from model.backbones.resnet import Depth, ResNet
+from model.config import PVDAConfig
 from model.inference.embed import embed, unit_embedding
-from model.pvda import FeatureEncoder, LocationClassifier, PVDAConfig, ViewDiscriminator, refinement
+from model.pvda import FeatureEncoder, LocationClassifier, ViewDiscriminator, refinement
 
 PAPER = PVDAConfig()
 TINY = PVDAConfig(

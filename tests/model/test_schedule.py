@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.schedule import Phase, Schedule, phase
+from model.schedule import Schedule, ScheduleState, schedule_at
 
 PAPER = Schedule()
 
@@ -18,14 +18,14 @@ PAPER = Schedule()
 def test_alpha_starts_at_nine_tenths_and_grows_by_a_tenth_every_140_epochs(
     epoch: int, alpha: float
 ) -> None:
-    assert phase(PAPER, epoch).alpha == alpha
+    assert schedule_at(PAPER, epoch).alpha == alpha
 
 
 @pytest.mark.parametrize("start", [0, 140, 280, 420])
 def test_the_rates_fall_to_four_fifths_after_60_and_120_epochs_of_each_period_and_start_anew_with_the_next(
     start: int,
 ) -> None:
-    scales = [phase(PAPER, start + within).rate_scale for within in (0, 59, 60, 119, 120, 139)]
+    scales = [schedule_at(PAPER, start + within).lr_scale for within in (0, 59, 60, 119, 120, 139)]
     assert scales == pytest.approx([1, 1, 0.8, 0.8, 0.64, 0.64])
 
 
@@ -35,8 +35,8 @@ def test_the_schedule_ends_with_the_fourth_alpha() -> None:
 
 def test_without_restarts_the_rates_only_fall_at_140_280_and_420_while_alpha_grows() -> None:
     ablation = Schedule(restart=False, decay_epochs=(140, 280, 420))
-    found = [phase(ablation, epoch) for epoch in (0, 139, 140, 279, 280, 419, 420, 559)]
-    assert [now.rate_scale for now in found] == pytest.approx(
+    found = [schedule_at(ablation, epoch) for epoch in (0, 139, 140, 279, 280, 419, 420, 559)]
+    assert [now.lr_scale for now in found] == pytest.approx(
         [1, 1, 0.8, 0.8, 0.64, 0.64, 0.512, 0.512]
     )
     assert [now.alpha for now in found] == [0.9, 0.9, 1.0, 1.0, 1.1, 1.1, 1.2, 1.2]
@@ -44,38 +44,40 @@ def test_without_restarts_the_rates_only_fall_at_140_280_and_420_while_alpha_gro
 
 def test_a_constant_alpha_keeps_the_restarts() -> None:
     ablation = Schedule(alpha_step=0.0)
-    assert [phase(ablation, epoch) for epoch in (0, 60, 140, 200, 420)] == [
-        Phase(alpha=0.9, rate_scale=scale) for scale in (1.0, 0.8, 1.0, 0.8, 1.0)
+    assert [schedule_at(ablation, epoch) for epoch in (0, 60, 140, 200, 420)] == [
+        ScheduleState(alpha=0.9, lr_scale=scale) for scale in (1.0, 0.8, 1.0, 0.8, 1.0)
     ]
 
 
 def test_the_control_without_an_adversary_has_the_rates_of_the_paper() -> None:
     control = Schedule(alpha=0.0, alpha_step=0.0)
     for epoch in range(0, 560, 7):
-        assert phase(control, epoch) == Phase(alpha=0.0, rate_scale=phase(PAPER, epoch).rate_scale)
+        assert schedule_at(control, epoch) == ScheduleState(
+            alpha=0.0, lr_scale=schedule_at(PAPER, epoch).lr_scale
+        )
 
 
 def test_steps_within_an_epoch_change_nothing_on_the_papers_schedule() -> None:
-    assert phase(PAPER, 59.99) == phase(PAPER, 59)
-    assert phase(PAPER, 139.99) == phase(PAPER, 139)
+    assert schedule_at(PAPER, 59.99) == schedule_at(PAPER, 59)
+    assert schedule_at(PAPER, 139.99) == schedule_at(PAPER, 139)
 
 
 def test_a_cosine_falls_from_one_over_a_half_to_zero() -> None:
     cosine = Schedule(epochs=80, shape="cosine")
-    scales = [phase(cosine, epoch).rate_scale for epoch in (0, 20, 40, 60, 80)]
+    scales = [schedule_at(cosine, epoch).lr_scale for epoch in (0, 20, 40, 60, 80)]
     assert scales == pytest.approx([1, (1 + 0.5**0.5) / 2, 0.5, (1 - 0.5**0.5) / 2, 0])
 
 
 def test_warm_up_grows_from_zero_by_steps_and_then_leaves_the_shape_as_it_is() -> None:
     warm, cold = Schedule(warmup_epochs=4), Schedule()
-    assert [phase(warm, epoch).rate_scale for epoch in (0, 1, 2.5, 4, 60)] == pytest.approx(
+    assert [schedule_at(warm, epoch).lr_scale for epoch in (0, 1, 2.5, 4, 60)] == pytest.approx(
         [0, 0.25, 0.625, 1, 0.8]
     )
     cosine = Schedule(epochs=80, shape="cosine", warmup_epochs=4)
-    assert phase(cosine, 2).rate_scale == pytest.approx(
-        phase(Schedule(epochs=80, shape="cosine"), 2).rate_scale / 2
+    assert schedule_at(cosine, 2).lr_scale == pytest.approx(
+        schedule_at(Schedule(epochs=80, shape="cosine"), 2).lr_scale / 2
     )
-    assert phase(warm, 100) == phase(cold, 100)
+    assert schedule_at(warm, 100) == schedule_at(cold, 100)
 
 
 @settings(max_examples=50)
@@ -95,10 +97,13 @@ def test_warm_up_grows_from_zero_by_steps_and_then_leaves_the_shape_as_it_is() -
 def test_the_rates_never_leave_zero_to_one_and_alpha_never_falls(
     schedule: Schedule, share: float
 ) -> None:
-    now, later = phase(schedule, share * schedule.epochs), phase(schedule, schedule.epochs)
-    assert 0 <= now.rate_scale <= 1
+    now, later = (
+        schedule_at(schedule, share * schedule.epochs),
+        schedule_at(schedule, schedule.epochs),
+    )
+    assert 0 <= now.lr_scale <= 1
     assert now.alpha <= later.alpha
-    assert now == phase(schedule, share * schedule.epochs)
+    assert now == schedule_at(schedule, share * schedule.epochs)
 
 
 @pytest.mark.parametrize("wrong", [{"epochs": 0}, {"period": 0}, {"alpha": -0.1}])

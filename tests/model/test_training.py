@@ -15,23 +15,23 @@ from torch import Tensor, nn
 from torch.optim import SGD, Adam, AdamW
 
 from model.checkpoint import Checkpoint, dumps, loads
+from model.config import Optimization, PVDAConfig
 from model.losses import location_loss
-from model.pvda import PVDAConfig
-from model.schedule import Phase
-from model.training import Learner, Optimisation, Training
+from model.schedule import ScheduleState
+from model.training import EncoderWithClassifier, Training
 
 TINY = PVDAConfig(
     depth=18, width=0.25, image_size=64, parts=2, part_dim=8, dropout=0.0, discriminator_channels=8
 )
 LOCATIONS = 5
-NOW = Phase(alpha=0.9, rate_scale=1.0)
+NOW = ScheduleState(alpha=0.9, lr_scale=1.0)
 
 
 def make(
-    config: PVDAConfig = TINY, optimisation: Optimisation | None = None, adversary: bool = True
+    config: PVDAConfig = TINY, optimization: Optimization | None = None, adversary: bool = True
 ) -> Training:
     torch.manual_seed(0)
-    training = Training(config, optimisation or Optimisation(), LOCATIONS, adversary=adversary)
+    training = Training(config, optimization or Optimization(), LOCATIONS, adversary=adversary)
     torch.manual_seed(1)  # as the training loop does: dropout does not depend on what was built
     return training
 
@@ -89,7 +89,7 @@ def watched_step(training: Training) -> list[dict[str, dict[str, Tensor]]]:
     they came.
     """
     seen = [weights(training)]
-    for optimiser in training.optimisers:
+    for optimiser in training.optimizers:
         optimiser.register_step_post_hook(lambda *_: seen.append(weights(training)))
     training.step(*batch(), NOW)
     return seen
@@ -113,7 +113,9 @@ def test_the_discriminator_can_be_trained_again_after_the_step_that_holds_it() -
     assert changed(held, weights(training)) == {"encoder", "classifier", "discriminator"}
 
 
-def reference(learner: Learner, discriminator: nn.Module, alpha: float) -> dict[str, Tensor]:
+def reference(
+    learner: EncoderWithClassifier, discriminator: nn.Module, alpha: float
+) -> dict[str, Tensor]:
     """Gradients of Eq. 4 by autograd, with nothing of the training's own code but the networks and
     Eq. 1.
     """
@@ -155,7 +157,7 @@ def test_no_gradient_reaches_the_discriminator_from_the_second_step() -> None:
             }
         )
 
-    for optimiser in training.optimisers:
+    for optimiser in training.optimizers:
         optimiser.register_step_post_hook(gradients)
     training.step(*batch(), NOW)
     assert seen[0]
@@ -226,7 +228,7 @@ def test_with_alpha_zero_encoder_and_classifier_become_what_they_are_without_an_
     for adversary in (True, False):
         training = make(config, adversary=adversary)
         for seed in range(3):
-            training.step(*batch(seed), Phase(alpha=0.0, rate_scale=1.0))
+            training.step(*batch(seed), ScheduleState(alpha=0.0, lr_scale=1.0))
         learned.append(training.learner.state_dict())
     assert learned[0].keys() == learned[1].keys()
     for name, tensor in learned[0].items():
@@ -240,35 +242,35 @@ def test_without_an_adversary_there_is_no_discriminator() -> None:
         "gradient_norm",
     }
     assert plain.discriminator is None
-    assert len(plain.optimisers) == 1
+    assert len(plain.optimizers) == 1
     assert set(plain.modules) == {"encoder", "classifier"}
 
 
 def test_alpha_moves_the_encoder_and_leaves_the_classifiers_first_step_alone() -> None:
     gentle, strong = make(), make()
-    gentle.step(*batch(), Phase(alpha=0.0, rate_scale=1.0))
-    strong.step(*batch(), Phase(alpha=1.0, rate_scale=1.0))
+    gentle.step(*batch(), ScheduleState(alpha=0.0, lr_scale=1.0))
+    strong.step(*batch(), ScheduleState(alpha=1.0, lr_scale=1.0))
     assert changed(weights(gentle), weights(strong)) == {"encoder"}
 
 
 def test_each_group_moves_at_its_own_rate_scaled_by_the_schedule() -> None:
     training = make()
-    training.step(*batch(), Phase(alpha=0.9, rate_scale=0.8))
+    training.step(*batch(), ScheduleState(alpha=0.9, lr_scale=0.8))
     assert training.rates == pytest.approx(
         {"backbone": 0.0008, "head": 0.008, "classifier": 0.008, "discriminator": 0.0016}
     )
-    assert {len(g["params"]) for g in training.optimisers[0].param_groups} == {60, 2 * 4, 2 * 2}
+    assert {len(g["params"]) for g in training.optimizers[0].param_groups} == {60, 2 * 4, 2 * 2}
 
 
 def test_the_optimisers_are_those_of_the_paper_unless_a_short_run_asks_for_adamw() -> None:
-    of_encoder, of_discriminator = make().optimisers
+    of_encoder, of_discriminator = make().optimizers
     assert type(of_encoder) is SGD
     assert type(of_discriminator) is Adam
     for group in of_encoder.param_groups:
         assert (group["momentum"], group["nesterov"], group["weight_decay"]) == (0.9, True, 5e-4)
     [group] = of_discriminator.param_groups
     assert (group["betas"], group["weight_decay"]) == ((0.9, 0.999), 0)
-    assert type(make(optimisation=Optimisation(kind="adamw")).optimisers[0]) is AdamW
+    assert type(make(optimization=Optimization(kind="adamw")).optimizers[0]) is AdamW
 
 
 def test_a_step_tells_its_losses_and_how_often_the_discriminator_was_right() -> None:
@@ -277,8 +279,8 @@ def test_a_step_tells_its_losses_and_how_often_the_discriminator_was_right() -> 
     whole = {"location_loss", "view_loss", "adversarial_loss", "discriminator_accuracy"}
     assert {name for name in measures if "/" not in name} == whole
     assert not any(measure.requires_grad for measure in measures.values())
-    held = Optimisation(backbone_rate=0, head_rate=0, classifier_rate=0, discriminator_rate=0.01)
-    training = make(optimisation=held)
+    held = Optimization(backbone_lr=0, head_lr=0, classifier_lr=0, discriminator_lr=0.01)
+    training = make(optimization=held)
     for _ in range(30):  # the same maps again and again, which D learns by heart
         measures = training.step(*batch(), NOW)
     for name in (
@@ -315,14 +317,14 @@ def test_the_length_of_each_networks_gradient_is_told() -> None:
 
 def test_in_bfloat16_weights_and_losses_stay_float32_and_the_step_is_nearly_the_same() -> None:
     torch.manual_seed(0)
-    half = Training(TINY, Optimisation(), LOCATIONS, precision="bfloat16")
+    half = Training(TINY, Optimization(), LOCATIONS, precision="bfloat16")
     whole = make()
     rough, exact = half.step(*batch(), NOW), whole.step(*batch(), NOW)
     assert {measure.dtype for measure in rough.values()} == {torch.float32}
     assert {parameter.dtype for parameter in half.learner.parameters()} == {torch.float32}
     assert float(rough["location_loss"]) == pytest.approx(float(exact["location_loss"]), rel=0.05)
     assert rough["location_loss"] != exact["location_loss"]
-    assert not Training(TINY, Optimisation(), LOCATIONS, precision="auto").bfloat16  # on a CPU
+    assert not Training(TINY, Optimization(), LOCATIONS, precision="auto").bfloat16  # on a CPU
 
 
 def test_networks_that_cannot_be_compiled_are_as_they_were_and_the_reason_is_told(
@@ -337,10 +339,10 @@ def test_networks_that_cannot_be_compiled_are_as_they_were_and_the_reason_is_tol
 
     monkeypatch.setattr(nn.Module, "compile", broken)
     torch.manual_seed(0)
-    uncompiled = Training(TINY, Optimisation(), LOCATIONS, compile_for=3)
-    assert uncompiled.not_compiled == "RuntimeError: no C++ compiler"
+    uncompiled = Training(TINY, Optimization(), LOCATIONS, compile_for=3)
+    assert uncompiled.compile_error == "RuntimeError: no C++ compiler"
     plain = make()
-    assert plain.not_compiled is None
+    assert plain.compile_error is None
     torch.manual_seed(1)
     uncompiled.step(*batch(), NOW)
     plain.step(*batch(), NOW)
@@ -355,8 +357,8 @@ def test_the_location_loss_falls_when_the_same_images_come_again_and_again() -> 
 
 @pytest.mark.parametrize("kind", ["sgd", "adamw"])
 def test_a_run_saved_and_loaded_goes_on_to_the_last_bit(kind: Any) -> None:
-    config, optimisation = replace(TINY, dropout=0.5), Optimisation(kind=kind)
-    whole = make(config, optimisation)
+    config, optimization = replace(TINY, dropout=0.5), Optimization(kind=kind)
+    whole = make(config, optimization)
     for seed in range(2):
         whole.step(*batch(seed), NOW)
     held = Checkpoint(
@@ -367,8 +369,8 @@ def test_a_run_saved_and_loaded_goes_on_to_the_last_bit(kind: Any) -> None:
         whole.step(*batch(seed), NOW)
 
     torch.manual_seed(99)
-    resumed = Training(config, optimisation, LOCATIONS)
-    resumed.load_state(loads(data).state)
+    resumed = Training(config, optimization, LOCATIONS)
+    resumed.load_state_dict(loads(data).state)
     for seed in range(2, 4):
         resumed.step(*batch(seed), NOW)
     assert_same(resumed.state(), whole.state())
@@ -376,17 +378,17 @@ def test_a_run_saved_and_loaded_goes_on_to_the_last_bit(kind: Any) -> None:
 
 def test_a_run_of_one_adversary_does_not_take_the_state_of_none() -> None:
     with pytest.raises(KeyError, match="discriminator"):
-        make().load_state(make(adversary=False).state())
+        make().load_state_dict(make(adversary=False).state())
 
 
 def test_joint_batchnorm_is_the_encoder_on_both_views_at_once() -> None:
     torch.manual_seed(0)
-    learner = Learner(TINY, 3, joint_bn=True)
+    learner = EncoderWithClassifier(TINY, 3, joint_bn=True)
     images_B3HW = torch.randint(0, 256, (5, 3, 64, 64), dtype=torch.uint8)
     maps1, maps2, logits1, logits2 = learner(images_B3HW[:2], images_B3HW[2:])
     maps_BCHW, g_BPD = learner.encoder(images_B3HW)
     assert torch.equal(torch.cat([maps1, maps2]), maps_BCHW)
     assert torch.allclose(torch.cat([logits1, logits2]), learner.classifier(g_BPD))
-    apart = Learner(TINY, 3)
+    apart = EncoderWithClassifier(TINY, 3)
     apart.load_state_dict(learner.state_dict())
     assert not torch.allclose(apart(images_B3HW[:2], images_B3HW[2:])[0], maps1, atol=1e-3)

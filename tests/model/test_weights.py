@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from model.backbones.resnet import BLOCKS, Depth, ResNet
-from model.checkpoint import CheckpointError
-from model.weights.load import load_backbone, measure_backbone, read_state_dict
+from model.errors import CheckpointError
+from model.weights.load import infer_backbone, load_backbone, read_state_dict
 
 
 def tiny(seed: int) -> ResNet:
@@ -121,7 +121,7 @@ def published(depth: Depth) -> dict[str, Tensor]:
 def test_a_state_dict_of_each_depth_loads_and_tells_its_depth(depth: Depth, tensors: int) -> None:
     state = published(depth)
     assert len(state) == tensors  # as torchvision's have them, the classifier's two included
-    assert measure_backbone(state, "resnet.pth") == (depth, 1.0)
+    assert infer_backbone(state, "resnet.pth") == (depth, 1.0)
     with torch.device("meta"):
         backbone = ResNet(depth)
     load_backbone(backbone, state, "resnet.pth")
@@ -143,7 +143,7 @@ def test_a_state_dict_of_another_depth_is_refused(depth: Depth, other: Depth) ->
 
 
 def test_the_width_is_told_too_and_what_is_no_resnet_of_ours_is_refused_by_what_it_has() -> None:
-    assert measure_backbone(foreign(), "thin.pth") == (18, 0.25)
+    assert infer_backbone(foreign(), "thin.pth") == (18, 0.25)
     resnet152 = published(101) | {
         f"layer2.{block}.conv3.weight": torch.ones(1) for block in range(4, 8)
     }
@@ -151,12 +151,12 @@ def test_the_width_is_told_too_and_what_is_no_resnet_of_ours_is_refused_by_what_
         CheckpointError,
         match=r"deep\.pth is of no ResNet that we build: .* 3, 8, 23, 3 bottleneck blocks",
     ):
-        measure_backbone(resnet152, "deep.pth")
+        infer_backbone(resnet152, "deep.pth")
     with pytest.raises(
         CheckpointError, match=r"conv1\.weight is missing, .*names begin with module\.conv1\.weight"
     ):
-        measure_backbone(
+        infer_backbone(
             {f"module.{key}": tensor for key, tensor in foreign().items()}, "wrapped.pth"
         )
     with pytest.raises(CheckpointError, match="begin with nothing"):
-        measure_backbone({}, "empty.pth")
+        infer_backbone({}, "empty.pth")

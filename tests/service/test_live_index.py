@@ -18,7 +18,8 @@ from pipeline.core import json_files
 from pipeline.core.errors import InputError
 from pipeline.core.records import Rejection
 from pipeline.features.table import Floats, PartFooter, PartRows, write_part
-from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.build import build_index
+from pipeline.index.settings import IndexSettings
 from pipeline.locate.locate import Answer
 from pipeline.service import live_index
 from pipeline.service.app import Service

@@ -24,11 +24,13 @@ import pytest
 from jobs.encoding.photo_encoder import PhotoEncoder
 from jobs.serve import Settings, load_predictor, main
 from model.checkpoint import Checkpoint, dumps
-from model.pvda import FeatureEncoder, PVDAConfig
+from model.config import PVDAConfig
+from model.pvda import FeatureEncoder
 from pipeline.core import json_files
 from pipeline.core.errors import InputError
 from pipeline.features.table import PartFooter, PartRows, write_part
-from pipeline.index.build import IndexSettings, build_index
+from pipeline.index.build import build_index
+from pipeline.index.settings import IndexSettings
 from pipeline.service import replicas
 from pipeline.service.engine import NotReady
 from pipeline.service.replicas import Replica

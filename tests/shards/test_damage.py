@@ -16,12 +16,14 @@ from jobs.training.recipes import smoke
 from pipeline.batches.training import StreamConfig, TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.features.embed import EmbeddingSettings, Encoder, pending_shards
+from pipeline.features.embed import Encoder, pending_shards
 from pipeline.features.embed_worker import EncoderSpec
 from pipeline.features.part import PartFooter, PartRows, write_part
+from pipeline.features.settings import EmbeddingSettings
 from pipeline.shards.manifest import DAMAGED_FILE, Shard, read_manifest
-from pipeline.shards.pack import PackingSettings, pack
+from pipeline.shards.pack import pack
 from pipeline.shards.samples import read_shard
+from pipeline.shards.settings import PackingSettings
 from pipeline.shards.verify import check_shard, verify
 from pipeline.sources.university1652 import University1652
 from tests.damaging import (

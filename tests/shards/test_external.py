@@ -16,7 +16,8 @@ from PIL import Image
 from pipeline.batches.training import StreamConfig, TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.features.embed import EmbeddingSettings, Encoder, EncoderSpec, embed_gallery
+from pipeline.features.embed import Encoder, EncoderSpec, embed_gallery
+from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table
 from pipeline.shards.external import external_metadata, open_manifest
 from pipeline.shards.manifest import read_manifest

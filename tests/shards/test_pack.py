@@ -27,10 +27,11 @@ from pipeline.shards import pack as packing
 from pipeline.shards import record_table
 from pipeline.shards.duplicates import find_duplicates
 from pipeline.shards.manifest import read_manifest
-from pipeline.shards.pack import PackingSettings, TooManyRejected, pack
+from pipeline.shards.pack import TooManyRejected, pack
 from pipeline.shards.plan import ShardPlan, ShardSize, plan_shards
 from pipeline.shards.record_table import Packed, read_part
 from pipeline.shards.samples import read_shard
+from pipeline.shards.settings import PackingSettings
 from pipeline.shards.verify import verify
 from pipeline.shards.writer import header, write_shard
 from pipeline.sources.university1652 import University1652

@@ -15,7 +15,8 @@ from pipeline.core import cluster
 from pipeline.core.errors import InputError
 from pipeline.simulation.layout import write_location
 from pipeline.simulation.location import LocationSpec, render_location
-from pipeline.simulation.simulate import SimulationSettings, plan_jobs, simulate
+from pipeline.simulation.settings import SimulationSettings
+from pipeline.simulation.simulate import plan_jobs, simulate
 
 
 def settings(out: Path, **changed: Any) -> SimulationSettings:

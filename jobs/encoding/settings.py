@@ -1,0 +1,26 @@
+"""How images become embeddings: flags of jobs/embed_gallery.py. Imports nothing heavy, so that the
+command line is parsed at once."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from model.inference.precision import Precision
+from pipeline.images.transforms import Resizer
+
+Compiling = Literal["auto", "always", "never"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderSettings:
+    """How images become embeddings. All but `compiling` is part of the fingerprint."""
+
+    mirror: bool = True
+    "Whether the embeddings of an image and its mirror image are summed [LPN]."
+    resizer: Resizer = "torch"
+    """Whose bicubic resizes the images: torch's, or pillow's, which is faster on CPUs without AVX2;
+    tables do not mix."""
+    precision: Precision = "auto"
+    """float32; bfloat16; int8, for CPUs that multiply 8-bit integers fast, calibrated by images of
+    the shards; auto: bfloat16 on GPUs, else float32."""
+    compiling: Compiling = "auto"
+    "Whether torch compiles the encoder; auto: where it saves more time than it takes."

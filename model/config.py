@@ -1,0 +1,91 @@
+"""The settings of the networks and of their optimisation. Imports nothing heavy: the command line
+offers them before torch is loaded, and a checkpoint carries them."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from model.backbones.resnet import BLOCKS, MIN_CHANNELS, STRIDE, Depth, layer1_channels
+from model.parts.ring_pooling import Divisor
+
+MAX_IMAGE_SIZE, MAX_CHANNELS = 16_384, 65_536
+"Beyond any use; a checkpoint from elsewhere may say anything."
+
+
+@dataclass(frozen=True, kw_only=True)
+class PVDAConfig:
+    """Sizes of the networks. The defaults are the paper's at 256 px."""
+
+    depth: Depth = 50
+    "Layers of the ResNet: 18, 34, 50 or 101 [paper: 50]."
+    width: float = 1.0
+    "Channels of the ResNet as a multiple of the published ones [paper: 1]."
+    image_size: int = 256
+    "Side of the square images in pixels [paper: 256, 384]."
+    parts: int = 4
+    "Square rings P [paper: 4]."
+    ring_divisor: Divisor = "box"
+    "What a ring's sum is divided by: the area of its `box` [LPN] or of the `ring`."
+    part_dim: int = 512
+    "Numbers D per ring after refinement [paper: 512]."
+    dropout: float = 0.75
+    "Before the location classifier [paper, LPN]."
+    discriminator_channels: int = 1024
+    "Of the view discriminator's convolutions [paper, fig. 2]."
+
+    def __post_init__(self) -> None:
+        if self.depth not in BLOCKS:
+            raise ValueError(
+                f"depth is {self.depth}, expected one of {', '.join(map(str, BLOCKS))}"
+            )
+        if layer1_channels(self.depth, self.width) < MIN_CHANNELS:
+            raise ValueError(
+                f"width is {self.width}, which gives layer1 of a ResNet-{self.depth} "
+                f"{layer1_channels(self.depth, self.width)} channels; expected at least {MIN_CHANNELS} (thinner ones crash "
+                "oneDNN); use a larger width"
+            )
+        for name, most in (
+            ("image_size", MAX_IMAGE_SIZE),
+            ("part_dim", MAX_CHANNELS),
+            ("discriminator_channels", MAX_CHANNELS),
+        ):
+            if not 1 <= getattr(self, name) <= most:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected 1 to {most}")
+        if layer1_channels(self.depth, self.width) > MAX_CHANNELS or self.parts < 1:
+            raise ValueError(
+                f"width is {self.width} and parts {self.parts}, expected a network that some machine can hold"
+            )
+        least = max(2 * self.parts, 4) * STRIDE  # the discriminator halves the maps twice
+        if self.image_size < least:
+            raise ValueError(
+                f"image_size is {self.image_size}, expected at least {least} pixels for {self.parts} parts; "
+                "use larger images or fewer parts"
+            )
+
+    @property
+    def embedding_dim(self) -> int:
+        """Length of an image's embedding: P * D."""
+        return self.parts * self.part_dim
+
+
+Precision = Literal["auto", "float32", "bfloat16"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Optimization:
+    """How the weights are moved. The defaults are the paper's."""
+
+    kind: Literal["sgd", "adamw"] = "sgd"
+    """Of the encoder and classifier: SGD with Nesterov momentum [LPN], or AdamW for short runs from
+    scratch."""
+    backbone_lr: float = 0.001
+    "Learning rate of the backbone [paper]."
+    head_lr: float = 0.01
+    "Learning rate of the rings' refinement [paper]."
+    classifier_lr: float = 0.01
+    "Learning rate of the location classifier [paper]."
+    discriminator_lr: float = 0.002
+    "Learning rate of D, which Adam moves [paper]."
+    momentum: float = 0.9
+    "Of SGD [LPN]."
+    weight_decay: float = 5e-4
+    "Of encoder and classifier [LPN]; D has none [chosen]."

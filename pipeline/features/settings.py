@@ -1,0 +1,68 @@
+"""The settings of embedding and of importing features: flags of jobs/embed_gallery.py and
+jobs/import_features.py. Imports nothing heavy, so that
+the command line is parsed at once."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pipeline.core.errors import InputError
+from pipeline.core.records import Split, View
+
+ViewName = Literal["drone", "satellite", "street", "google"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmbeddingSettings:
+    """Which shards are embedded into which table, and how the work is spread."""
+
+    shards: str
+    "Folder or URI of the shards."
+    out: str
+    "Folder or URI of the feature table."
+    split: Split | None = None
+    "Only this split; of shards that others made, which have no manifest, what they are."
+    view: View | None = None
+    "Only this view; likewise."
+    batch_size: int = 32
+    "Images per forward pass."
+    dtype: str = "float32"
+    "Of the stored embeddings: float32, or float16 for half the space."
+    workers: int | None = None
+    "Actors; by default one per GPU, or where there is none one per eight CPU cores."
+    cpus_per_worker: int | None = None
+    "CPU cores of an actor; by default as many as let all actors fit on the nodes that are up."
+    gpus_per_worker: float | None = None
+    "GPUs of an actor; by default 1 where the cluster has any, else 0."
+    decode_threads: int | None = None
+    """Threads of an actor that decode; by default its cores but one beside a GPU, else one per four
+    cores."""
+    patience: float = 600.0
+    "Seconds to wait for the first actor to start, before giving up."
+    verify: bool = False
+    """Look at every byte of the shards first, and of the parts that are done: damaged parts are
+    embedded again."""
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 1:
+            raise InputError(f"--batch-size is {self.batch_size}, expected at least 1")
+        if self.dtype not in ("float32", "float16"):
+            raise InputError(f"--dtype is {self.dtype!r}, expected float32 or float16")
+        for name in ("workers", "cpus_per_worker", "decode_threads"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise InputError(f"--{name.replace('_', '-')} is {value}, expected at least 1")
+        if self.gpus_per_worker is not None and self.gpus_per_worker < 0:
+            raise InputError(f"--gpus-per-worker is {self.gpus_per_worker}, expected 0 or more")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportSettings:
+    """Features to import."""
+
+    mat: str
+    "The .mat file (MATLAB 5, as scipy.io.savemat writes it); a path or a URI."
+    out: str
+    "Folder for the tables: queries and gallery appear in it."
+    query_view: ViewName = "drone"
+    "View of the queries, where the file holds no paths that say it."
+    gallery_view: ViewName = "satellite"
+    "View of the gallery, where the file holds no paths that say it."

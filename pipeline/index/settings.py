@@ -1,0 +1,75 @@
+"""The settings of building an index: flags of jobs/build_index.py. Imports nothing heavy, so that
+the command line is parsed at once."""
+
+import re
+from dataclasses import dataclass
+
+from pipeline.core.errors import InputError
+from pipeline.core.records import Split, View
+
+BYTE_UNITS = {"": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+
+
+@dataclass(frozen=True, kw_only=True)
+class IndexSettings:
+    """Which table is indexed, and how."""
+
+    table: str
+    "Folder or URI of the feature table."
+    out: str
+    "Folder or URI of the index."
+    split: Split | None = None
+    "Only rows of this split."
+    view: View | None = None
+    "Only rows of this view."
+    memory_budget: str = "4GB"
+    """What building and searching may take in memory, the process included: a number with KB, MB,
+    GB or TB."""
+    target_recall: float = 0.95
+    "Recall@10 against exact search that the index is to reach."
+    factory: str | None = None
+    "FAISS factory string; by default the planner chooses."
+    refine: bool = False
+    "With --factory: score the best candidates again by the table's own vectors."
+    parts: int = 1
+    "Parts of the index, each a file that a machine of a cluster can hold."
+    workers: int = 0
+    """Ray tasks that build units of the index, of one core each; 0: this process builds, on all
+    cores."""
+    verify: bool = False
+    "Look at every byte of the table first, and of an index that is finished."
+
+    def __post_init__(self) -> None:
+        if not 0 < self.target_recall <= 1:
+            raise InputError(
+                f"--target-recall is {self.target_recall}, expected a fraction above 0 and at most 1"
+            )
+        if self.parts < 1 or self.workers < 0:
+            raise InputError(
+                f"found --parts {self.parts} and --workers {self.workers}; expected at least one part, and 0 workers or more"
+            )
+        if self.refine and not self.factory:
+            raise InputError(
+                "found --refine without --factory, whose planner decides it; leave it out or name a --factory"
+            )
+        parse_bytes(self.memory_budget)
+
+
+def parse_bytes(text: str) -> int:
+    """Bytes that a text such as `4GB` means.
+
+    Raises InputError.
+    """
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?B?)\s*", text.upper())
+    unit = (
+        ""
+        if match is None
+        else match[2]
+        if match[2].endswith("B") or not match[2]
+        else match[2] + "B"
+    )
+    if match is None or unit not in BYTE_UNITS:
+        raise InputError(
+            f"--memory-budget is {text!r}, expected a number with KB, MB, GB or TB, such as 4GB"
+        )
+    return int(float(match[1]) * BYTE_UNITS[unit])
