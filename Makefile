@@ -34,7 +34,7 @@ bench: .venv/installed  ## the benchmarks that need no data: half an hour
 # network and its index: they are called by hand
 
 chaos: .venv/installed  ## the fault campaign over every stage: about an hour
-	$(BIN)/python benchmarks/chaos.py
+	$(BIN)/python -m tests.chaos
 
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and f"found Python {sys.version}; expected 3.11 or later; run make PYTHON=python3.11")'

@@ -85,7 +85,8 @@ class Launcher:
     def __init__(self, scratch: Path, environment: Mapping[str, str]) -> None:
         self._log, self._jobs = scratch / "job.log", dict[int, RunningJob]()
         self._server = subprocess.Popen(
-            [sys.executable, __file__],
+            # By its module name: run as a file it would find tests/jobs as the package `jobs`.
+            [sys.executable, "-m", "tests.launcher"],
             cwd=ROOT,
             text=True,
             bufsize=1,
