@@ -108,16 +108,18 @@ def photos_of(table: str) -> LabelledImages:
             strict=True,
         )
     ]
-    return LabelledImages(facts=facts, embeddings_QD=rows.embeddings())
+    return LabelledImages(records=facts, embeddings_QD=rows.embeddings())
 
 
 def grouped(photos: LabelledImages, views: int) -> LabelledImages:
     """Means of `views` photos of a place, in the order of their keys."""
-    order = sorted(range(len(photos.facts)), key=lambda number: photos.facts[number]["key"])
+    order = sorted(range(len(photos.records)), key=lambda number: photos.records[number]["key"])
     groups = [order[begin : begin + views] for begin in range(0, len(order), views)]
     total_GD = np.array([photos.embeddings_QD[group].sum(axis=0) for group in groups])
     unit_GD = (total_GD / np.linalg.norm(total_GD, axis=1, keepdims=True)).astype(np.float32)
-    return LabelledImages(facts=[photos.facts[group[0]] for group in groups], embeddings_QD=unit_GD)
+    return LabelledImages(
+        records=[photos.records[group[0]] for group in groups], embeddings_QD=unit_GD
+    )
 
 
 def within(found: list[Answer], asked: list[CalibrationExample]) -> Doubles:
@@ -257,7 +259,7 @@ def main() -> None:
         )
     )
     photos = photos_of(str(given.out / "table"))
-    nobody = LabelledImages(facts=[], embeddings_QD=photos.embeddings_QD[:0])
+    nobody = LabelledImages(records=[], embeddings_QD=photos.embeddings_QD[:0])
     for views in (1, 3, 12):
         asked = make_examples(grouped(photos, views), nobody, index, confidence.spacing_m, WITHIN_M)
         bins = confidence_lines(

@@ -1,8 +1,9 @@
-"""How sure an answer is: what its candidates look like -> the probability that it is right.
+"""The calibration of an index: candidates of a photo -> the probability that its answer is right.
 
-In: what the candidates of a photo agree on. Out: a probability, by a small logistic model that
-`pipeline/locate/calibrate.py` fits and `calibration.json` beside an index holds. It is of one
-network and one gallery: another network's is refused. Shapes: K candidates, F features.
+In: the consensus of a photo's candidates. Out: a probability, by a small logistic model that
+`pipeline/locate/calibrate.py` fits and that is stored in `calibration.json` beside an index. It
+belongs to one encoder and one gallery: that of another encoder is refused.
+Shapes: K candidates, F features.
 """
 
 from dataclasses import asdict, dataclass
@@ -23,120 +24,113 @@ CALIBRATION_FILE = "calibration.json"
 FEATURE_NAMES = ("score", "margin", "depth", "share")
 
 
-def confidence_features(agreed: Consensus, scores_K: Doubles) -> Doubles:
-    """What tells right from wrong answers (F,): the place's best score, by how much it beats the
-    best candidate elsewhere, by how much it beats the mean of the candidates, and which share of
-    them lies at the place."""
-    best = float(scores_K[agreed.leader])
-    return np.array(
-        [best, best - agreed.elsewhere, best - scores_K.mean(), agreed.members_K.mean()]
-    )
+def confidence_features(consensus: Consensus, scores_K: Doubles) -> Doubles:
+    """The features (F,) of FEATURE_NAMES that separate right answers from wrong ones: the best
+    score of the group, its margin over the best candidate outside the group, its margin over the
+    mean score, and the share of candidates that belong to the group."""
+    best = float(scores_K[consensus.leader])
+    margin = best - consensus.best_other_score
+    return np.array([best, margin, best - scores_K.mean(), consensus.members_K.mean()])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """A calibration of one network over one gallery."""
+    """A calibration of one encoder over one gallery."""
 
     fingerprint: str
-    "Of the network and its preprocessing."
-    gallery: int
+    "Fingerprint of the encoder and its preprocessing."
+    gallery_rows: int
     "Rows of the index."
-    asked: str
+    photo_selection: str
     "Which photos it was fitted on, in words."
     spacing_m: float | None
     "Median distance of a gallery position to the next one; None where no two are known."
     agreement_radius_m: float
-    """How far apart candidates may lie that agree on a place: what served the calibration's photos
-    best."""
+    "How far apart agreeing candidates may lie, chosen by the photos of the calibration."
     tolerance_m: float
-    """An answer was taken for right where it names the photo's location, or lies this near to its
+    """An answer counted as right if it named the photo's location, or lay this near to its
     position."""
     outside: float
-    "Share of photos that were supposed to show no place of the gallery."
+    "Share of photos that were assumed to show no location of the gallery."
     model: LogisticModel
     threshold: float
-    """Below it an answer is `unknown`: where the share of right answers kept less that of others
-    kept is greatest."""
+    """Answers below it are `unknown`: the probability at which the share of right answers kept,
+    less the share of wrong answers kept, is greatest."""
     inverse_temperature: float
-    "Of the track's choice among candidates: log-odds per unit of score."
-    elsewhere: float
-    """Of the track's choice: the log-odds of none of the candidates, at the level of the last one
-    considered."""
+    "For the choice of a track among candidates: log-odds per unit of score."
+    none_log_odds: float
+    """For the choice of a track: the log-odds of none of the candidates, relative to a candidate
+    whose score is that of the last one considered."""
     photos: int
-    "That it was fitted on."
+    "Photos that it was fitted on."
     locations: int
-    "That they show."
-    right: float
-    "Share of these photos whose answer was right, their place being in the gallery."
+    "Locations that these photos show."
+    accuracy: float
+    "Share of these photos whose answer was right with their location in the gallery."
     right_kept: float
-    """Share of the right answers that the threshold keeps; this and what follows by folds of
-    locations left out of the fit."""
+    """Share of the right answers that the threshold keeps. Measured, as are the three fields below,
+    in cross-validation: each photo by a model that was fitted without its location."""
     outside_unknown: float
-    "Share of the photos without their place that it answers `unknown`."
+    "Share of the photos without their location in the gallery that are answered `unknown`."
     calibration_error: float
     "Expected calibration error."
     bins: tuple[ReliabilityBin, ...]
-    "The reliability diagram's."
+    "Bins of the reliability diagram."
 
-    def probability(self, agreed: Consensus, scores_K: Doubles) -> float:
-        """That the place is right, by the candidates considered."""
-        return float(self.model.probabilities(confidence_features(agreed, scores_K)[None])[0])
-
-
-def write_calibration(path: str, confidence: Calibration) -> None:
-    """The calibration as a JSON file, whole or not at all."""
-    json_files.write_checksummed(
-        path, {"schema_version": SCHEMA_VERSION, "features": FEATURE_NAMES, **asdict(confidence)}
-    )
+    def probability(self, consensus: Consensus, scores_K: Doubles) -> float:
+        """Probability that the consensus is the photo's location."""
+        return float(self.model.probabilities(confidence_features(consensus, scores_K)[None])[0])
 
 
-def read_calibration(path: str, facts: dict[str, Any]) -> Calibration:
-    """The calibration of an index that says `facts` of itself.
+def write_calibration(path: str, calibration: Calibration) -> None:
+    """Write the calibration as a JSON file, atomically."""
+    header = {"schema_version": SCHEMA_VERSION, "features": FEATURE_NAMES}
+    json_files.write_checksummed(path, header | asdict(calibration))
 
-    Raises InputError when the file is none, or another network's.
+
+def read_calibration(path: str, index_metadata: dict[str, Any]) -> Calibration:
+    """Read and validate the calibration of the index with this metadata.
+
+    Raises InputError when the file is not a calibration, or one of another encoder.
     """
     try:
-        said = json_files.read_checksummed(path)
-        if (
-            said.pop("schema_version") != SCHEMA_VERSION
-            or tuple(said.pop("features")) != FEATURE_NAMES
-        ):
+        content = json_files.read_checksummed(path)
+        version, names = content.pop("schema_version"), tuple(content.pop("features"))
+        if version != SCHEMA_VERSION or names != FEATURE_NAMES:
             raise ValueError("another version")
-        confidence = from_json(Calibration, said)
-        model = confidence.model
-        if any(
-            len(each) != len(FEATURE_NAMES)
-            for each in (model.mean_F, model.scale_F, model.coefficient_F)
-        ):
-            raise ValueError("another number of features")
-        if not np.isfinite(
-            [
-                *model.mean_F,
-                *model.scale_F,
-                *model.coefficient_F,
-                model.intercept,
-                confidence.threshold,
-            ]
-        ).all():
-            raise ValueError("numbers that are none")
-        if not all(model.scale_F):
-            raise ValueError("a scale of 0")
+        calibration = from_json(Calibration, content)
+        _check_model(calibration)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise InputError(
             f"{path} is not a calibration of schema {SCHEMA_VERSION} ({error!r}); expected what "
             "jobs/calibrate.py writes; delete it and calibrate again"
         ) from None
-    if confidence.fingerprint != facts["fingerprint"]:
+    if calibration.fingerprint != index_metadata["fingerprint"]:
         raise InputError(
-            f"{path} was made with network {confidence.fingerprint[:12]} and the index with {facts['fingerprint'][:12]}, "
-            "expected the same; calibrate again with jobs/calibrate.py"
+            f"{path} was made with encoder {calibration.fingerprint[:12]} and the index with "
+            f"{index_metadata['fingerprint'][:12]}, expected the same; calibrate again with "
+            "jobs/calibrate.py"
         )
-    return confidence
+    return calibration
 
 
-def find_calibration(index: str, facts: dict[str, Any]) -> Calibration | None:
-    """The calibration beside an index, if there is one. Raises InputError when it is another
-    network's.
+def _check_model(calibration: Calibration) -> None:
+    """Raise ValueError where the numbers of the model cannot be computed with."""
+    model = calibration.model
+    vectors = (model.mean_F, model.scale_F, model.coefficient_F)
+    if any(len(vector_F) != len(FEATURE_NAMES) for vector_F in vectors):
+        raise ValueError("another number of features")
+    flat = [value for vector_F in vectors for value in vector_F]
+    if not np.isfinite([*flat, model.intercept, calibration.threshold]).all():
+        raise ValueError("numbers that are not finite")
+    if not all(model.scale_F):
+        raise ValueError("a scale of 0")
+
+
+def find_calibration(index: str, index_metadata: dict[str, Any]) -> Calibration | None:
+    """The calibration beside an index; None where there is none.
+
+    Raises InputError when it is not one, or one of another encoder.
     """
     path = storage.join(index, CALIBRATION_FILE)
-    return read_calibration(path, facts) if storage.exists(path) else None
+    return read_calibration(path, index_metadata) if storage.exists(path) else None

@@ -1,7 +1,7 @@
-"""Answers of single photos, and when they were taken -> answers in the light of the whole flight.
+"""Answers for the single photos of a flight and their times -> answers given the whole flight.
 
-In: answers with TRACKED candidates each, times, and a calibration, which says how much a score is
-worth. Out: the same number of answers, whose places are those that the track passes through.
+In: answers with TRACK_CANDIDATES candidates each, times, and a calibration, which turns scores into
+probabilities. Out: as many answers, located where the track passes.
 """
 
 import math
@@ -17,46 +17,42 @@ from pipeline.locate.logistic import choice_log_probabilities
 from pipeline.locate.track import Motion, SmoothedPhoto, TrackPhoto, TrackStart, smooth_track
 
 TRACK_THRESHOLD = 0.5
-"""A flight's photo is known where its place is likelier than all others and elsewhere together;
-this needs no threshold."""
+"""A photo of a flight is known where its location is likelier than all others and none together;
+this needs no fitted threshold."""
 
 
 def apply_track(
     answers: Sequence[Answer],
     times_s: Sequence[float],
-    confidence: Calibration,
+    calibration: Calibration,
     motion: Motion,
     start: TrackStart | None = None,
 ) -> list[Answer]:
-    """What the flight says of each photo, in the order given. A photo that the track passes over is
-    not known.
+    """The answers given the whole flight, in the order of `answers`. A photo that the track skips
+    is unknown.
 
-    Times are seconds since any moment and may be in any order; a rough start is where the earliest
-    photo was taken.
+    Times are seconds since any moment, in any order; `start` is the rough position at the earliest.
     """
     order = sorted(range(len(answers)), key=lambda number: times_s[number])
-    # The calibration's share of photos from outside the gallery is another than the flight's.
-    outside = confidence.elsewhere - _log_odds(confidence.outside) + _log_odds(motion.elsewhere)
-    flight = [
-        _track_photo(answers[number], times_s[number], confidence.inverse_temperature, outside)
-        for number in order
-    ]
-    settled = list(answers)
-    for number, found in zip(order, smooth_track(flight, motion, start), strict=True):
-        settled[number] = _apply_smoothed(answers[number], found, confidence)
-    return settled
+    # The share of photos from outside the gallery was one in calibration and is another in flight.
+    prior_shift = _log_odds(motion.elsewhere) - _log_odds(calibration.outside)
+    none_log_odds = calibration.none_log_odds + prior_shift
+    temperature = calibration.inverse_temperature
+    photos = [_track_photo(answers[at], times_s[at], temperature, none_log_odds) for at in order]
+    tracked = list(answers)
+    for at, smoothed in zip(order, smooth_track(photos, motion, start), strict=True):
+        tracked[at] = _apply_smoothed(answers[at], smoothed, calibration)
+    return tracked
 
 
 def motion_for_gallery(gallery: GalleryMap, max_speed: float, elsewhere: float = 0.1) -> Motion:
-    """The motion of a UAV over a gallery: at either end of a way a photo may lie half a spacing
-    from its gallery image.
-    """
-    spacing_m = gallery.spacing_m
+    """The motion model over a gallery: at either end of a distance a photo may lie half a spacing
+    from its gallery image."""
     return Motion(
         max_speed=max_speed,
-        slack_m=spacing_m or 0.0,
-        places=max(gallery.distinct, 1.0),
-        spacing_m=spacing_m or math.inf,
+        slack_m=gallery.spacing_m or 0.0,
+        gallery_positions=max(gallery.position_count, 1.0),
+        spacing_m=gallery.spacing_m or math.inf,
         elsewhere=elsewhere,
     )
 
@@ -66,39 +62,37 @@ def _log_odds(share: float) -> float:
 
 
 def _track_photo(
-    answer: Answer, time_s: float, inverse_temperature: float, outside: float
+    answer: Answer, time_s: float, inverse_temperature: float, none_log_odds: float
 ) -> TrackPhoto:
     hits = answer.candidates
-    log_chance_C = choice_log_probabilities(
-        relative_scores(hits)[None], inverse_temperature, outside
-    )[0]
+    scores_1K = relative_scores(hits)[None]
+    log_p_C = choice_log_probabilities(scores_1K, inverse_temperature, none_log_odds)[0]
     return TrackPhoto(
         time_s=time_s,
-        places_K2=coordinates(hits),
-        log_chance_K=log_chance_C[:-1],
-        log_elsewhere=float(log_chance_C[-1]),
+        positions_K2=coordinates(hits),
+        log_p_K=log_p_C[:-1],
+        log_p_none=float(log_p_C[-1]),
     )
 
 
-def _apply_smoothed(answer: Answer, found: SmoothedPhoto, confidence: Calibration) -> Answer:
-    """The answer's place is that of the candidate chosen; its probability that of all candidates of
-    this location.
-    """
-    hits, chosen = answer.candidates, found.chosen
+def _apply_smoothed(answer: Answer, smoothed: SmoothedPhoto, calibration: Calibration) -> Answer:
+    """The answer at the chosen candidate; its probability is that of all candidates of this
+    location."""
+    hits, chosen = answer.candidates, smoothed.chosen
     location = answer.location if chosen is None else hits[chosen].location
-    at_K = np.array([hit.location == location for hit in hits], np.bool_)
-    probability = float(found.chance_K[at_K].sum())
+    at_location_K = np.array([hit.location == location for hit in hits], np.bool_)
+    probability = float(smoothed.p_K[at_location_K].sum())
     if chosen is None:
         return replace(answer, probability=probability, known=False)
     lat, lon = hits[chosen].lat, hits[chosen].lon
     position = None
     if lat is not None and lon is not None:
-        position = Position(lat=lat, lon=lon, radius_m=(confidence.spacing_m or 0.0) / 2)
+        position = Position(lat=lat, lon=lon, radius_m=(calibration.spacing_m or 0.0) / 2)
     return replace(
         answer,
         position=position,
         location=location,
         probability=probability,
-        agreeing=int(at_K.sum()),
+        agreeing=int(at_location_K.sum()),
         known=probability >= TRACK_THRESHOLD,
     )

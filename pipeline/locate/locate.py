@@ -1,8 +1,8 @@
-"""Embeddings of photos -> answers: a position, how sure it is, and the candidates behind it.
+"""Embeddings of photos -> answers: a position, a probability, and the candidates behind them.
 
-In: an opened index and unit vectors. Out: one Answer per vector. The position is that of the place
-which the best candidates agree on; the probability comes from a calibration, without which there is
-none. Shapes: Q photos, D dimensions, K candidates.
+In: an opened index and unit vectors. Out: one Answer per vector. The position is the one that the
+best candidates agree on; the probability comes from a calibration and is None without one.
+Shapes: Q photos, D dimensions, K candidates.
 """
 
 import math
@@ -11,60 +11,58 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core.arrays import Doubles
-from pipeline.features.table import Floats
+from pipeline.core.arrays import Doubles, Floats
 from pipeline.index.filters import Filter
 from pipeline.index.searcher import Hit, Searchable
 from pipeline.locate.calibration import Calibration
 from pipeline.locate.consensus import Consensus, find_consensus
 
 CONSENSUS_CANDIDATES = 10
-"""Candidates that decide on place and probability, whatever number is shown: a calibration holds
-for one number only. Ten, since a place that agrees with none of the ten best has little to say, and
-the tenth is well within what comes by chance."""
-
+"""Candidates that decide on position and probability, however many are listed: a calibration holds
+for one number only. Ten, since a location that agrees with none of the ten best has little support,
+and the tenth score is well within what a gallery reaches by chance."""
 
 UNCALIBRATED_SPACINGS = 0.5
-"""Of the gallery's spacing: how far apart candidates may lie that agree, where no calibration has
-chosen. Only images of one place: whether neighbours overlap is not known, and unlike ones would
-lead away."""
+"""Agreement radius in spacings of the gallery, where no calibration has chosen one. Half a spacing
+joins only images of one location: whether neighbours overlap is not known, and neighbours that show
+other ground would pull the position away."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Position:
-    """Where a photo was taken, as far as it can be told."""
+    """The estimated position of a photo."""
 
     lat: float
     "Degrees north, WGS84."
     lon: float
     "Degrees east."
     radius_m: float
-    """Of uncertainty, if the place is right: half way to the next gallery image, and how far the
-    agreeing ones lie apart."""
+    """Uncertainty in metres, if the location is right: half the distance to the next gallery image
+    and the spread of the agreeing candidates, added in quadrature."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """What is said of one photo."""
+    """The answer for one photo."""
 
     position: Position | None
-    "None where no candidate of the place has a position."
+    "Null where no candidate of the location has a position."
     location: str | None
-    "The place's name: the location of its best candidate; None where the search found nothing."
+    "Name of the location: that of its best candidate; null where the search found nothing."
     probability: float | None
-    "That the place is right, 0 to 1; None without a calibration."
+    "Probability that the location is right, 0 to 1; null without a calibration."
     known: bool
-    "False: unknown, as the probability is below the calibration's threshold, or nothing was found."
+    "False (unknown) where the probability is below the threshold, or nothing was found."
     candidates: tuple[Hit, ...]
     "Best first."
     agreeing: int
-    "How many of the candidates considered lie at the place."
+    "How many of the candidates considered lie at the location."
 
 
 NO_ANSWER = Answer(
     position=None, location=None, probability=None, known=False, candidates=(), agreeing=0
 )
-"What is said where the search found nothing."
+"The answer where the search found nothing."
 
 
 def locate_embeddings(
@@ -72,78 +70,80 @@ def locate_embeddings(
     embeddings_QD: Floats,
     k: int = CONSENSUS_CANDIDATES,
     where: Filter | None = None,
-    confidence: Calibration | None = None,
+    calibration: Calibration | None = None,
     spacing_m: float | None = None,
 ) -> list[Answer]:
     """One answer per embedding (Q, D), each with its `k` best candidates.
 
-    `where` narrows the search; `confidence` is the calibration of this index. Without one `spacing_m`, the gallery's, says how
-    far apart candidates may lie that agree; without either they agree where they are of one location.
-    Raises InputError where the embeddings are not the index's.
+    `where` restricts the search; `calibration` must belong to this index. Without a calibration the
+    agreement radius follows from `spacing_m`, the gallery's spacing; without either, candidates
+    agree where they have one location. Raises InputError where the embeddings do not fit the index.
     """
-    most = max(k, CONSENSUS_CANDIDATES)
-    return answers_from_hits(index.search(embeddings_QD, most, where), k, confidence, spacing_m)
+    hits = index.search(embeddings_QD, max(k, CONSENSUS_CANDIDATES), where)
+    return answers_from_hits(hits, k, calibration, spacing_m)
 
 
 def answers_from_hits(
-    found: Sequence[Sequence[Hit]],
+    hits_of_photos: Sequence[Sequence[Hit]],
     k: int,
-    confidence: Calibration | None = None,
+    calibration: Calibration | None = None,
     spacing_m: float | None = None,
 ) -> list[Answer]:
-    """What the candidates of each photo, best first, amount to; `k` of them go into the answer."""
-    spacing = (confidence.spacing_m if confidence else spacing_m) or 0.0
-    agreement_radius_m = (
-        confidence.agreement_radius_m if confidence else UNCALIBRATED_SPACINGS * spacing
-    )
+    """One answer per photo from its candidates, best first; `k` of them are listed in it."""
+    spacing = (calibration.spacing_m if calibration else spacing_m) or 0.0
+    radius_m = calibration.agreement_radius_m if calibration else UNCALIBRATED_SPACINGS * spacing
     return [
-        _answer(hits, consensus_of(hits, agreement_radius_m), k, confidence, spacing)
-        if hits
-        else NO_ANSWER
-        for hits in found
+        _answer(hits, consensus_of(hits, radius_m), k, calibration, spacing) if hits else NO_ANSWER
+        for hits in hits_of_photos
     ]
 
 
 def _answer(
-    hits: Sequence[Hit], agreed: Consensus, k: int, confidence: Calibration | None, spacing: float
-) -> Answer:  # fmt: skip
-    probability = confidence.probability(agreed, consensus_scores(hits)) if confidence else None
+    hits: Sequence[Hit],
+    consensus: Consensus,
+    k: int,
+    calibration: Calibration | None,
+    spacing: float,
+) -> Answer:
+    probability = (
+        calibration.probability(consensus, consensus_scores(hits)) if calibration else None
+    )
     position = None
-    if agreed.lat is not None and agreed.lon is not None:
-        radius_m = math.hypot(agreed.spread_m, spacing / 2)
-        position = Position(lat=agreed.lat, lon=agreed.lon, radius_m=radius_m)
+    if consensus.lat is not None and consensus.lon is not None:
+        radius_m = math.hypot(consensus.spread_m, spacing / 2)
+        position = Position(lat=consensus.lat, lon=consensus.lon, radius_m=radius_m)
     return Answer(
-        position=position, location=hits[agreed.leader].location, probability=probability,
-        known=confidence is None or probability is None or probability >= confidence.threshold,
-        candidates=tuple(hits[:k]), agreeing=int(agreed.members_K.sum()),
-    )  # fmt: skip
-
-
-def consensus_of(hits: Sequence[Hit], agreement_radius_m: float) -> Consensus:
-    """The place that the best CONSIDERED candidates agree on."""
-    hits = hits[:CONSENSUS_CANDIDATES]
-    return find_consensus(
-        consensus_scores(hits),
-        [hit.location for hit in hits],
-        coordinates(hits),
-        agreement_radius_m,
+        position=position,
+        location=hits[consensus.leader].location,
+        probability=probability,
+        known=calibration is None or probability is None or probability >= calibration.threshold,
+        candidates=tuple(hits[:k]),
+        agreeing=int(consensus.members_K.sum()),
     )
 
 
+def consensus_of(hits: Sequence[Hit], agreement_radius_m: float) -> Consensus:
+    """The consensus of the best CONSENSUS_CANDIDATES hits."""
+    hits = hits[:CONSENSUS_CANDIDATES]
+    locations = [hit.location for hit in hits]
+    return find_consensus(consensus_scores(hits), locations, coordinates(hits), agreement_radius_m)
+
+
 def consensus_scores(hits: Sequence[Hit]) -> Doubles:
-    """Scores (K,) of the candidates considered, best first."""
+    """Scores (K,) of the candidates that the consensus considers, best first."""
     return np.array([hit.score for hit in hits[:CONSENSUS_CANDIDATES]])
 
 
 def relative_scores(hits: Sequence[Hit]) -> Doubles:
-    """Scores of any number of candidates above that of the last one considered: what a gallery
-    holds by chance differs from photo to photo."""
+    """Scores of any number of hits, relative to the last one that the consensus considers.
+
+    The level that a gallery reaches by chance differs from photo to photo; this removes it.
+    """
     scores_K = np.array([hit.score for hit in hits])
     return np.asarray(scores_K - scores_K[:CONSENSUS_CANDIDATES][-1:].sum())
 
 
 def coordinates(hits: Sequence[Hit]) -> Doubles:
-    """Latitudes and longitudes (K, 2) of candidates, NaN where unknown."""
-    return np.array([(hit.lat, hit.lon) for hit in hits], dtype=np.float64).reshape(
-        -1, 2
-    )  # None becomes NaN
+    """Latitudes and longitudes (K, 2) of hits, NaN where unknown."""
+    pairs = [(hit.lat, hit.lon) for hit in hits]
+    return np.array(pairs, dtype=np.float64).reshape(-1, 2)  # None becomes NaN

@@ -1,8 +1,8 @@
-"""Answers -> one self-contained HTML page: each photo, its candidates, and a map drawn with the
-gallery's own images.
+"""Answers -> one self-contained HTML page: each photo, its candidates, and a map of the gallery's
+own images.
 
-In: answers, pictures by key and by path, and the gallery's map. Out: the page as text. Nothing on
-it runs or leaves it: no script, no font, no request, no map server.
+In: answers, images by key and by path, and the gallery's positions. Out: the page as text. It has no
+script and no font of its own, and loads nothing: no request, no map server.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -14,7 +14,8 @@ import numpy as np
 
 from pipeline.core.geo import haversine_m
 from pipeline.core.templates import template_environment
-from pipeline.images.thumbnails import ANSWER_PX, QUERY_PX, thumbnail
+from pipeline.images.thumbnails import ANSWER_PX, QUERY_PX, ImageLoader, thumbnail
+from pipeline.index.searcher import Hit
 from pipeline.locate.calibration import Calibration
 from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.geojson import LocatedPhoto
@@ -29,10 +30,9 @@ from pipeline.locate.page_map import (
 )
 
 MAX_SHOWN = 60
-"Answers on the page at most, evenly spread: some 100 kB each."
+"Answers on the page at most, evenly spaced: about 100 kB each."
+
 TILE_PX = 96
-Pictures = Callable[[Iterable[str]], Mapping[str, bytes]]
-"Encoded images by key or by path; what is not at hand is absent."
 LatLon = tuple[float, float]
 
 
@@ -42,49 +42,51 @@ class PageContext:
 
     title: str
     gallery: GalleryMap
-    confidence: Calibration | None
+    calibration: Calibration | None
     fingerprint: str
     track: bool = False
     footprints: Callable[[Iterable[str]], Mapping[str, Footprint]] = lambda keys: {}
-    """Corners of gallery images by key, where they are known; the others are drawn as squares as
-    wide as the spacing."""
+    """Corners of gallery images by key, where known; the others are drawn as squares as wide as the
+    spacing."""
     true_positions: Mapping[str, LatLon] = field(default_factory=dict)
-    "Where photos were really taken, by name, where that is known."
+    "Where photos were taken, by name, where known."
 
 
 def render_page(
-    located: Sequence[LocatedPhoto], around: PageContext, photos: Pictures, tiles: Pictures
+    located: Sequence[LocatedPhoto],
+    context: PageContext,
+    load_photos: ImageLoader,
+    load_tiles: ImageLoader,
 ) -> str:
-    """The page."""
-    shown = [
-        located[round(at)] for at in np.linspace(0, len(located) - 1, min(len(located), MAX_SHOWN))
-    ]
-    answered = [one.answer for one in shown if one.answer]
-    footprints = around.footprints(
-        sorted({key for answer in answered for key in nearby_keys(answer, around.gallery)})
-    )
+    """The page, with at most MAX_SHOWN of the answers."""
+    numbers = np.linspace(0, len(located) - 1, min(len(located), MAX_SHOWN))
+    shown = [located[round(number)] for number in numbers]
+    answers = [one.answer for one in shown if one.answer]
+    nearby = {key for answer in answers for key in nearby_keys(answer, context.gallery)}
+    footprints = context.footprints(sorted(nearby))
     maps = [
-        position_map(one.answer, around.gallery, footprints) if one.answer else None
+        position_map(one.answer, context.gallery, footprints) if one.answer else None
         for one in shown
     ]
-    keys = {tile.key for view in maps if view for tile in view.tiles}
-    keys |= {hit.key for answer in answered for hit in answer.candidates}
-    held, taken = tiles(sorted(keys)), photos([one.photos[0] for one in shown])
-    panels = [_panel(one, view, held, taken, around) for one, view in zip(shown, maps, strict=True)]
+    on_maps = {tile.key for view in maps if view for tile in view.tiles}
+    candidates = {hit.key for answer in answers for hit in answer.candidates}
+    tiles = load_tiles(sorted(on_maps | candidates))
+    photos = load_photos([one.photos[0] for one in shown])
+    named = [(one.name, one.answer) for one in located if one.answer]
     environment = template_environment(Path(__file__).parent / "templates")
-    answers = [(one.name, one.answer) for one in located if one.answer]
-    on_maps = sorted({tile.key for view in maps if view for tile in view.tiles} & held.keys())
     return environment.get_template("answers.html").render(
-        title=around.title,
-        fingerprint=around.fingerprint,
-        confidence=around.confidence,
+        title=context.title,
+        fingerprint=context.fingerprint,
+        calibration=context.calibration,
         photos=len(located),
-        known=sum(answer.known for _, answer in answers),
+        known=sum(answer.known for _, answer in named),
         damaged=sum(len(one.rejected) for one in located),
-        track=around.track,
-        overview=overview_map(answers, around.gallery, around.track),
-        tiles={key: thumbnail(held[key], TILE_PX) for key in on_maps},
-        panels=panels,
+        track=context.track,
+        overview=overview_map(named, context.gallery, context.track),
+        tiles={key: thumbnail(tiles[key], TILE_PX) for key in sorted(on_maps & tiles.keys())},
+        panels=[
+            _panel(one, view, tiles, photos, context) for one, view in zip(shown, maps, strict=True)
+        ],
         side=MAP_SIDE_PX,
     )
 
@@ -94,11 +96,13 @@ def _panel(
     view: MapView | None,
     tiles: Mapping[str, bytes],
     photos: Mapping[str, bytes],
-    around: PageContext,
+    context: PageContext,
 ) -> dict[str, Any]:
     """One answer as the template shows it."""
-    answer, truth = one.answer, around.true_positions.get(one.name)
+    answer, truth = one.answer, context.true_positions.get(one.name)
     point = view.frame.pixels(np.array([truth]))[0].tolist() if view and truth else None
+    on_map = point is not None and all(0 <= at <= MAP_SIDE_PX for at in point)
+    candidates = enumerate(answer.candidates, 1) if answer else ()
     return {
         "name": short_name(one.name),
         "path": one.name,
@@ -108,39 +112,35 @@ def _panel(
         "map": view,
         "answer": answer,
         "rejected": one.rejected,
-        "truth": point if point and all(0 <= at <= MAP_SIDE_PX for at in point) else None,
+        "truth": point if on_map else None,
         "error": format_distance(distance_to_m(answer, truth)) if answer and truth else "",
-        "candidates": [
-            {
-                "rank": rank,
-                "key": hit.key,
-                "location": hit.location,
-                "score": hit.score,
-                "picture": thumbnail(tiles.get(hit.key), ANSWER_PX),
-                "here": hit.location == answer.location,
-                "away": format_distance(
-                    distance_to_m(
-                        answer,
-                        (hit.lat, hit.lon) if hit.lat is not None and hit.lon is not None else None,
-                    )
-                ),
-            }
-            for rank, hit in enumerate(answer.candidates, 1)
-        ]
-        if answer
-        else [],
+        "candidates": [_candidate(rank, hit, answer, tiles) for rank, hit in candidates if answer],
     }
 
 
-def distance_to_m(answer: Answer, place: LatLon | None) -> float | None:
-    """Metres from an answer's position to a place; None where either is unknown."""
-    if answer.position is None or place is None:
+def _candidate(rank: int, hit: Hit, answer: Answer, tiles: Mapping[str, bytes]) -> dict[str, Any]:
+    position = (hit.lat, hit.lon) if hit.lat is not None and hit.lon is not None else None
+    return {
+        "rank": rank,
+        "key": hit.key,
+        "location": hit.location,
+        "score": hit.score,
+        "picture": thumbnail(tiles.get(hit.key), ANSWER_PX),
+        "here": hit.location == answer.location,
+        "away": format_distance(distance_to_m(answer, position)),
+    }
+
+
+def distance_to_m(answer: Answer, position: LatLon | None) -> float | None:
+    """Metres from an answer's position to another one; None where either is unknown."""
+    if answer.position is None or position is None:
         return None
-    return float(haversine_m(np.array([answer.position.lat, answer.position.lon]), np.array(place)))
+    found_2 = np.array([answer.position.lat, answer.position.lon])
+    return float(haversine_m(found_2, np.array(position)))
 
 
 def format_distance(metres: float | None) -> str:
-    """A distance in words."""
+    """A distance in words; empty where unknown."""
     if metres is None:
         return ""
     if metres < 1:
@@ -148,6 +148,6 @@ def format_distance(metres: float | None) -> str:
     return f"{metres:.0f} m away" if metres < 1000 else f"{metres / 1000:.1f} km away"
 
 
-def short_name(name: str) -> str:
+def short_name(path: str) -> str:
     """The last two parts of a path: a photo and its folder."""
-    return "/".join(name.rstrip("/").split("/")[-2:])
+    return "/".join(path.rstrip("/").split("/")[-2:])

@@ -289,8 +289,8 @@ def test_a_damaged_calibration_is_refused(tmp_path: Path) -> None:
     )
     calibration = Calibration(
         fingerprint="f" * 64,
-        gallery=5,
-        asked="places held out",
+        gallery_rows=5,
+        photo_selection="places held out",
         spacing_m=10.0,
         agreement_radius_m=5.0,
         tolerance_m=3.0,
@@ -298,14 +298,14 @@ def test_a_damaged_calibration_is_refused(tmp_path: Path) -> None:
         model=model,
         threshold=0.5,
         inverse_temperature=9.0,
-        elsewhere=0.1,
+        none_log_odds=0.1,
         photos=3,
         locations=2,
-        right=0.7,
+        accuracy=0.7,
         right_kept=0.6,
         outside_unknown=0.8,
         calibration_error=0.02,
-        bins=(ReliabilityBin(said=0.5, seen=0.4, share=1.0),),
+        bins=(ReliabilityBin(predicted=0.5, observed=0.4, share=1.0),),
     )
     path = tmp_path / "calibration.json"
     write_calibration(str(path), calibration)

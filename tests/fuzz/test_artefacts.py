@@ -102,8 +102,8 @@ FACTS = IndexMetadata(
 NUMBERS = (0.1,) * len(FEATURE_NAMES)
 CONFIDENCE = Calibration(
     fingerprint="0" * 64,
-    gallery=2,
-    asked="photos",
+    gallery_rows=2,
+    photo_selection="photos",
     spacing_m=20.0,
     agreement_radius_m=50.0,
     tolerance_m=25.0,
@@ -111,14 +111,14 @@ CONFIDENCE = Calibration(
     model=LogisticModel(mean_F=NUMBERS, scale_F=NUMBERS, coefficient_F=NUMBERS, intercept=0.0),
     threshold=0.5,
     inverse_temperature=1.0,
-    elsewhere=0.0,
+    none_log_odds=0.0,
     photos=10,
     locations=5,
-    right=0.5,
+    accuracy=0.5,
     right_kept=0.5,
     outside_unknown=0.5,
     calibration_error=0.1,
-    bins=(ReliabilityBin(said=0.5, seen=0.5, share=1.0),),
+    bins=(ReliabilityBin(predicted=0.5, observed=0.5, share=1.0),),
 )
 
 

@@ -29,7 +29,7 @@ from pipeline.locate.logistic import sigmoid
 from pipeline.locate.track import TRACK_CANDIDATES
 
 METRE = 1 / 111_195.08  # degrees of latitude
-GALLERY = CalibrationContext(fingerprint="f" * 64, rows=40, spacing_m=300.0)
+GALLERY = CalibrationContext(fingerprint="f" * 64, gallery_rows=40, spacing_m=300.0)
 
 
 def hit(location: str, score: float, north_m: float | None = 0.0) -> Hit:
@@ -240,7 +240,7 @@ def labelled(location: str, vector: list[float], north_m: float = 0.0) -> Labell
         "view": "drone",
         "geotag": {"lat": north_m * METRE, "lon": 8.0},
     }
-    return LabelledImages(facts=[facts], embeddings_QD=np.array([vector], np.float32))
+    return LabelledImages(records=[facts], embeddings_QD=np.array([vector], np.float32))
 
 
 def test_a_place_of_many_rows_is_left_out_whole_and_others_take_their_ranks() -> None:

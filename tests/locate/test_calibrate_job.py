@@ -86,8 +86,10 @@ def test_photos_of_places_not_trained_on_calibrate_an_index(
 ) -> None:
     made = calibrate_index(Settings(**world))
     assert (made.photos, made.locations) == (2 * HELD, HELD)
-    assert made.right == pytest.approx(0.5, abs=0.1)  # a photo of something else may hit by chance
-    assert (made.gallery, made.spacing_m, made.agreement_radius_m) == (GALLERY, None, 0)
+    assert made.accuracy == pytest.approx(
+        0.5, abs=0.1
+    )  # a photo of something else may hit by chance
+    assert (made.gallery_rows, made.spacing_m, made.agreement_radius_m) == (GALLERY, None, 0)
     facts = json.loads((tmp_path / "index" / "index.json").read_text())
     assert find_calibration(world["index"], facts) == made
     assert (tmp_path / "index" / "calibration.svg").read_text().startswith("<svg")

@@ -26,7 +26,7 @@ def test_three_that_stand_together_outweigh_a_better_one_alone() -> None:
     places = at((10, 20), (50, 60), (50.0005, 60), (49.9995, 60), (-30, 0))
     found = find_consensus(np.array([0.9, 0.8, 0.8, 0.7, 0.4]), list("abcde"), places, 100)
     assert found.members_K.tolist() == [False, True, True, True, False]
-    assert (found.leader, found.elsewhere) == (1, 0.9)
+    assert (found.leader, found.best_other_score) == (1, 0.9)
     assert haversine_m(at((found.lat, found.lon)), at((50, 60)))[0] < 60
 
 
@@ -34,7 +34,7 @@ def test_many_that_stand_together_by_chance_do_not_outweigh_one_that_stands_out(
     """Weights 1 and four times 0.04: by their share unsquared the four would have 0.8."""
     places = at((10, 20), *[(50, 60)] * 4, (-30, 0))
     found = find_consensus(np.array([0.9, 0.5, 0.5, 0.5, 0.5, 0.4]), list("abcdef"), places, 100)
-    assert (found.leader, found.lat, found.elsewhere) == (0, 10, 0.5)
+    assert (found.leader, found.lat, found.best_other_score) == (0, 10, 0.5)
 
 
 def test_images_of_one_location_agree_wherever_they_are() -> None:
@@ -42,7 +42,7 @@ def test_images_of_one_location_agree_wherever_they_are() -> None:
     nowhere = at(*[(None, None)] * 4)
     found = find_consensus(np.array([0.9, 0.85, 0.8, 0.5]), list("abbc"), nowhere, 100)
     assert (found.leader, found.lat, found.lon, found.spread_m) == (1, None, None, 0)
-    assert found.elsewhere == 0.9
+    assert found.best_other_score == 0.9
 
 
 def test_members_without_a_position_support_a_place_but_do_not_move_it() -> None:
@@ -54,7 +54,7 @@ def test_members_without_a_position_support_a_place_but_do_not_move_it() -> None
 
 def test_one_candidate_is_its_own_place_and_nothing_is_elsewhere() -> None:
     found = find_consensus(np.array([0.3]), ["a"], at((1, 2)), 10)
-    assert (found.leader, found.lat, found.lon, found.elsewhere) == (0, 1, 2, 0.3)
+    assert (found.leader, found.lat, found.lon, found.best_other_score) == (0, 1, 2, 0.3)
 
 
 def test_an_unlike_neighbour_does_not_pull_the_place_away() -> None:

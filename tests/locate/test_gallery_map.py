@@ -25,7 +25,7 @@ def on_a_grid(side: int, rows: int | None = None) -> GalleryMap:
     places = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
     places = np.concatenate([places, places, [[np.nan, np.nan]]])
     names = np.array([f"{number}" for number in range(len(places))])
-    return GalleryMap(keys=names, places_N2=places, rows=rows or len(places))
+    return GalleryMap(keys=names, positions_N2=places, rows=rows or len(places))
 
 
 def test_the_spacing_is_the_way_to_the_next_other_position() -> None:
@@ -44,7 +44,7 @@ def test_without_two_positions_there_is_no_spacing() -> None:
 def test_the_nearest_are_found_across_the_meridian_of_180_degrees() -> None:
     places = np.array([[0, 179.9], [0, -179.99], [0, 170.0], [np.nan, np.nan]])
     names = np.array(list("abcd"))
-    gallery = GalleryMap(keys=names, places_N2=places, rows=4)
+    gallery = GalleryMap(keys=names, positions_N2=places, rows=4)
     assert gallery.nearest(0, 179.99, 3).tolist() == [1, 0, 2]
     assert gallery.nearest(0, 179.99, 1).tolist() == [1]
 
@@ -54,7 +54,7 @@ def test_the_rows_of_an_index_are_on_its_map(tmp_path: Path) -> None:
     build_index(IndexSettings(table=str(table), out=str(tmp_path / "index"), view=None, split=None))
     gallery = read_gallery_map(Index(str(tmp_path / "index")))
     assert gallery.rows == len(gallery.keys) == 60
-    assert np.isnan(gallery.places_N2[:, 1]).sum() == 12  # every fifth row has no longitude
+    assert np.isnan(gallery.positions_N2[:, 1]).sum() == 12  # every fifth row has no longitude
     assert gallery.spacing_m is not None
 
 

@@ -47,15 +47,15 @@ def hit(location: str, score: float, north_m: float | None = 0.0) -> Hit:
     )
 
 
-def confidence(**changes: Any) -> Calibration:
+def calibration(**changes: Any) -> Calibration:
     """Sure by the margin alone: 0.5 where it is 0.1."""
     model = LogisticModel(
         mean_F=(0, 0.1, 0, 0), scale_F=(1, 0.05, 1, 1), coefficient_F=(0, 2.0, 0, 0), intercept=0.0
     )
     plain = Calibration(
         fingerprint="f" * 64,
-        gallery=3,
-        asked="",
+        gallery_rows=3,
+        photo_selection="",
         spacing_m=300.0,
         agreement_radius_m=150.0,
         tolerance_m=25.0,
@@ -63,14 +63,14 @@ def confidence(**changes: Any) -> Calibration:
         model=model,
         threshold=0.4,
         inverse_temperature=20.0,
-        elsewhere=1.0,
+        none_log_odds=1.0,
         photos=100,
         locations=20,
-        right=0.7,
+        accuracy=0.7,
         right_kept=0.8,
         outside_unknown=0.9,
         calibration_error=0.02,
-        bins=(ReliabilityBin(said=0.1, seen=0.2, share=1.0),),
+        bins=(ReliabilityBin(predicted=0.1, observed=0.2, share=1.0),),
     )
     return replace(plain, **changes)
 
@@ -109,7 +109,7 @@ def test_an_answer_is_the_place_of_the_best_candidate_and_its_radius_reaches_hal
 def test_a_sure_answer_is_known_and_a_doubtful_one_is_not() -> None:
     """Margins 0.2 and 0.05: sigmoid(2 * 2) and sigmoid(2 * -1)."""
     doubtful = [hit("a", 0.75), hit("b", 0.7, 1000), hit("c", 0.5, 2000)]
-    sure, other = answers_from_hits([HITS, doubtful], 5, confidence())
+    sure, other = answers_from_hits([HITS, doubtful], 5, calibration())
     assert sure.probability == pytest.approx(1 / (1 + np.exp(-4)))
     assert other.probability == pytest.approx(1 / (1 + np.exp(2)))
     assert (sure.known, other.known) == (True, False)
@@ -122,7 +122,7 @@ def test_the_features_are_score_margin_depth_and_share() -> None:
 
 
 def test_nothing_found_is_unknown_and_the_others_keep_their_order() -> None:
-    found = answers_from_hits([[], HITS, []], 5, confidence())
+    found = answers_from_hits([[], HITS, []], 5, calibration())
     assert found[0] == found[2] == NO_ANSWER
     assert found[1].location == "a"
 
@@ -137,7 +137,7 @@ def test_as_many_candidates_decide_however_few_are_shown() -> None:
         [hit(f"{number:02d}", 0.9 - number / 100, 500 * number) for number in range(20)]
     )
     few, many = (
-        locate_embeddings(gallery, np.ones((1, 4), np.float32), k, None, confidence())[0]
+        locate_embeddings(gallery, np.ones((1, 4), np.float32), k, None, calibration())[0]
         for k in (1, 15)
     )
     assert gallery.asked[1:] == [CONSENSUS_CANDIDATES, 15]
@@ -152,8 +152,8 @@ def test_levels_are_told_from_the_last_candidate_considered() -> None:
 
 
 def test_a_calibration_comes_back_as_it_was_written(tmp_path: Any) -> None:
-    write_calibration(str(tmp_path / "calibration.json"), confidence())
-    assert find_calibration(str(tmp_path), {"fingerprint": "f" * 64}) == confidence()
+    write_calibration(str(tmp_path / "calibration.json"), calibration())
+    assert find_calibration(str(tmp_path), {"fingerprint": "f" * 64}) == calibration()
     assert find_calibration(str(tmp_path / "elsewhere"), {"fingerprint": "f" * 64}) is None
 
 
@@ -172,8 +172,8 @@ def test_what_is_no_calibration_is_refused(tmp_path: Any, text: str, sentence: s
 
 
 def test_another_network_s_calibration_is_refused(tmp_path: Any) -> None:
-    write_calibration(str(tmp_path / "calibration.json"), confidence())
-    with pytest.raises(InputError, match="network ffffffffffff and the index with 000"):
+    write_calibration(str(tmp_path / "calibration.json"), calibration())
+    with pytest.raises(InputError, match="encoder ffffffffffff and the index with 000"):
         read_calibration(str(tmp_path / "calibration.json"), {"fingerprint": "0" * 64})
 
 
@@ -185,8 +185,8 @@ def test_a_flight_settles_a_doubtful_photo_whatever_the_order_of_its_answers() -
     first, last = (
         [hit(name, 0.9, north), hit("z", 0.3, 50_000)] for name, north in (("a", 0), ("d", 400))
     )
-    single = answers_from_hits([last, middle, first], 5, confidence(spacing_m=None))
-    found = apply_track(single, [20, 10, 0], confidence(spacing_m=None), Motion(max_speed=25))
+    single = answers_from_hits([last, middle, first], 5, calibration(spacing_m=None))
+    found = apply_track(single, [20, 10, 0], calibration(spacing_m=None), Motion(max_speed=25))
     assert [one.location for one in single] == ["d", "b", "a"]
     assert [one.location for one in found] == ["d", "c", "a"]
     assert found[1].position is not None
@@ -196,9 +196,9 @@ def test_a_flight_settles_a_doubtful_photo_whatever_the_order_of_its_answers() -
 
 def test_the_fewer_photos_of_a_flight_are_expected_elsewhere_the_surer_the_others() -> None:
     doubtful = [hit("a", 0.5), hit("z", 0.45, 50_000)]
-    single = answers_from_hits([doubtful], 5, confidence())
+    single = answers_from_hits([doubtful], 5, calibration())
     rare, common = (
-        apply_track(single, [0], confidence(), Motion(elsewhere=share))[0] for share in (0.01, 0.9)
+        apply_track(single, [0], calibration(), Motion(elsewhere=share))[0] for share in (0.01, 0.9)
     )
     assert (rare.known, common.known) == (True, False)
 
@@ -209,9 +209,9 @@ def test_a_photo_that_the_track_passes_over_is_unknown() -> None:
         [hit(name, 0.9, north), hit("z", 0.2, 50_000)]
         for name, north in (("a", 0), ("c", 50), ("d", 100))
     ]
-    single = answers_from_hits([near[0], far, *near[1:]], 5, confidence())
+    single = answers_from_hits([near[0], far, *near[1:]], 5, calibration())
     found = apply_track(
-        single, [0, 10, 20, 30], replace(confidence(), elsewhere=0.0), Motion(max_speed=25)
+        single, [0, 10, 20, 30], replace(calibration(), none_log_odds=0.0), Motion(max_speed=25)
     )
     assert [one.known for one in found] == [True, False, True, True]
     assert found[1].location == "b"

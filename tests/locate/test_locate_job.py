@@ -89,8 +89,8 @@ def calibrated(world: dict[str, str]) -> None:
     sure = LogisticModel(mean_F=(0,) * 4, scale_F=(1,) * 4, coefficient_F=(0,) * 4, intercept=2.0)
     confidence = Calibration(
         fingerprint=world["mark"],
-        gallery=PLACES,
-        asked="",
+        gallery_rows=PLACES,
+        photo_selection="",
         spacing_m=111.0,
         agreement_radius_m=50.0,
         tolerance_m=25.0,
@@ -98,10 +98,10 @@ def calibrated(world: dict[str, str]) -> None:
         model=sure,
         threshold=0.4,
         inverse_temperature=5000.0,
-        elsewhere=0.0,
+        none_log_odds=0.0,
         photos=100,
         locations=20,
-        right=0.7,
+        accuracy=0.7,
         right_kept=0.8,
         outside_unknown=0.9,
         calibration_error=0.02,
@@ -205,7 +205,7 @@ def test_a_flight_without_times_or_without_a_calibration_is_refused(world: dict[
     with pytest.raises(InputError, match=r"no calibration beside .*--track"):
         locate_photos(settings(world, track=True))
     calibrated(world)
-    with pytest.raises(InputError, match=r"4 of 4 photos do not say when .*--interval"):
+    with pytest.raises(InputError, match=r"4 of 4 photos have no time in their tags.*--interval"):
         locate_photos(settings(world, track=True))
     assert len(locate_photos(settings(world, track=True, interval=5.0))) == 4
 

@@ -52,7 +52,7 @@ def gallery(lon: float = 8.0) -> GalleryMap:
         for column in (-1, 0, 1)
     ]
     names = np.array([f"gallery-satellite-{number}" for number in range(9)])
-    return GalleryMap(keys=names, places_N2=np.array(at), rows=9)
+    return GalleryMap(keys=names, positions_N2=np.array(at), rows=9)
 
 
 def answer(known: bool = True, lat: float = 0.0, lon: float = 8.0, location: str = "4") -> Answer:
@@ -98,7 +98,7 @@ def page(located: list[LocatedPhoto] = LOCATED, **changes: Any) -> str:
     given: dict[str, Any] = {
         "title": "Where?",
         "gallery": gallery(),
-        "confidence": None,
+        "calibration": None,
         "fingerprint": "f" * 64,
     } | changes
     return render_page(
@@ -155,7 +155,7 @@ def test_the_map_crosses_the_meridian_of_180_degrees() -> None:
     view = position_map(answer(lon=180.0), around, {})
     assert view is not None
     assert len(view.tiles) == 9
-    frame = fit_frame(around.places_N2)
+    frame = fit_frame(around.positions_N2)
     assert abs(frame.lon) == pytest.approx(180)
     assert frame.half_m < 200
 

@@ -62,8 +62,8 @@ def test_a_table_gives_times_by_path_or_by_name(tmp_path: Path) -> None:
     [
         (None, "no table at"),
         ("name,when\na.jpg,1\n", "no rows with the columns photo and time"),
-        ("photo,time\nb.jpg,1\n", "says nothing of /x/a.jpg"),
-        ("photo,time\na.jpg,noon\n", "says 'noon' of /x/a.jpg"),
+        ("photo,time\nb.jpg,1\n", "has no row for /x/a.jpg"),
+        ("photo,time\na.jpg,noon\n", "has the time 'noon' for /x/a.jpg"),
     ],
 )
 def test_a_table_that_does_not_say_is_refused(

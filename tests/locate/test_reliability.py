@@ -20,8 +20,8 @@ SAID, TRUE, WEIGHT = (
 
 def test_bins_hold_what_was_said_and_seen_by_weight() -> None:
     low, high = reliability_bins(SAID, TRUE, WEIGHT)
-    assert (low.said, low.seen, low.share) == pytest.approx((0.15, 0.5, 2 / 6))
-    assert (high.said, high.seen, high.share) == pytest.approx((0.9875, 1, 4 / 6))
+    assert (low.predicted, low.observed, low.share) == pytest.approx((0.15, 0.5, 2 / 6))
+    assert (high.predicted, high.observed, high.share) == pytest.approx((0.9875, 1, 4 / 6))
 
 
 def test_the_calibration_error_is_the_mean_distance_of_said_and_seen() -> None:

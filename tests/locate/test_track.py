@@ -19,9 +19,9 @@ def photo(time_s: float, norths_m: list[float], chances: list[float]) -> TrackPh
     left = 1 - sum(chances)
     return TrackPhoto(
         time_s=time_s,
-        places_K2=places,
-        log_chance_K=np.log(chances),
-        log_elsewhere=float(np.log(left)),
+        positions_K2=places,
+        log_p_K=np.log(chances),
+        log_p_none=float(np.log(left)),
     )
 
 
@@ -62,7 +62,7 @@ def test_slack_is_added_to_every_way() -> None:
 
 def test_one_photo_keeps_the_chances_that_it_had() -> None:
     found = smooth_track([photo(0, [0, 900], [0.5, 0.3])], Motion())[0]
-    assert found.chance_K == pytest.approx([0.5, 0.3])
+    assert found.p_K == pytest.approx([0.5, 0.3])
     assert found.chosen == 0
     assert found.probability == pytest.approx(0.5)
 
@@ -77,9 +77,9 @@ def test_no_photos_and_photos_without_candidates_have_no_places() -> None:
 def test_a_candidate_without_a_position_is_never_chosen() -> None:
     flight = TrackPhoto(
         time_s=0,
-        places_K2=np.full((1, 2), np.nan),
-        log_chance_K=np.log([0.99]),
-        log_elsewhere=float(np.log(0.01)),
+        positions_K2=np.full((1, 2), np.nan),
+        log_p_K=np.log([0.99]),
+        log_p_none=float(np.log(0.01)),
     )
     assert smooth_track([flight], Motion())[0].chosen is None
 
@@ -88,9 +88,9 @@ def test_the_way_across_the_meridian_of_180_degrees_is_short() -> None:
     flight = [
         TrackPhoto(
             time_s=10.0 * n,
-            places_K2=np.array([[0, lon]]),
-            log_chance_K=np.log([0.9]),
-            log_elsewhere=float(np.log(0.1)),
+            positions_K2=np.array([[0, lon]]),
+            log_p_K=np.log([0.9]),
+            log_p_none=float(np.log(0.1)),
         )
         for n, lon in enumerate((179.9995, -179.9995))
     ]
@@ -102,17 +102,17 @@ def chains(
 ) -> dict[tuple[int | None, ...], float]:
     """Every chain that can be flown, with its weight: all combinations are tried."""
     weights = {}
-    for chain in product(*([None, *range(len(one.log_chance_K))] for one in flight)):
+    for chain in product(*([None, *range(len(one.log_p_K))] for one in flight)):
         weight, last = (
             1.0,
             None if start is None else (flight[0].time_s, start.lat, start.lon, start.radius_m),
         )
         seen = None
         for number, (one, at) in enumerate(zip(flight, chain, strict=True)):
-            weight *= float(np.exp(one.log_elsewhere if at is None else one.log_chance_K[at]))
+            weight *= float(np.exp(one.log_p_none if at is None else one.log_p_K[at]))
             if at is None:
                 continue
-            here: Doubles = one.places_K2[at]
+            here: Doubles = one.positions_K2[at]
             if last is not None and (seen is None or number - seen <= motion.max_gap_photos):
                 away = float(haversine_m(np.array(last[1:3]), here))
                 way = motion.max_speed * (one.time_s - last[0]) + motion.slack_m + last[3]
@@ -135,7 +135,7 @@ def test_track_and_probabilities_are_those_of_all_chains(seed: int) -> None:
     motion = Motion(
         max_speed=12,
         slack_m=20,
-        places=40 if seed % 3 else 1,
+        gallery_positions=40 if seed % 3 else 1,
         spacing_m=50,
         max_gap_photos=1 + seed % 4,
     )
@@ -145,7 +145,7 @@ def test_track_and_probabilities_are_those_of_all_chains(seed: int) -> None:
     found = smooth_track(flight, motion, start)
     assert tuple(one.chosen for one in found) == max(weights, key=lambda chain: weights[chain])
     for number, one in enumerate(found):
-        for at, chance in enumerate(one.chance_K):
+        for at, chance in enumerate(one.p_K):
             with_it = sum(weight for chain, weight in weights.items() if chain[number] == at)
             assert chance == pytest.approx(with_it / total, abs=1e-9)
 
@@ -153,7 +153,7 @@ def test_track_and_probabilities_are_those_of_all_chains(seed: int) -> None:
 def test_a_place_gains_by_how_few_others_are_within_reach() -> None:
     """Of 100 places on squares of 10 m, 20 lie within a circle of 2,000 square metres: five times
     as likely. Beyond all and within one there is nothing more to gain."""
-    motion = Motion(places=100, spacing_m=10)
+    motion = Motion(gallery_positions=100, spacing_m=10)
     ways = np.array([np.sqrt(2000 / np.pi), 1e6, 0.0])
     assert np.exp(motion.gain(ways)) == pytest.approx([5, 1, 100])
 
@@ -161,9 +161,9 @@ def test_a_place_gains_by_how_few_others_are_within_reach() -> None:
 def test_near_places_are_likelier_than_elsewhere_though_no_photo_alone_says_so() -> None:
     flight = [photo(10.0 * n, [100.0 * n, 9000], [0.2, 0.2]) for n in range(4)]
     assert [one.chosen for one in smooth_track(flight, Motion())] == [None] * 4
-    assert [one.chosen for one in smooth_track(flight, Motion(places=1000, spacing_m=100))] == [
-        0
-    ] * 4
+    assert [
+        one.chosen for one in smooth_track(flight, Motion(gallery_positions=1000, spacing_m=100))
+    ] == [0] * 4
 
 
 def test_a_motion_that_makes_no_sense_is_refused() -> None:
