@@ -1,9 +1,8 @@
-"""What exact ranking costs at University-1652's size, as a ratio to the bare matrix products it
-cannot do without.
+"""Exact ranking at University-1652's size, as a ratio to the matrix products that it consists of.
 
 Prints one line per figure: seconds, and the ratio to the float32 products of the same blocks in the
-same run. `--large` ranks a gallery of the size of University160k's, streamed from a table on disk,
-and says how far memory grew beyond the start.
+same run. `--large` ranks a gallery of University160k's size, streamed from a table on disk, and
+prints by how much memory grew.
 """
 
 import argparse
@@ -23,17 +22,15 @@ from pipeline.retrieval.tasks import side_of
 
 DIMENSION = 2048
 TASKS = {"drone->satellite": (701, 54, 951, 1), "satellite->drone": (701, 1, 951, 54)}
-LARGE_GALLERY = (
-    168_437  # University-1652's 951 satellite images and University160k's 167,486 distractors
-)
+LARGE_GALLERY = 168_437
+"University-1652's 951 satellite images and University160k's 167,486 distractors."
 PART_ROWS = 8_192
-ROUNDS = 3  # the best of so many, in turn: other work on the machine slows some of them
+ROUNDS = 3
+"Alternating rounds, of which the best counts: other work on the machine slows some of them."
 
 
 def made_vectors(label_Q: Ints, centres_LD: Floats, seed: int, noise: float = 3) -> Floats:
-    """Unit vectors round the centre of each label; cosines of true matches are near 0.1, of others
-    near 0.
-    """
+    """Unit vectors around the centre of each label: cosines near 0.1 for true matches, else 0."""
     vectors_QD = np.random.default_rng(seed).standard_normal(
         (len(label_Q), DIMENSION), dtype=np.float32
     )
@@ -51,15 +48,15 @@ def made_side(locations: int, each: int, centres_LD: Floats, seed: int) -> Side:
 
 
 def product_seconds(queries: Side, gallery: Side) -> float:
-    """The bare float32 products of the blocks that the ranking multiplies; reading is not counted."""
-    cut = Blocks()
-    room = np.empty((cut.query_rows, cut.gallery_rows), np.float32)
-    query_blocks = list(queries.blocks(cut.query_rows))
+    """Seconds of the bare float32 products of the ranking's blocks, without reading."""
+    size = Blocks()
+    out = np.empty((size.query_rows, size.gallery_rows), np.float32)
+    query_blocks = list(queries.blocks(size.query_rows))
     seconds = 0.0
-    for gallery_BD in gallery.blocks(cut.gallery_rows):
+    for gallery_BD in gallery.blocks(size.gallery_rows):
         begin = time.perf_counter()
         for query_QD in query_blocks:
-            np.matmul(query_QD, gallery_BD.T, out=room[: len(query_QD), : len(gallery_BD)])
+            np.matmul(query_QD, gallery_BD.T, out=out[: len(query_QD), : len(gallery_BD)])
         seconds += time.perf_counter() - begin
     return seconds
 
@@ -83,7 +80,7 @@ def measure(name: str, queries: Side, gallery: Side, rounds: int = ROUNDS) -> No
 
 
 def write_tables(folder: str, query_rows: int, gallery_rows: int) -> None:
-    """Queries of 54 a location, and a gallery whose first 951 rows show the locations."""
+    """54 queries per location, and a gallery whose first 951 rows show the locations."""
     centres_LD = np.random.default_rng(0).standard_normal((951, DIMENSION), dtype=np.float32)
     around_LD = np.concatenate([centres_LD, np.zeros((1, DIMENSION), np.float32)])
     for split, view, rows, each in (
@@ -111,44 +108,43 @@ def write_tables(folder: str, query_rows: int, gallery_rows: int) -> None:
 
 
 class Interleaved:
-    """A gallery that keeps its last blocks, and multiplies each with each block of queries right
-    after that was ranked.
+    """A gallery that times the bare product of each block right after the block was ranked.
 
-    On a machine with other work, products measured minutes before or after the ranking say little;
-    these share its minutes.
+    On a machine with other work, products measured minutes before or after the ranking are no
+    baseline.
     """
 
     def __init__(self, queries: Side, gallery: Side) -> None:
         self._gallery, self.seconds = gallery, 0.0
         self._query_blocks = list(queries.blocks(Blocks().query_rows))
-        self._room = np.empty((Blocks().query_rows, Blocks().gallery_rows), np.float32)
-        self._kept: dict[int, Floats] = {}
+        self._out = np.empty((Blocks().query_rows, Blocks().gallery_rows), np.float32)
+        self._recent: dict[int, Floats] = {}
         self._done = 0
         self.side = replace(gallery, blocks=self._blocks)
 
     def _blocks(self, rows: int) -> Iterator[Floats]:
-        """The ranking reads twice: first for the true matches alone."""
+        """The ranking reads all blocks twice, the first time for the true matches alone."""
         for number, gallery_BD in enumerate(self._gallery.blocks(rows)):
-            self._kept[number] = gallery_BD
-            self._kept.pop(number - 3, None)  # the ranking reads a block ahead
+            self._recent[number] = gallery_BD
+            self._recent.pop(number - 3, None)  # the ranking prefetches one block
             yield gallery_BD
 
     def advance(self, scores: int) -> None:
-        """The ranking has done a block of queries x gallery."""
+        """Called when the ranking has done a block of queries x gallery."""
         number, part = divmod(self._done, len(self._query_blocks))
-        query_QD, gallery_BD = self._query_blocks[part], self._kept[number]
+        query_QD, gallery_BD = self._query_blocks[part], self._recent[number]
         assert scores == len(query_QD) * len(gallery_BD)
         begin = time.perf_counter()
-        np.matmul(query_QD, gallery_BD.T, out=self._room[: len(query_QD), : len(gallery_BD)])
+        np.matmul(query_QD, gallery_BD.T, out=self._out[: len(query_QD), : len(gallery_BD)])
         self.seconds += time.perf_counter() - begin
         self._done += 1
 
 
 def large(scale: float) -> None:
-    """Queries and gallery in tables on disk."""
+    """Rank queries and a gallery in tables on disk."""
     gallery_rows, query_rows = int(LARGE_GALLERY * scale), int(701 * scale) * 54
     with tempfile.TemporaryDirectory() as folder:
-        # In a process of its own: what making the tables takes is not what ranking takes.
+        # In a separate process: the memory of writing the tables must not count as the ranking's.
         maker = multiprocessing.get_context("spawn").Process(
             target=write_tables, args=(folder, query_rows, gallery_rows)
         )
@@ -157,29 +153,29 @@ def large(scale: float) -> None:
         queries, gallery = (
             side_of(open_table(f"{folder}/{split}")) for split in ("query", "gallery")
         )
-        beside = Interleaved(queries, gallery)
+        timed = Interleaved(queries, gallery)
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         begin = time.perf_counter()
-        rank(queries, beside.side, advance=beside.advance)
-        total = time.perf_counter() - begin - beside.seconds
+        rank(queries, timed.side, advance=timed.advance)
+        total = time.perf_counter() - begin - timed.seconds
         grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 2**20
         print(
-            f"streamed {query_rows} x {gallery_rows} x {DIMENSION}: {total:.1f} s, {total / beside.seconds:.2f} x the float32 "
-            f"products ({beside.seconds:.1f} s, block by block between the ranking), reading twice included; memory grew by "
-            f"{grown:.2f} GiB",
+            f"streamed {query_rows} x {gallery_rows} x {DIMENSION}: {total:.1f} s, "
+            f"{total / timed.seconds:.2f} x the float32 products ({timed.seconds:.1f} s, block by "
+            f"block between the ranking), reading twice included; memory grew by {grown:.2f} GiB",
             flush=True,
         )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scale", type=float, default=1.0, help="share of the locations to rank")
+    parser.add_argument("--scale", type=float, default=1.0, help="fraction of locations to rank")
     parser.add_argument(
         "--large", action="store_true", help="a gallery of 168,437 images from disk; takes minutes"
     )
-    arguments = parser.parse_args()
-    scale: float = arguments.scale
-    if arguments.large:
+    args = parser.parse_args()
+    scale: float = args.scale
+    if args.large:
         large(scale)
         return
     centres_LD = np.random.default_rng(0).standard_normal((951, DIMENSION), dtype=np.float32)

@@ -1,10 +1,9 @@
-"""What an index of a million embeddings costs and gives: build time, memory, size, recall, and
-speed against exact search.
+"""Build time, memory, size, recall and speed of indexes, as a ratio to exact search in one run.
 
-Prints one line per index. Each is built by the stage itself in a process of its own, whose memory
-is watched; then it and exact search in memory answer the same queries in turn. `--table` keeps the
-vectors for the next call; `--embeddings` of a trained network (see `embeddings.py` beside this
-file) take the place of made-up clusters.
+Prints one line per index. The stage builds each in a separate process, whose memory is sampled;
+then the index and exact search in memory answer the same queries, alternating. `--table` keeps the
+synthetic vectors for the next call, or takes the embeddings of a trained network
+(`benchmarks/embeddings.py`).
 """
 
 import argparse
@@ -13,6 +12,8 @@ import os
 import tempfile
 import threading
 import time
+from dataclasses import dataclass
+from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -28,10 +29,12 @@ from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings
 
 PART_ROWS = 16_384
-IMAGES_OF_PLACE = 20
-KINDS = 500  # of places: towns, woods, fields
-FLAT_ROWS = 131_072  # searched exactly in memory; the time of a product grows with its rows
-ROUNDS = 7
+IMAGES_PER_PLACE = 20
+KINDS = 500
+"Kinds of places: towns, woods, fields."
+BLOCK_ROWS = 8_192
+FLAT_ROWS = 131_072
+"Rows of the exact search in memory; its time is scaled to all rows, which it is linear in."
 PLANNED = "planned"
 HEADINGS = (
     "index",
@@ -47,12 +50,13 @@ HEADINGS = (
 )
 
 
-def made_vectors(first: int, count: int, dimension: int, seed: int) -> Floats:
-    """Unit vectors of rows first .. first + count: images of places (cosines near 0.5), places of
-    kinds (0.2).
+def synthetic_vectors(first: int, count: int, dimension: int, seed: int) -> Floats:
+    """Unit vectors of rows first .. first + count.
+
+    Cosines are near 0.5 between images of one place, near 0.2 between places of one kind.
     """
     kinds_KD = np.random.default_rng(0).standard_normal((KINDS, dimension), dtype=np.float32)
-    place_N = (np.arange(first, first + count) // IMAGES_OF_PLACE).astype(np.int64)
+    place_N = (np.arange(first, first + count) // IMAGES_PER_PLACE).astype(np.int64)
     places, inverse_N = np.unique(place_N, return_inverse=True)
     own_PD = np.stack(
         [
@@ -75,7 +79,7 @@ def write_rows(
     count = len(vectors_ND)
     rows = PartRows(
         keys=[f"{split}-{view}-{first + i:09d}" for i in range(count)],
-        locations=[f"{(first + i) // IMAGES_OF_PLACE:07d}" for i in range(count)],
+        locations=[f"{(first + i) // IMAGES_PER_PLACE:07d}" for i in range(count)],
         views=[view] * count,
         splits=[split] * count,
         lats=[(first + i) % 1000 / 1e4 for i in range(count)],
@@ -87,47 +91,46 @@ def write_rows(
 
 
 def make_table(folder: Path, rows: int, dimension: int) -> None:
-    """A gallery of `rows` images in places of twenty, and HELD_QUERIES other images of its places,
-    in float16.
-    """
+    """Write a float16 gallery of `rows` images, twenty per place, and queries of those places."""
     for number, first in enumerate(range(0, rows, PART_ROWS)):
         count = min(PART_ROWS, rows - first)
-        write_rows(
-            folder, "gallery", "satellite", number, made_vectors(first, count, dimension, 0), first
-        )
+        vectors_ND = synthetic_vectors(first, count, dimension, 0)
+        write_rows(folder, "gallery", "satellite", number, vectors_ND, first)
     spread = np.linspace(0, rows - 1, RECALL_QUERIES).astype(int)
-    queries = np.concatenate([made_vectors(int(first), 1, dimension, 1) for first in spread])
+    queries = np.concatenate([synthetic_vectors(int(first), 1, dimension, 1) for first in spread])
     write_rows(folder, "query", "drone", 0, queries, 0)
 
 
 def memory_of(kind: str) -> int:
-    """Bytes of this process: RssAnon, without the files that it maps, which the system takes back;
-    VmHWM, the most so far.
+    """Memory of this process in bytes, by a field of /proc/self/status.
+
+    RssAnon excludes mapped files, whose pages the system can drop; VmHWM is the peak of all.
     """
-    said = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-    return int(said[kind].split()[0]) * 1024
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(status[kind].split()[0]) * 1024
 
 
-def built(settings: IndexSettings, answer: Connection) -> None:
-    """Build an index, and say its facts and the most memory it took."""
+def build(settings: IndexSettings, answer: Connection) -> None:
+    """Build an index; send its metadata, the peak of RssAnon, and VmHWM."""
     peak, done = 0, threading.Event()
 
-    def watch() -> None:
+    def sample() -> None:
         nonlocal peak
         while not done.wait(0.02):
             peak = max(peak, memory_of("RssAnon"))
 
-    watcher = threading.Thread(target=watch)
-    watcher.start()
+    sampler = threading.Thread(target=sample)
+    sampler.start()
     try:
-        facts = build_index(settings)
+        metadata = build_index(settings)
     finally:
         done.set()
-        watcher.join()
-    answer.send((facts, peak, memory_of("VmHWM")))
+        sampler.join()
+    answer.send((metadata, peak, memory_of("VmHWM")))
 
 
 def in_a_process(target: Any, *arguments: Any) -> Any:
+    """Call `target` with a connection as its last argument in a new process; what it sends."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=target, args=(*arguments, theirs))
@@ -139,67 +142,73 @@ def in_a_process(target: Any, *arguments: Any) -> Any:
         process.join()
 
 
-def searched(
-    path: str, queries_QD: Floats, flat_QD: Floats, scale: float, exact_QK: Any, answer: Connection
-) -> None:
-    """Recall, queries a second and their ratio to exact search, which answers in turn; and the
-    memory that searching takes.
+@dataclass(frozen=True, kw_only=True)
+class Queries:
+    """What every index answers."""
+
+    queries_QD: Floats
+    exact_QK: Any
+    """Rows of the ten best of the whole gallery, by exact search."""
+    flat_ND: Floats
+    """The gallery's first rows, for the exact search that is timed."""
+    rounds: int
+
+
+def search(path: str, given: Queries, scale: float, answer: Connection) -> None:
+    """Send recall@10, queries per second, their ratio to exact search, and the memory to search.
+
+    `scale` is the number of rows of the index over those of the exact search.
     """
     before = memory_of("RssAnon")
     index = Index(path)
-    index.search(queries_QD[:4])
+    index.search(given.queries_QD[:4])
     memory = memory_of("RssAnon") - before
-    flat = faiss.IndexFlatIP(flat_QD.shape[1])
-    flat.add(flat_QD)
+    flat = faiss.IndexFlatIP(given.flat_ND.shape[1])
+    flat.add(given.flat_ND)
     ours, exact = [], []
-    for _ in range(ROUNDS):
+    for _ in range(given.rounds):
         start = time.perf_counter()
-        found = index.search_rows(queries_QD, 10)[1]
+        found = index.search_rows(given.queries_QD, 10)[1]
         ours.append(time.perf_counter() - start)
         start = time.perf_counter()
-        flat.search(queries_QD, 10)
+        flat.search(given.queries_QD, 10)
         exact.append((time.perf_counter() - start) * scale)
-    at_10 = np.mean(
-        [len({*a} & {*b}) / 10 for a, b in zip(exact_QK.tolist(), found.tolist(), strict=True)]
-    )
+    pairs = zip(given.exact_QK.tolist(), found.tolist(), strict=True)
+    recall = np.mean([len({*a} & {*b}) / 10 for a, b in pairs])
     ratio = np.median([one / other for one, other in zip(exact, ours, strict=True)])
-    answer.send((float(at_10), len(queries_QD) / float(np.median(ours)), float(ratio), memory))
+    rate = len(given.queries_QD) / float(np.median(ours))
+    answer.send((float(recall), rate, float(ratio), memory))
 
 
-def report(
-    table: str, out: str, factory: str, asked: argparse.Namespace, held: tuple[Floats, Any, Floats]
-) -> None:
-    """Build one index, let it answer, and print its line."""
+def report(table: str, out: str, factory: str, args: argparse.Namespace, given: Queries) -> None:
+    """Build one index, search it, and print its line."""
     name, refined = factory.removesuffix("+table"), factory.endswith("+table")
     settings = IndexSettings(
         table=table,
         out=out,
         split=Split.GALLERY,
-        memory_budget=asked.memory_budget,
-        target_recall=asked.target_recall,
+        memory_budget=args.memory_budget,
+        target_recall=args.target_recall,
         factory=None if name == PLANNED else name,
         refine=refined,
     )
     start = time.perf_counter()
-    facts, anonymous, resident = in_a_process(built, settings)
-    total = time.perf_counter() - start
-    queries_QD, exact_QK, flat_QD = held
-    at_10, speed, ratio, memory = in_a_process(
-        searched, out, queries_QD, flat_QD, facts["rows"] / len(flat_QD), exact_QK
-    )
-    said = (
-        facts["factory"] + " + table" * (facts["refine"] == "table") + " on disk" * facts["on_disk"]
-    )
+    metadata, anonymous, resident = in_a_process(build, settings)
+    seconds = time.perf_counter() - start
+    scale = metadata["rows"] / len(given.flat_ND)
+    recall, rate, ratio, memory = in_a_process(search, out, given, scale)
+    label = metadata["factory"]
+    label += " + table" * (metadata["refine"] == "table") + " on disk" * metadata["on_disk"]
     cells = [
-        said + " (the planner)" * (name == PLANNED),
-        f"{total:.0f} s",
+        label + " (the planner)" * (name == PLANNED),
+        f"{seconds:.0f} s",
         f"{anonymous / 1e9:.2f} GB",
         f"{resident / 1e9:.2f} GB",
-        f"{facts['bytes_per_vector']:,.0f}",
+        f"{metadata['bytes_per_vector']:,.0f}",
         f"{memory / 1e9:.2f} GB",
-        f"{at_10:.4f}",
-        f"{facts['effort']['breadth']}, {facts['effort']['candidates']}",
-        f"{speed:,.0f}",
+        f"{recall:.4f}",
+        f"{metadata['effort']['breadth']}, {metadata['effort']['candidates']}",
+        f"{rate:,.0f}",
         f"{ratio:.1f} x",
     ]
     print(f"| {' | '.join(cells)} |", flush=True)
@@ -207,51 +216,46 @@ def report(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rows", type=int, default=200_000)
-    parser.add_argument("--dimension", type=int, default=2048)
-    parser.add_argument("--memory-budget", default="4GB")
-    parser.add_argument("--target-recall", type=float, default=0.95)
-    parser.add_argument(
-        "--table", help="feature table: used where it is there, made there otherwise"
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    add("--rows", type=int, default=200_000)
+    add("--dimension", type=int, default=2048)
+    add("--memory-budget", default="4GB")
+    add("--target-recall", type=float, default=0.95)
+    add("--rounds", type=int, default=7, help="alternating rounds of search")
+    add("--table", help="feature table: used if it exists, written otherwise")
+    factories = [PLANNED, "IVF1024,SQ8", "IVF1024,RaBitQ+table"]
+    add(
         "--factories",
         nargs="*",
-        default=[PLANNED, "IVF1024,SQ8", "IVF1024,RaBitQ+table"],
+        default=factories,
         help="FAISS factory strings; +table: candidates are scored again by the table",
     )
-    arguments = parser.parse_args()
+    args = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(arguments.table or f"{scratch}/table")
+        folder = Path(args.table or f"{scratch}/table")
         if not any(folder.glob("*.parquet")):
             start = time.perf_counter()
-            make_table(folder, arguments.rows, arguments.dimension)
-            print(
-                f"made {arguments.rows:,} x {arguments.dimension} in {time.perf_counter() - start:.0f} s"
-            )
+            make_table(folder, args.rows, args.dimension)
+            print(f"wrote {args.rows:,} x {args.dimension} in {time.perf_counter() - start:.0f} s")
         table = open_table(str(folder))
         gallery, queries_QD = table.select(Split.GALLERY), table.select(Split.QUERY).embeddings()
         faiss.omp_set_num_threads(os.cpu_count() or 1)
         exact_QK = exact_search(queries_QD, gallery, 10)
-        flat_QD = np.concatenate(
-            [
-                block
-                for _, block in zip(range(FLAT_ROWS // 8192), gallery.blocks(8192), strict=False)
-            ]
+        blocks = islice(gallery.blocks(BLOCK_ROWS), FLAT_ROWS // BLOCK_ROWS)
+        given = Queries(
+            queries_QD=queries_QD,
+            exact_QK=exact_QK,
+            flat_ND=np.concatenate(list(blocks)),
+            rounds=args.rounds,
         )
         print(
-            f"{gallery.rows:,} x {table.dimension} in {table.dtype}, budget {arguments.memory_budget}, "
-            f"{len(queries_QD)} queries, exact search timed on {len(flat_QD):,} rows, {os.cpu_count()} cores"
+            f"{gallery.rows:,} x {table.dimension} in {table.dtype}, budget {args.memory_budget}, "
+            f"{len(queries_QD)} queries, exact search timed on {len(given.flat_ND):,} rows, "
+            f"{os.cpu_count()} cores"
         )
         print(f"| {' | '.join(HEADINGS)} |\n|{'---|' * len(HEADINGS)}", flush=True)
-        for number, factory in enumerate(arguments.factories):
-            report(
-                str(folder),
-                f"{scratch}/index-{number}",
-                factory,
-                arguments,
-                (queries_QD, exact_QK, flat_QD),
-            )
+        for number, factory in enumerate(args.factories):
+            report(str(folder), f"{scratch}/index-{number}", factory, args, given)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,12 @@
-"""Pictures per second and core that the simulator makes, the making of the worlds and JPEG
-included: a line per figure.
+"""Images per second and core of the simulator, and their cost as a ratio to JPEG encoding alone.
 
-`python benchmarks/simulate.py` measures; with `--sheet FILE` it writes a contact sheet instead: one location a row, the
-satellite's picture first, then the flight from its first view to its last.
+World generation and JPEG encoding are included. Prints one line per image size; the ratio compares
+CPU seconds per image with those that Pillow needs, in the same run, to encode the same images.
+
+    python benchmarks/simulate.py [--sizes 64 128 256 512] [--views 54]
+
+With `--sheet FILE` it writes a contact sheet instead: one location per row, first the satellite
+image, then UAV images from the first to the last of the flight.
 """
 
 import argparse
@@ -11,25 +15,37 @@ import os
 import time
 from pathlib import Path
 
-# One core is measured: NumPy reads this when it is imported.
+# One core is measured: NumPy reads these when it is imported.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from PIL import Image
 
-from pipeline.simulation.location import LocationSpec, render_location
+from pipeline.simulation.location import JPEG_QUALITY, LocationSpec, render_location
 
-VIEWS = 54
+LOCATIONS = {64: 4, 128: 4, 256: 3, 512: 1}
+"Image size in pixels -> locations measured."
 
 
-def measure(size: int, locations: int) -> float:
-    """Pictures per second of CPU time, whole locations."""
-    render_location(LocationSpec(seed=1, location=1, views=1, size=size))
+def measure(size: int, locations: int, views: int) -> tuple[float, float]:
+    """(images per second of CPU time, its inverse over Pillow's JPEG encoding of the images)."""
+    render_location(LocationSpec(seed=1, location=1, views=1, size=size))  # warm
     begin = time.process_time()
-    for location in range(locations):
-        render_location(LocationSpec(seed=1, location=2 + location, views=VIEWS, size=size))
-    return locations * (VIEWS + 1) / (time.process_time() - begin)
+    made = [
+        render_location(LocationSpec(seed=1, location=2 + number, views=views, size=size))
+        for number in range(locations)
+    ]
+    seconds = time.process_time() - begin
+    images = [
+        Image.open(io.BytesIO(data)).convert("RGB")
+        for location in made
+        for data in (location.satellite, *location.drone)
+    ]
+    begin = time.process_time()
+    for image in images:
+        image.save(io.BytesIO(), "JPEG", quality=JPEG_QUALITY)
+    return len(images) / seconds, seconds / (time.process_time() - begin)
 
 
 def contact_sheet(
@@ -37,34 +53,31 @@ def contact_sheet(
 ) -> None:
     """Write a JPEG with a row per location."""
     rows = []
-    for location in locations:
-        taken = render_location(LocationSpec(seed=seed, location=location, views=views, size=size))
-        rows.append(
-            np.hstack(
-                [
-                    np.asarray(Image.open(io.BytesIO(data)))
-                    for data in (taken.satellite, *taken.drone)
-                ]
-            )
-        )
+    for number in locations:
+        spec = LocationSpec(seed=seed, location=number, views=views, size=size)
+        location = render_location(spec)
+        frames = (location.satellite, *location.drone)
+        rows.append(np.hstack([np.asarray(Image.open(io.BytesIO(data))) for data in frames]))
     Image.fromarray(np.vstack(rows)).save(path, quality=78)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--sheet", type=Path, help="write a contact sheet of made towns to this JPEG"
-    )
-    parser.add_argument(
-        "--locations", type=int, nargs="+", default=[14, 11, 22, 13, 25, 12, 16], help="its rows"
-    )
-    asked = parser.parse_args()
-    if asked.sheet:
-        contact_sheet(asked.sheet, locations=asked.locations)
+    add = parser.add_argument
+    add("--sizes", type=int, nargs="+", choices=LOCATIONS, default=list(LOCATIONS), help="pixels")
+    add("--views", type=int, default=54, help="UAV images per location")
+    add("--sheet", type=Path, help="write a contact sheet of simulated towns to this JPEG")
+    rows = [14, 11, 22, 13, 25, 12, 16]
+    add("--locations", type=int, nargs="+", default=rows, help="the sheet's rows")
+    args = parser.parse_args()
+    if args.sheet:
+        contact_sheet(args.sheet, locations=args.locations)
         return
-    for size, locations in ((64, 4), (128, 4), (256, 3), (512, 1)):
+    for size in args.sizes:
+        rate, ratio = measure(size, LOCATIONS[size], args.views)
         print(
-            f"simulate: {measure(size, locations):.1f} images/s per core at {size} px, worlds and JPEG included"
+            f"simulate: {size} px, {rate:.1f} images/s per core, {ratio:.1f} x the time of "
+            "encoding them as JPEG"
         )
 
 

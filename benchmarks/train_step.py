@@ -1,8 +1,7 @@
-"""What a training step costs when its images are streamed, as a ratio to the same step on one batch
-that is there already.
+"""A training step on streamed images, as a ratio to the same step on one batch in memory.
 
 Prints one line per figure: the ratio (goal: at most 1.03), images per second, and the share of time
-of each part.
+of each part of a step.
 """
 
 import argparse
@@ -12,17 +11,18 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
+from synthetic import jpegs
 
 from jobs.training.loop import BatchTensors, Worker, WorkerContext
 from jobs.training.recipes import Recipe, paper, smoke
 from jobs.training.settings import RunConfig
 from model.losses import adversarial_terms, location_terms
 from model.schedule import ScheduleState
-from pipeline.core import storage
+from pipeline.core import json_files, storage
 from pipeline.core.records import ImageRecord, Split, View
 from pipeline.shards.manifest import MANIFEST, Manifest
 from pipeline.shards.plan import ShardPlan
@@ -31,25 +31,19 @@ from pipeline.sources.university1652 import University1652
 
 NOW = ScheduleState(alpha=0.9, lr_scale=0.01)
 ROUNDS = 3
-"Streamed and resident steps take turns, so that whatever else the machine does meets both."
+"Streamed and resident steps alternate, so that other work on the machine slows both."
 
 
-def made_shards(folder: str, side: int, images: int) -> str:
-    """So many satellite images, and as many of a UAV, of `side` pixels: noise at several scales,
-    which JPEG finds hard.
-    """
-    rng, written = np.random.default_rng(0), []
-    for view in (View.DRONE, View.SATELLITE):
+def write_shards(folder: str, side: int, images: int) -> str:
+    """Write a set of so many UAV images and as many satellite images of `side` pixels."""
+    written = []
+    for seed, view in enumerate((View.DRONE, View.SATELLITE)):
         records = []
-        for number in range(images):
-            image = np.zeros((side, side, 3))
-            for cells in (4, 16, 64):
-                coarse = Image.fromarray(rng.integers(0, 256, (cells, cells, 3), np.uint8))
-                image += np.asarray(coarse.resize((side, side), Image.Resampling.BICUBIC)) / 3
-            path = f"{folder}/{view}-{number:04d}.jpg"
-            Image.fromarray(image.astype(np.uint8)).save(path, quality=90)
+        for number, data in enumerate(jpegs(images, side, side, seed)):
+            path = Path(folder) / f"{view}-{number:04d}.jpg"
+            path.write_bytes(data)
             records.append(
-                ImageRecord(path=path, split=Split.TRAIN, view=view, location=f"{number:04d}")
+                ImageRecord(path=str(path), split=Split.TRAIN, view=view, location=f"{number:04d}")
             )
         plan = ShardPlan(
             name=f"train-{view}-000000", split=Split.TRAIN, view=view, records=tuple(records)
@@ -57,38 +51,36 @@ def made_shards(folder: str, side: int, images: int) -> str:
         written.append(write_shard(plan, University1652(), folder, "").shard)
     classes = tuple(f"{number:04d}" for number in range(images))
     manifest = Manifest(shards=tuple(written), classes=classes, packing={}, rejected=0)
-    storage.write_json(storage.join(folder, MANIFEST), asdict(manifest))
+    json_files.write_checksummed(storage.join(folder, MANIFEST), asdict(manifest))
     return folder
 
 
-def finished(device: torch.device) -> float:
-    """The time, once the device has done what it was told."""
+def synchronised_time(device: torch.device) -> float:
+    """The time at which the device has finished its queued work."""
     if device.type == "cuda":
         torch.cuda.synchronize()
     return time.perf_counter()
 
 
 def streamed(worker: Worker, epoch: int, steps: int) -> tuple[float, float]:
-    """Seconds of a step that is fed by the stream, and of these the seconds that it waits for its
-    batch.
-    """
+    """(Seconds of a step on streamed batches, the part of them spent waiting for the batch)."""
     batches = worker.batches(epoch)
-    step(worker, next(batches))  # the stream starts
-    waited, began = 0.0, finished(worker.training.device)
+    step(worker, next(batches))  # starts the stream
+    waited, begin = 0.0, synchronised_time(worker.training.device)
     for _ in range(steps):
-        asked = time.perf_counter()
+        request = time.perf_counter()
         batch = next(batches)
-        waited += time.perf_counter() - asked
+        waited += time.perf_counter() - request
         step(worker, batch)
-    return (finished(worker.training.device) - began) / steps, waited / steps
+    return (synchronised_time(worker.training.device) - begin) / steps, waited / steps
 
 
 def resident(worker: Worker, batch: BatchTensors, steps: int) -> float:
-    """Seconds of a step on a batch that is on the device."""
-    began = finished(worker.training.device)
+    """Seconds of a step on a batch that is already on the device."""
+    begin = synchronised_time(worker.training.device)
     for _ in range(steps):
         step(worker, batch)
-    return (finished(worker.training.device) - began) / steps
+    return (synchronised_time(worker.training.device) - begin) / steps
 
 
 def step(worker: Worker, batch: BatchTensors) -> None:
@@ -97,16 +89,14 @@ def step(worker: Worker, batch: BatchTensors) -> None:
 
 
 def parts(worker: Worker, batch: BatchTensors, steps: int) -> dict[str, float]:
-    """Seconds of each part of a step: the same computations, one after the other and each waited
-    for.
-    """
+    """Seconds of each part of a step, run one after the other with a wait after each."""
     training, spent = worker.training, defaultdict[str, float](float)
 
     @contextmanager
     def part(name: str) -> Iterator[None]:
-        began = finished(training.device)
+        begin = synchronised_time(training.device)
         yield
-        spent[name] += (finished(training.device) - began) / steps
+        spent[name] += (synchronised_time(training.device) - begin) / steps
 
     def autocast() -> torch.autocast:
         return torch.autocast(training.device.type, torch.bfloat16, enabled=training.bfloat16)
@@ -126,41 +116,43 @@ def parts(worker: Worker, batch: BatchTensors, steps: int) -> dict[str, float]:
             verdict_B2 = discriminator(both_BCHW)
             discriminator.requires_grad_(True)
             loss = adversarial_terms(*verdict_B2.tensor_split([len(maps1_BCHW)])).sum()
-            [pushed] = torch.autograd.grad(loss, both_BCHW, retain_graph=True)
+            [gradient_BCHW] = torch.autograd.grad(loss, both_BCHW, retain_graph=True)
         with part("encoder"):
             training.optimizers[0].zero_grad(set_to_none=True)
-            torch.autograd.backward([located, both_BCHW], [None, NOW.alpha * pushed])
+            torch.autograd.backward([located, both_BCHW], [None, NOW.alpha * gradient_BCHW])
         with part("optimiser"):
             training.optimizers[0].step()
     return spent
 
 
-def measure(name: str, recipe: Recipe, side: int, steps: int, device: str, compiled: bool) -> None:
-    wanted = recipe.batch_size * (steps + 2)
+def measure(
+    name: str, recipe: Recipe, side: int, steps: int, rounds: int, device: str, compiled: bool
+) -> None:
+    images = recipe.batch_size * (steps + 2)
     with tempfile.TemporaryDirectory() as folder:
-        shards = made_shards(folder, side, wanted)
+        shards = write_shards(folder, side, images)
         run = RunConfig(shards=shards, out=folder, recipe=recipe, compile=compiled)
         worker = Worker(run, WorkerContext(device=device), lambda told: print(told["note"]))
         batch = next(iter(worker.batches(0)))
         resident(worker, batch, 3)  # warm
-        rounds = [
+        seconds = [
             (*streamed(worker, epoch, steps), resident(worker, batch, steps))
-            for epoch in range(ROUNDS)
+            for epoch in range(rounds)
         ]
         spent = parts(worker, batch, steps)
-    fed, waited, there = (float(np.median(column)) for column in zip(*rounds, strict=True))
-    ratios = ", ".join(f"{one / other:.3f}" for one, _, other in rounds)
+    fed, waited, in_memory = (float(np.median(column)) for column in zip(*seconds, strict=True))
+    ratios = ", ".join(f"{one / other:.3f}" for one, _, other in seconds)
     print(
-        f"{name}: streamed step {1000 * fed:.1f} ms, {fed / there:.3f} x the resident step (rounds: {ratios})"
+        f"{name}: streamed step {1000 * fed:.1f} ms, {fed / in_memory:.3f} x the resident step "
+        f"(rounds: {ratios})"
     )
     print(
-        f"{name}: {2 * recipe.batch_size / fed:.1f} images/s, waits for data {100 * waited / fed:.1f} % of the step"
+        f"{name}: {2 * recipe.batch_size / fed:.1f} images/s, waits for data "
+        f"{100 * waited / fed:.1f} % of the step"
     )
-    whole = sum(spent.values())
-    print(
-        f"{name}: "
-        + ", ".join(f"{part} {100 * seconds / whole:.0f} %" for part, seconds in spent.items())
-    )
+    total = sum(spent.values())
+    shares = [f"{part} {100 * taken / total:.0f} %" for part, taken in spent.items()]
+    print(f"{name}: " + ", ".join(shares))
 
 
 CASES: dict[str, Callable[[], tuple[Recipe, int, int]]] = {
@@ -171,7 +163,7 @@ CASES: dict[str, Callable[[], tuple[Recipe, int, int]]] = {
         3,
     ),
 }
-"Recipe, side of the source's images, and steps of a round."
+"Case -> recipe, side of the source images, and steps of a round."
 ON_CUDA: dict[str, Callable[[], tuple[Recipe, int, int]]] = {
     "paper, 8 + 8 images of 256 px": lambda: (paper(), 512, 100),
     "paper, 64 + 64 images of 256 px": lambda: (replace(paper(), batch_size=64), 512, 30),
@@ -180,12 +172,18 @@ ON_CUDA: dict[str, Callable[[], tuple[Recipe, int, int]]] = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--compile", action="store_true", help="compile the networks")
-    compiled = parser.parse_args().compile
+    add = parser.add_argument
+    add("--compile", action="store_true", help="compile the networks")
+    add("--cases", nargs="+", help="first words of the cases to run; all by default")
+    add("--steps", type=int, help="steps of a round; the case's own by default")
+    add("--rounds", type=int, default=ROUNDS, help="alternating rounds")
+    args = parser.parse_args()
     device = "cuda" if torch.cuda.is_available() else "cpu"
     print(f"{device}, torch {torch.__version__}, {torch.get_num_threads()} threads")
     for name, case in (ON_CUDA if device == "cuda" else CASES).items():
-        measure(name, *case(), device, compiled)
+        if not args.cases or name.startswith(tuple(args.cases)):
+            recipe, side, steps = case()
+            measure(name, recipe, side, args.steps or steps, args.rounds, device, args.compile)
 
 
 if __name__ == "__main__":
