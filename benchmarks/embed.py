@@ -1,20 +1,19 @@
-"""What a fast encoder gains over the plain one, as ratios of images per second within one run, with
-its agreement.
+"""Optimised encoders against the plain one: images per second as a ratio, and agreement.
 
-The plain encoder is the field's: float32, NCHW, uncompiled, the mirror image in a second pass.
-Rounds of all encoders take turns, so that whatever else the machine does meets all of them. Prints
-one line per figure.
+The plain encoder is the field's: float32, NCHW, uncompiled, the mirror image in a second pass. All
+encoders alternate, so that other work on the machine slows all of them. Prints one line per figure.
 """
 
 import argparse
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model.checkpoint import load_encoder
+from model.checkpoint import build_encoder, loads
 from model.config import PVDAConfig
 from model.inference.embed import FastEncoder, embed
 from model.inference.int8 import PrecisionError
@@ -32,21 +31,18 @@ CHOICES: dict[str, tuple[Precision, bool]] = {
 
 
 def soft_noise(count: int, size: int, seed: int) -> Tensor:
-    """Bytes (count, 3, size, size), channels last as the embedder stacks them: noise at several
-    scales.
-    """
+    """Bytes (count, 3, size, size) of noise at several scales, channels last as in embedding."""
     generator = torch.Generator().manual_seed(seed)
     image = torch.zeros(count, 3, size, size)
-    for cells, share in ((3, 0.5), (12, 0.3), (size, 0.2)):
+    for cells, weight in ((3, 0.5), (12, 0.3), (size, 0.2)):
         coarse = torch.rand(count, 3, cells, cells, generator=generator)
-        image += F.interpolate(coarse, (size, size), mode="bicubic") * 255 * share
+        image += F.interpolate(coarse, (size, size), mode="bicubic") * 255 * weight
     return image.clamp(0, 255).to(torch.uint8).to(memory_format=torch.channels_last)
 
 
 @torch.no_grad()
-def made_encoder(config: PVDAConfig) -> FeatureEncoder:
-    """Random weights, but features that are alive: each BatchNorm has random scales and the
-    statistics of its input.
+def random_encoder(config: PVDAConfig) -> FeatureEncoder:
+    """Random weights with usable features: BatchNorms of random scale, fitted to their input.
 
     The norm that ends a block's branch is small, as training leaves it. With scales around 1 there,
     fifty random layers multiply any rounding: at 128 px the cosine of bfloat16 fell from .9992 to
@@ -57,109 +53,98 @@ def made_encoder(config: PVDAConfig) -> FeatureEncoder:
     last = "bn3" if config.depth >= 50 else "bn2"
     for name, module in encoder.named_modules():
         if isinstance(module, nn.modules.batchnorm._BatchNorm):
-            module.momentum = None  # statistics are the mean over what was seen
+            module.momentum = None  # the statistics become the mean over all input
             module.weight.uniform_(*((0.1, 0.3) if name.endswith(last) else (0.5, 1.5)))
             module.bias.normal_(0, 0.3)
     encoder(soft_noise(16, config.image_size, seed=1))
     return encoder.eval()
 
 
-def seconds(encode: Callable[[Tensor], Tensor], images_B3HW: Tensor, device: str) -> float:
-    """Of one pass. One thread on a CPU is timed by what it computed, which other work on the
-    machine does not stretch.
-    """
-    clock = (
-        time.process_time if device == "cpu" and torch.get_num_threads() == 1 else time.perf_counter
-    )
-    start = clock()
+def pass_seconds(encode: Callable[[Tensor], Tensor], images_B3HW: Tensor, device: str) -> float:
+    """Duration of one pass; of one thread on a CPU its CPU time, which other work leaves alone."""
+    one_thread = device == "cpu" and torch.get_num_threads() == 1
+    clock = time.process_time if one_thread else time.perf_counter
+    begin = clock()
     encode(images_B3HW).cpu()  # waits for the device
-    return clock() - start
+    return clock() - begin
 
 
-def encoders(encoder: FeatureEncoder, arguments: argparse.Namespace) -> None:
-    """The encoder alone, on a batch that is there: one line per way to compute it."""
-    batch, mirror, device = arguments.batch_size, not arguments.no_mirror, arguments.device
-    size = arguments.size
+def compare_encoders(encoder: FeatureEncoder, size: int, args: argparse.Namespace) -> None:
+    """Print one line per optimised encoder, on a batch in memory."""
+    batch, mirror, device = args.batch_size, not args.no_mirror, args.device
     images_B3HW = soft_noise(batch, size, seed=2)
+    probe_B3HW = soft_noise(args.probes, size, seed=3)
     plain = encoder.to(device, memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-    ways: dict[str, Callable[[Tensor], Tensor]] = {
+    encoders: dict[str, Callable[[Tensor], Tensor]] = {
         "plain": lambda images: embed(plain, images.to(device), mirror)
     }
-    made: dict[str, FastEncoder] = {}
-    asked = dict(MIN_COSINE)
-    MIN_COSINE.update(
-        {"bfloat16": -1, "int8": -1}
-    )  # what would be refused is timed too, and said to be so
-    for name in arguments.ways:
+    optimised: dict[str, FastEncoder] = {}
+    required = dict(MIN_COSINE)
+    # Time encoders below the required agreement as well; their lines say so.
+    MIN_COSINE.update({"bfloat16": -1, "int8": -1})
+    for name in args.encoders:
         precision, compiled = CHOICES[name]
-        start = time.perf_counter()
+        begin = time.perf_counter()
         try:
-            made[name] = ways[name] = optimise_encoder(
+            optimised[name] = encoders[name] = optimise_encoder(
                 plain,
                 precision=precision,
                 mirror=mirror,
                 compiled=compiled,
                 batch_size=batch,
-                probe_B3HW=soft_noise(arguments.probes, size, seed=3),
-                calibration_B3HW=soft_noise(arguments.calibration, size, seed=4),
-                say=lambda told: None,
+                probe_B3HW=probe_B3HW,
+                calibration_B3HW=soft_noise(args.calibration, size, seed=4),
+                say=lambda message: None,
             )
         except PrecisionError as error:
-            print(f"{name}: not here: {error}")
+            print(f"{name}: not available here: {error}")
         else:
-            print(
-                f"{name}: made in {time.perf_counter() - start:.0f} s, checks and calibration among them"
-            )
-    spent = {name: seconds(way, images_B3HW, device) for name, way in ways.items()}
-    for _ in range(arguments.rounds):
-        for name, way in ways.items():
-            spent[name] = min(spent[name], seconds(way, images_B3HW, device))
-    base = spent.pop("plain")
-    print(f"plain: {batch / base:.2f} images/s")
-    for name, best in spent.items():
-        fast = made[name]
-        refused = fast.mean_agreement if fast.precision == "int8" else fast.agreement
+            seconds = time.perf_counter() - begin
+            print(f"{name}: built in {seconds:.0f} s, checks and calibration included")
+    best = {name: pass_seconds(one, images_B3HW, device) for name, one in encoders.items()}
+    for _ in range(args.rounds):
+        for name, one in encoders.items():
+            best[name] = min(best[name], pass_seconds(one, images_B3HW, device))
+    baseline = best.pop("plain")
+    print(f"plain: {batch / baseline:.2f} images/s")
+    for name, seconds in best.items():
+        fast = optimised[name]
+        agreement = fast.mean_agreement if fast.precision == "int8" else fast.agreement
+        refused = ", which a job would refuse" * (agreement < required[fast.precision])
         print(
-            f"{name}: {base / best:.2f} x the plain encoder's images per second ({batch / best:.2f} images/s; {fast.kind}; "
-            f"cosine with the plain one {fast.mean_agreement:.6f} in the mean, {fast.agreement:.6f} at worst"
-            f"{', which a job would refuse' if refused < asked[fast.precision] else ''})"
+            f"{name}: {baseline / seconds:.2f} x the plain encoder's images per second "
+            f"({batch / seconds:.2f} images/s; {fast.kind}; cosine with the plain one "
+            f"{fast.mean_agreement:.6f} in the mean, {fast.agreement:.6f} at worst{refused})"
         )
-    unlike_BE = embed(plain, soft_noise(arguments.probes, size, seed=3).to(device), mirror)
-    others = (unlike_BE @ unlike_BE.T)[
-        ~torch.eye(len(unlike_BE), dtype=torch.bool, device=unlike_BE.device)
-    ]
-    print(f"for comparison: cosine between different images {float(others.mean()):.4f} in the mean")
+    distinct_BE = embed(plain, probe_B3HW.to(device), mirror)
+    is_other_BB = ~torch.eye(len(distinct_BE), dtype=torch.bool, device=distinct_BE.device)
+    cosine = float((distinct_BE @ distinct_BE.T)[is_other_BB].mean())
+    print(f"for comparison: cosine between different images {cosine:.4f} in the mean")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--checkpoint", help="a last.pt; by default ResNet-50 with random weights at 256 px"
-    )
-    parser.add_argument("--depth", type=int, default=50, help="of the random network")
-    parser.add_argument(
-        "--size", type=int, default=256, help="side of the random network's images in pixels"
-    )
-    parser.add_argument(
-        "--ways", nargs="*", choices=CHOICES, default=["folded", "compiled", "int8"]
-    )
-    parser.add_argument("--batch-size", type=int, default=16)
-    parser.add_argument("--rounds", type=int, default=3, help="the best of so many counts")
-    parser.add_argument(
-        "--probes", type=int, default=16, help="images that the agreement is measured on"
-    )
-    parser.add_argument(
-        "--calibration", type=int, default=32, help="images that int8 is calibrated by"
-    )
-    parser.add_argument("--no-mirror", action="store_true")
-    arguments = parser.parse_args()
-    arguments.device = "cuda" if torch.cuda.is_available() else "cpu"
-    if arguments.checkpoint:
-        encoder = load_encoder(arguments.checkpoint)
+    add = parser.add_argument
+    add("--checkpoint", help="a last.pt; by default a ResNet with random weights")
+    add("--depth", type=int, default=50, help="layers of the random ResNet")
+    add("--width", type=float, default=1.0, help="its channels, as a multiple")
+    add("--size", type=int, default=256, help="side of its images, pixels")
+    add("--encoders", nargs="*", choices=CHOICES, default=["folded", "compiled", "int8"])
+    add("--batch-size", type=int, default=16)
+    add("--rounds", type=int, default=3, help="alternating rounds, of which the best counts")
+    add("--probes", type=int, default=16, help="images that the agreement is measured on")
+    add("--calibration", type=int, default=32, help="images that int8 is calibrated by")
+    add("--no-mirror", action="store_true")
+    args = parser.parse_args()
+    args.device = "cuda" if torch.cuda.is_available() else "cpu"
+    if args.checkpoint:
+        checkpoint = loads(Path(args.checkpoint).read_bytes(), args.checkpoint)
+        config, encoder = checkpoint.network, build_encoder(checkpoint)
     else:
-        encoder = made_encoder(PVDAConfig(depth=arguments.depth, image_size=arguments.size))
-    print(f"{arguments.device}, torch {torch.__version__}, {torch.get_num_threads()} threads")
-    encoders(encoder, arguments)
+        config = PVDAConfig(depth=args.depth, width=args.width, image_size=args.size)
+        encoder = random_encoder(config)
+    print(f"{args.device}, torch {torch.__version__}, {torch.get_num_threads()} threads")
+    compare_encoders(encoder, config.image_size, args)
 
 
 if __name__ == "__main__":

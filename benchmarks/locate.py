@@ -1,17 +1,16 @@
-"""From photos to positions: single, together and as a flight, over real overhead images, and
-whether the confidence is true.
+"""From photos to positions over real overhead images, and whether the probabilities are calibrated.
 
-In: a folder of 1,000 overhead images. Out: one line per figure on the terminal, and
-reliability.svg. 900 places: about 400 to train on, 100 held out of training to calibrate by, 200 to
-find, 200 more in the gallery; `smoke` trained for a few minutes. Run again, it goes on where it
-was.
+The input is a folder of 1,000 overhead images; the output is one line per figure on the terminal,
+and reliability.svg. 900 places: about 400 to train on, 100 held out of training to calibrate by,
+200 to find, 200 more in the gallery; `smoke` trained for a few minutes. A rerun resumes.
 
     python benchmarks/locate.py --textures IMAGES --out DIR
 
-A flight visits unseen places, each time the nearest that it has not seen, with a photo of each from
-a random side, at 15 m/s; the track is told that no UAV is faster than 25 m/s. Photos from outside
-the gallery are those of unseen places whose images, and those around, are left out of what the
-search finds; in other flights every fifth photo is one.
+Photos are located singly (the baseline), together, and as flights. A flight goes from each unseen
+place to the nearest one not visited yet, with a photo of each from a random side, at 15 m/s; the
+track knows that no UAV is faster than 25 m/s. Photos from outside the gallery are those of unseen
+places whose images, and the images around, are excluded from the search; in the second set of
+flights every fifth photo is one.
 """
 
 import argparse
@@ -56,62 +55,52 @@ from pipeline.simulation.settings import SimulationSettings
 from pipeline.simulation.simulate import simulate
 from pipeline.sources.university1652 import University1652
 
-SPEED, WITHIN_M = 15.0, 25.0
-FLIGHTS, STOPS, DRAWS = 8, 25, 5
-"Flights, places that each visits, and how often its photos are drawn anew."
+SPEED_M_S, MAX_SPEED_M_S, WITHIN_M = 15.0, 25.0, 25.0
 START_M = 500.0
+"Radius of a track's rough start."
 
 
-def prepare(textures: str, out: Path, epochs: int) -> None:
-    """The data, the network, the index and its calibration, as the jobs make them."""
+def prepare(args: argparse.Namespace) -> None:
+    """Make the data, the network, the index and its calibration with the jobs' functions."""
     flights, shards, run, table, index = (
-        str(out / name) for name in ("flights", "shards", "run", "table", "index")
+        str(args.out / name) for name in ("flights", "shards", "run", "table", "index")
     )
     cluster.connect()
     simulate(
         SimulationSettings(
             out=flights,
-            textures=textures,
-            train_locations=500,
-            test_locations=200,
-            distractors=200,
+            textures=args.textures,
+            train_locations=args.train_locations,
+            test_locations=args.test_locations,
+            distractors=args.distractors,
             views=12,
             size=96,
         )
     )
     pack(University1652(), PackingSettings(root=flights, out=shards))
-    checkpoint = train(
-        TrainSettings(
-            recipe=replace(smoke(epochs=epochs), hold_out=0.2), shards=shards, out=run, workers=0
-        )
-    )
+    recipe = replace(smoke(epochs=args.epochs), hold_out=0.2)
+    checkpoint = train(TrainSettings(recipe=recipe, shards=shards, out=run, workers=0))
     for split, view in ((Split.QUERY, View.DRONE), (Split.GALLERY, View.SATELLITE)):
         embedding = EmbeddingSettings(shards=shards, out=table, split=split, view=view)
-        embed_gallery(
-            embedding, make_encoder_spec(storage.read_bytes(checkpoint), checkpoint, embedding)
-        )
+        spec = make_encoder_spec(storage.read_bytes(checkpoint), checkpoint, embedding)
+        embed_gallery(embedding, spec)
     build_index(IndexSettings(table=table, out=index, split=Split.GALLERY, view=View.SATELLITE))
     calibrate_index(CalibrationSettings(checkpoint=checkpoint, shards=shards, index=index))
 
 
-def photos_of(table: str) -> LabelledImages:
-    """The test's UAV photos with what is known of them."""
+def query_photos(table: str) -> LabelledImages:
+    """The UAV photos of the test with their metadata."""
     rows = open_table(table).select(Split.QUERY, View.DRONE)
     labels = rows.labels()
-    facts = [
+    columns = (labels.keys, labels.locations, labels.lats, labels.lons)
+    records = [
         {"key": key, "location": location, "view": "drone", "geotag": {"lat": lat, "lon": lon}}
-        for key, location, lat, lon in zip(
-            *(
-                values.tolist()
-                for values in (labels.keys, labels.locations, labels.lats, labels.lons)
-            ),
-            strict=True,
-        )
+        for key, location, lat, lon in zip(*(column.tolist() for column in columns), strict=True)
     ]
-    return LabelledImages(records=facts, embeddings_QD=rows.embeddings())
+    return LabelledImages(records=records, embeddings_QD=rows.embeddings())
 
 
-def grouped(photos: LabelledImages, views: int) -> LabelledImages:
+def group_photos(photos: LabelledImages, views: int) -> LabelledImages:
     """Means of `views` photos of a place, in the order of their keys."""
     order = sorted(range(len(photos.records)), key=lambda number: photos.records[number]["key"])
     groups = [order[begin : begin + views] for begin in range(0, len(order), views)]
@@ -122,157 +111,168 @@ def grouped(photos: LabelledImages, views: int) -> LabelledImages:
     )
 
 
-def within(found: list[Answer], asked: list[CalibrationExample]) -> Doubles:
-    """Which answers, known or not, lie within the tolerance: 1 or 0."""
+def is_within(answers: list[Answer], examples: list[CalibrationExample]) -> Doubles:
+    """1 for answers, known or not, within the tolerance, else 0."""
     at_Q2 = np.array(
         [
-            (one.position.lat, one.position.lon) if one.position else (np.nan, np.nan)
-            for one in found
+            (answer.position.lat, answer.position.lon) if answer.position else (np.nan, np.nan)
+            for answer in answers
         ]
     )
-    return np.asarray(
-        haversine_m(at_Q2, np.array([(one.lat, one.lon) for one in asked])) <= WITHIN_M, np.float64
-    )
+    true_Q2 = np.array([(example.lat, example.lon) for example in examples])
+    return np.asarray(haversine_m(at_Q2, true_Q2) <= WITHIN_M, np.float64)
 
 
-def confidence_lines(
-    name: str, asked: list[CalibrationExample], confidence: Calibration
+def print_calibration(
+    name: str, examples: list[CalibrationExample], calibration: Calibration
 ) -> list[ReliabilityBin]:
-    """How true the probabilities are, and what the threshold does, photos from inside and outside
-    the gallery alike.
+    """Print the calibration of the probabilities and the effect of the threshold.
 
-    Returns the bins of the reliability diagram.
+    Half of the photos are from outside the gallery. Returns the bins of the reliability diagram.
     """
     inside, outside = (
-        answers_from_hits([getattr(one, side) for one in asked], 5, confidence)
+        answers_from_hits([getattr(example, side) for example in examples], 5, calibration)
         for side in ("inside", "outside")
     )
-    right_Q = within(inside, asked)
-    said_N = np.array([one.probability for one in [*inside, *outside]], np.float64)
-    bins = reliability_bins(said_N, np.concatenate([right_Q, 0 * right_Q]), np.ones(len(said_N)))
-    known_Q = np.array([one.known for one in inside])
-    print(f"{name}: within {WITHIN_M:.0f} m {right_Q.mean():.1%} of {len(asked)}")
+    right_Q = is_within(inside, examples)
+    probability_N = np.array([one.probability for one in [*inside, *outside]], np.float64)
+    right_N = np.concatenate([right_Q, 0 * right_Q])
+    bins = reliability_bins(probability_N, right_N, np.ones(len(probability_N)))
+    known_Q = np.array([answer.known for answer in inside])
+    unknown = np.mean([not answer.known for answer in outside])
+    print(f"{name}: within {WITHIN_M:.0f} m {right_Q.mean():.1%} of {len(examples)}")
     print(f"{name}: expected calibration error {expected_calibration_error(bins):.3f}")
+    print(f"{name}: from outside the gallery, answered unknown {unknown:.1%}")
+    print(f"{name}: right answers lost to unknown {1 - mean_of(known_Q[right_Q > 0]):.1%}")
     print(
-        f"{name}: from outside the gallery, answered unknown {np.mean([not one.known for one in outside]):.1%}"
-    )
-    print(f"{name}: right answers lost to unknown {1 - known_Q[right_Q > 0].mean():.1%}")
-    print(
-        f"{name}: of the answers given inside the gallery, right {right_Q[known_Q].mean():.1%} of {known_Q.sum()}"
+        f"{name}: of the answers given inside the gallery, right {mean_of(right_Q[known_Q]):.1%} "
+        f"of {known_Q.sum()}"
     )
     return bins
 
 
-def flights_of(asked: list[CalibrationExample], rng: np.random.Generator) -> list[list[int]]:
-    """Numbers of the photos of each flight: always to the nearest place not seen yet, a photo of
-    each.
-    """
+def mean_of(values: np.ndarray) -> float:
+    """The mean; nan of none, without NumPy's warning."""
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def plan_flights(
+    examples: list[CalibrationExample], flights: int, stops: int, rng: np.random.Generator
+) -> list[list[int]]:
+    """Photo numbers of each flight: always on to the nearest unvisited place, one photo of each."""
     by_place: dict[str, list[int]] = {}
-    for number, one in enumerate(asked):
-        by_place.setdefault(one.location, []).append(number)
+    for number, example in enumerate(examples):
+        by_place.setdefault(example.location, []).append(number)
+
+    def position(name: str) -> np.ndarray:
+        example = examples[by_place[name][0]]
+        return np.array([example.lat, example.lon])
+
     left = sorted(by_place)
-    place = left.pop(int(rng.integers(len(left))))
-    route = [place]
+    route = [left.pop(int(rng.integers(len(left))))]
     while left:
-        here = asked[by_place[place][0]]
-        away = [
-            float(
-                haversine_m(
-                    np.array([here.lat, here.lon]),
-                    np.array([asked[by_place[name][0]].lat, asked[by_place[name][0]].lon]),
-                )
-            )
-            for name in left
-        ]
-        place = left.pop(int(np.argmin(away)))
-        route.append(place)
-    flights = [route[begin : begin + STOPS] for begin in range(0, STOPS * FLIGHTS, STOPS)]
-    return [[int(rng.choice(by_place[name])) for name in flight] for flight in flights]
+        here = position(route[-1])
+        distances = [float(haversine_m(here, position(name))) for name in left]
+        route.append(left.pop(int(np.argmin(distances))))
+    legs = [route[begin : begin + stops] for begin in range(0, stops * flights, stops)]
+    return [[int(rng.choice(by_place[name])) for name in leg] for leg in legs if leg]
 
 
-def track_lines(
-    asked: list[CalibrationExample], confidence: Calibration, gallery: GalleryMap, strangers: float
+def print_tracks(
+    args: argparse.Namespace,
+    examples: list[CalibrationExample],
+    calibration: Calibration,
+    gallery: GalleryMap,
+    outside_share: float,
 ) -> None:
-    """Photos of flights, a share of them from outside the gallery: each by itself, as tracks, and
-    with a rough start.
-    """
+    """Print photos located singly, as tracks, and as tracks with a rough start."""
     rng = np.random.default_rng(0)
-    motion = motion_for_gallery(gallery, 25.0)
+    motion = motion_for_gallery(gallery, MAX_SPEED_M_S)
     rows: dict[str, list[tuple[bool, bool, bool]]] = {
         name: [] for name in ("single", "track", "track with start")
     }
-    spent = 0.0
-    for _ in range(DRAWS):
-        for flight in flights_of(asked, rng):
-            stops = [asked[number] for number in flight]
-            strange = rng.uniform(size=len(stops)) < strangers
-            at_T2 = np.array([(one.lat, one.lon) for one in stops])
-            times = np.concatenate(
-                [[0.0], np.cumsum(haversine_m(at_T2[1:], at_T2[:-1]) / SPEED + 1)]
-            ).tolist()
+    single_seconds, track_seconds, tracks = 0.0, 0.0, 0
+    for _ in range(args.draws):
+        for flight in plan_flights(examples, args.flights, args.stops, rng):
+            stops = [examples[number] for number in flight]
+            outside_T = rng.uniform(size=len(stops)) < outside_share
+            at_T2 = np.array([(stop.lat, stop.lon) for stop in stops])
+            legs = haversine_m(at_T2[1:], at_T2[:-1]) / SPEED_M_S + 1
+            times = np.concatenate([[0.0], np.cumsum(legs)]).tolist()
             hits = [
-                one.outside if odd else one.inside for one, odd in zip(stops, strange, strict=True)
+                stop.outside if is_outside else stop.inside
+                for stop, is_outside in zip(stops, outside_T, strict=True)
             ]
-            single = answers_from_hits(hits, TRACK_CANDIDATES, confidence)
-            off = float(rng.uniform(-0.5, 0.5)) * START_M / 111_195
+            begin = time.perf_counter()
+            single = answers_from_hits(hits, TRACK_CANDIDATES, calibration)
+            single_seconds += time.perf_counter() - begin
+            north = float(rng.uniform(-0.5, 0.5)) * START_M / 111_195
             start = TrackStart(
-                lat=float(at_T2[0, 0]) + off, lon=float(at_T2[0, 1]), radius_m=START_M
+                lat=float(at_T2[0, 0]) + north, lon=float(at_T2[0, 1]), radius_m=START_M
             )
             begin = time.perf_counter()
             found = {
-                "single": single, "track": apply_track(single, times, confidence, motion),
-                "track with start": apply_track(single, times, confidence, motion, start),
-            }  # fmt: skip
-            spent += time.perf_counter() - begin
-            for name, said in found.items():
-                known = [one.known for one in said]
-                rows[name] += zip(
-                    strange.tolist(), known, (within(said, stops) > 0).tolist(), strict=True
-                )
-    for name, told in rows.items():
-        odd_N, known_N, right_N = np.array(told).T
-        kind = f"flights, {strangers:.0%} from outside, {name}"
-        print(f"{kind}: within {WITHIN_M:.0f} m {right_N[~odd_N].mean():.1%} of the others")
-        print(f"{kind}: known {known_N.mean():.1%}, of these right {right_N[known_N].mean():.1%}")
-        if strangers:
-            print(f"{kind}: these answered unknown {(~known_N[odd_N]).mean():.1%}")
-    print(f"flights: {spent / (2 * DRAWS * FLIGHTS) * 1000:.0f} ms a track of {STOPS} photos")
+                "single": single,
+                "track": apply_track(single, times, calibration, motion),
+                "track with start": apply_track(single, times, calibration, motion, start),
+            }
+            track_seconds += time.perf_counter() - begin
+            tracks += 2
+            for name, answers in found.items():
+                known = [answer.known for answer in answers]
+                right = (is_within(answers, stops) > 0).tolist()
+                rows[name] += zip(outside_T.tolist(), known, right, strict=True)
+    for name, row in rows.items():
+        outside_N, known_N, right_N = np.array(row).T
+        kind = f"flights, {outside_share:.0%} from outside, {name}"
+        print(f"{kind}: within {WITHIN_M:.0f} m {mean_of(right_N[~outside_N]):.1%} of the others")
+        print(f"{kind}: known {known_N.mean():.1%}, of these right {mean_of(right_N[known_N]):.1%}")
+        if outside_share:
+            print(f"{kind}: these answered unknown {mean_of(~known_N[outside_N]):.1%}")
+    print(
+        f"flights: {track_seconds / tracks * 1000:.0f} ms per track of {args.stops} photos, "
+        f"{track_seconds / single_seconds / 2:.1f} x the time of their single answers"
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--textures", required=True, help="folder of overhead images, 0.3 m a pixel"
-    )
-    parser.add_argument("--out", required=True, type=Path)
-    parser.add_argument("--epochs", type=int, default=100)
-    given = parser.parse_args()
-    prepare(given.textures, given.out, given.epochs)
-    index = Index(str(given.out / "index"))
-    confidence = calibrate_index(
+    add = parser.add_argument
+    add("--textures", required=True, help="folder of overhead images, 0.3 m per pixel")
+    add("--out", required=True, type=Path, help="folder of the artefacts and the diagram")
+    add("--epochs", type=int, default=100, help="of training")
+    add("--train-locations", type=int, default=500)
+    add("--test-locations", type=int, default=200)
+    add("--distractors", type=int, default=200)
+    add("--flights", type=int, default=8, help="flights of a draw")
+    add("--stops", type=int, default=25, help="places that a flight visits")
+    add("--draws", type=int, default=5, help="times that the flights' photos are drawn anew")
+    args = parser.parse_args()
+    prepare(args)
+    index = Index(str(args.out / "index"))
+    calibration = calibrate_index(
         CalibrationSettings(
-            checkpoint=str(given.out / "run" / "last.pt"),
-            shards=str(given.out / "shards"),
+            checkpoint=str(args.out / "run" / "last.pt"),
+            shards=str(args.out / "shards"),
             index=index.path,
         )
     )
-    photos = photos_of(str(given.out / "table"))
-    nobody = LabelledImages(records=[], embeddings_QD=photos.embeddings_QD[:0])
+    photos = query_photos(str(args.out / "table"))
+    none = LabelledImages(records=[], embeddings_QD=photos.embeddings_QD[:0])
     for views in (1, 3, 12):
-        asked = make_examples(grouped(photos, views), nobody, index, confidence.spacing_m, WITHIN_M)
-        bins = confidence_lines(
-            f"{views} photo{'s together' if views > 1 else ''}", asked, confidence
+        examples = make_examples(
+            group_photos(photos, views), none, index, calibration.spacing_m, WITHIN_M
         )
+        name = "1 photo" if views == 1 else f"{views} photos together"
+        bins = print_calibration(name, examples, calibration)
         if views == 1:
-            picture = reliability_diagram(
-                bins,
-                "Probability said and share that was right, test photos inside and outside the gallery",
-            )
-            storage.write_bytes(str(given.out / "reliability.svg"), picture.encode())
-            for strangers in (0.0, 0.2):
-                track_lines(asked, confidence, read_gallery_map(index), strangers)
+            title = "Predicted probability and observed share, photos inside and outside"
+            diagram = reliability_diagram(bins, title)
+            storage.write_bytes(str(args.out / "reliability.svg"), diagram.encode())
+            for outside_share in (0.0, 0.2):
+                print_tracks(args, examples, calibration, read_gallery_map(index), outside_share)
 
 
 if __name__ == "__main__":

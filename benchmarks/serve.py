@@ -1,12 +1,12 @@
-"""The service under load from another process: latency and rate at 1, 8 and 32 clients, and what
-batching gains.
+"""The service under load from another process: latency and rate, and the gain of batching.
 
-Starts jobs/serve.py twice, with batches of one photo and as it comes, and asks them by turns; each
-client sends its next photo when the last one is answered. Prints one line per figure. Loopback
-only; bounded in time and number of requests.
+Starts jobs/serve.py twice, with batches of one photo and with larger ones, and sends requests to
+both alternately, by 1, 8 and 32 clients; each client sends its next photo when the last one is
+answered. Prints one line per figure; the gain is a ratio to batches of one in the same run.
+Loopback only; bounded in time and number of requests.
 
-    python benchmarks/serve.py --checkpoint run/last.pt --index index --photos
-    flights/test/query_drone
+    python benchmarks/serve.py --checkpoint run/last.pt --index index \
+        --photos flights/test/query_drone
 """
 
 import argparse
@@ -29,60 +29,56 @@ import numpy as np
 
 ROOT = Path(__file__).parent.parent
 CLIENTS = (1, 8, 32)
-MOST_REQUESTS = 5_000
-"Of one measurement."
-MOST_PHOTOS = 200
-PATIENCE_S = 180
-"For a service to be ready."
+MAX_REQUESTS = 5_000
+"Requests of one measurement, at most."
+MAX_PHOTOS = 200
+TIMEOUT_S = 180
+"Longest start of a service."
+
+Measurement = tuple[list[float], float, Counter[int]]
+"Latencies in seconds, duration, and number of requests by status."
 
 
 @contextmanager
-def service(given: argparse.Namespace, *flags: str) -> Iterator[str]:
-    """A service of its own on a free port: its address, as soon as it listens."""
-    command = [
-        sys.executable,
-        str(ROOT / "jobs" / "serve.py"),
-        "--checkpoint",
-        given.checkpoint,
-        "--index",
-        given.index,
-    ]
-    command += ["--port", "0", *flags]
+def service(args: argparse.Namespace, *flags: str) -> Iterator[str]:
+    """Start a service on a free port; yields its address as soon as it listens."""
+    command = [sys.executable, str(ROOT / "jobs" / "serve.py"), "--port", "0", *flags]
+    command += ["--checkpoint", args.checkpoint, "--index", args.index]
     environment = os.environ | {"RAY_ADDRESS": "local"}
     with subprocess.Popen(
         command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
         try:
             assert process.stderr is not None
-            heard = process.stderr.readline()
-            address = re.match(r"(http://127\.0\.0\.1:\d+) listens", heard)
+            line = process.stderr.readline()
+            address = re.match(r"(http://127\.0\.0\.1:\d+) listens", line)
             if address is None:
-                raise SystemExit(heard + process.stderr.read())
+                raise SystemExit(line + process.stderr.read())
             yield address[1]
         finally:
             process.send_signal(signal.SIGTERM)
             process.wait(30)
 
 
-async def ready(session: aiohttp.ClientSession, address: str) -> None:
-    deadline = time.monotonic() + PATIENCE_S
+async def wait_until_ready(session: aiohttp.ClientSession, address: str) -> None:
+    deadline = time.monotonic() + TIMEOUT_S
     while time.monotonic() < deadline:
         async with session.get(f"{address}/health") as response:
             if response.status == 200:
                 return
         await asyncio.sleep(0.5)
-    raise SystemExit(f"{address} was not ready after {PATIENCE_S} s")
+    raise SystemExit(f"{address} was not ready after {TIMEOUT_S} s")
 
 
 async def load(
     session: aiohttp.ClientSession, address: str, photos: list[bytes], clients: int, seconds: float
-) -> tuple[list[float], float, Counter[int]]:
-    """Seconds of each answered request, seconds in all, and how many had which status."""
+) -> Measurement:
+    """Send photos from so many clients for so many seconds."""
     latencies, statuses, numbers = list[float](), Counter[int](), itertools.count()
-    began = time.perf_counter()
+    begin = time.perf_counter()
 
     async def client() -> None:
-        while time.perf_counter() < began + seconds and (number := next(numbers)) < MOST_REQUESTS:
+        while time.perf_counter() < begin + seconds and (number := next(numbers)) < MAX_REQUESTS:
             sent = time.perf_counter()
             async with session.post(
                 f"{address}/locate",
@@ -95,76 +91,73 @@ async def load(
                 latencies.append(time.perf_counter() - sent)
 
     await asyncio.gather(*(client() for _ in range(clients)))
-    return latencies, time.perf_counter() - began, statuses
+    return latencies, time.perf_counter() - begin, statuses
 
 
-def told(clients: int, name: str, found: list[tuple[list[float], float, Counter[int]]]) -> float:
-    """Print what all rounds of a setting found; its requests per second in the best round."""
-    latencies = np.concatenate([np.asarray(round_[0]) for round_ in found]) * 1000
-    rates = [len(round_[0]) / round_[1] for round_ in found]
-    statuses = sum((round_[2] for round_ in found), Counter[int]())
+def print_latency(clients: int, name: str, rounds: list[Measurement]) -> float:
+    """Print one setting's latency over all rounds; photos per second of its best round."""
+    latencies = np.concatenate([np.asarray(one[0]) for one in rounds]) * 1000
+    rates = [len(one[0]) / one[1] for one in rounds]
+    statuses = sum((one[2] for one in rounds), Counter[int]())
     p50, p90, p99 = np.percentile(latencies, [50, 90, 99])
+    listed = ", ".join(f"{rate:.1f}" for rate in rates)
     print(
-        f"{clients:2d} clients, {name}: p50 {p50:.0f} ms, p90 {p90:.0f}, p99 {p99:.0f}, longest {latencies.max():.0f}; "
-        f"{max(rates):.1f} photos/s (rounds {', '.join(f'{rate:.1f}' for rate in rates)}); "
-        f"statuses {dict(sorted(statuses.items()))}",
+        f"{clients:2d} clients, {name}: p50 {p50:.0f} ms, p90 {p90:.0f}, p99 {p99:.0f}, longest "
+        f"{latencies.max():.0f}; {max(rates):.1f} photos/s (rounds {listed}); statuses "
+        f"{dict(sorted(statuses.items()))}",
         flush=True,
     )
     return max(rates)
 
 
-async def measure(given: argparse.Namespace, addresses: dict[str, str]) -> None:
-    photos = [path.read_bytes() for path in sorted(Path(given.photos).rglob("*.jp*g"))]
+async def measure(args: argparse.Namespace, addresses: dict[str, str]) -> None:
+    """Load the services alternately and print their latencies and the gain of batching."""
+    photos = [path.read_bytes() for path in sorted(Path(args.photos).rglob("*.jp*g"))]
     random.Random(0).shuffle(photos)
-    photos = photos[:MOST_PHOTOS]
+    photos = photos[:MAX_PHOTOS]
     if not photos:
-        raise SystemExit(f"no JPEG below {given.photos}")
+        raise SystemExit(f"no JPEG below {args.photos}")
     mean = sum(map(len, photos)) / len(photos) / 1000
     async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(limit=0)) as session:
         for address in addresses.values():
-            await ready(session, address)
-            await load(
-                session, address, photos, given.batch, given.seconds
-            )  # each size of batch is slow the first time
+            await wait_until_ready(session, address)
+            # The first batch of each size is slow.
+            await load(session, address, photos, args.batch, args.seconds)
         print(
-            f"{len(photos)} photos, {mean:.0f} kB in the mean; {given.rounds} rounds of {given.seconds:g} s by turns"
+            f"{len(photos)} photos, {mean:.0f} kB in the mean; {args.rounds} alternating rounds of "
+            f"{args.seconds:g} s"
         )
-        for clients in given.clients:
-            found: dict[str, list[tuple[list[float], float, Counter[int]]]] = {
-                name: [] for name in addresses
-            }
-            for _ in range(given.rounds):
+        for clients in args.clients:
+            rounds: dict[str, list[Measurement]] = {name: [] for name in addresses}
+            for _ in range(args.rounds):
                 for name, address in addresses.items():
-                    found[name].append(await load(session, address, photos, clients, given.seconds))
-            alone, batched = (told(clients, name, rounds) for name, rounds in found.items())
+                    rounds[name].append(await load(session, address, photos, clients, args.seconds))
+            single, batched = (print_latency(clients, name, all_) for name, all_ in rounds.items())
             print(
-                f"{clients:2d} clients: batching {batched / alone:.2f} x the photos/s of one at a time",
+                f"{clients:2d} clients: batching {batched / single:.2f} x the photos/s of one at "
+                "a time",
                 flush=True,
             )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
-    parser.add_argument("--checkpoint", required=True)
-    parser.add_argument("--index", required=True)
-    parser.add_argument("--photos", required=True, help="folder of JPEGs")
-    parser.add_argument(
-        "--clients", type=int, nargs="+", default=CLIENTS, help="that ask at the same time"
-    )
-    parser.add_argument("--seconds", type=float, default=6, help="of a measurement")
-    parser.add_argument("--rounds", type=int, default=2, help="of all in turn")
-    parser.add_argument("--batch", type=int, default=8, help="photos of the larger batch")
-    given = parser.parse_args()
-    signal.signal(
-        signal.SIGTERM, lambda *_: sys.exit(143)
-    )  # told to stop, it ends the services too
+    add = parser.add_argument
+    add("--checkpoint", required=True)
+    add("--index", required=True)
+    add("--photos", required=True, help="folder of JPEGs")
+    add("--clients", type=int, nargs="+", default=CLIENTS, help="concurrent clients, in turn")
+    add("--seconds", type=float, default=6, help="length of a measurement")
+    add("--rounds", type=int, default=2, help="alternating rounds")
+    add("--batch", type=int, default=8, help="photos of the larger batch")
+    args = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ends the services too
     with (
-        service(given, "--batch", "1") as alone,
-        service(given, "--batch", str(given.batch)) as batched,
+        service(args, "--batch", "1") as single,
+        service(args, "--batch", str(args.batch)) as batched,
     ):
-        asyncio.run(
-            measure(given, {"one at a time": alone, f"batches of up to {given.batch}": batched})
-        )
+        addresses = {"one at a time": single, f"batches of up to {args.batch}": batched}
+        asyncio.run(measure(args, addresses))
 
 
 if __name__ == "__main__":
