@@ -140,7 +140,7 @@ def measure_single_rows(folder: Path, count: int) -> None:
 
 def measure_checkpoint(depth: Any, repeats: int) -> None:
     """A ResNet with its optimizer's momentum: loaded, with and without checking every byte."""
-    network = PVDAConfig(depth=depth)
+    network = PVDAConfig(backbone=f"resnet{depth}")
     weights = FeatureEncoder(network).state_dict()
     momentum = {name: torch.zeros_like(tensor) for name, tensor in weights.items()}
     state = {"modules": {"encoder": weights}, "optimizers": momentum}

@@ -50,7 +50,7 @@ def random_encoder(config: PVDAConfig) -> FeatureEncoder:
     """
     torch.manual_seed(0)
     encoder = FeatureEncoder(config)
-    last = "bn3" if config.depth >= 50 else "bn2"
+    last = "bn2" if config.backbone in ("resnet18", "resnet34") else "bn3"
     for name, module in encoder.named_modules():
         if isinstance(module, nn.modules.batchnorm._BatchNorm):
             module.momentum = None  # the statistics become the mean over all input
@@ -141,7 +141,7 @@ def main() -> None:
         checkpoint = loads(Path(args.checkpoint).read_bytes(), args.checkpoint)
         config, encoder = checkpoint.network, build_encoder(checkpoint)
     else:
-        config = PVDAConfig(depth=args.depth, width=args.width, image_size=args.size)
+        config = PVDAConfig(backbone=f"resnet{args.depth}", width=args.width, image_size=args.size)
         encoder = random_encoder(config)
     print(f"{args.device}, torch {torch.__version__}, {torch.get_num_threads()} threads")
     compare_encoders(encoder, config.image_size, args)

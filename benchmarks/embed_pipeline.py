@@ -92,7 +92,7 @@ def write_shard(folder: str, number: int, images: list[bytes], count: int) -> Sh
 
 def checkpoint(depth: Any, size: int, **config: Any) -> bytes:
     """A checkpoint of random weights; `config` overrides the network's other settings."""
-    network = PVDAConfig(depth=depth, image_size=size, **config)
+    network = PVDAConfig(backbone=f"resnet{depth}", image_size=size, **config)
     weights = {"modules": {"encoder": FeatureEncoder(network).state_dict()}}
     return dumps(
         Checkpoint(network=network, recipe={}, locations=[], epoch=0, history=[], state=weights)

@@ -96,7 +96,7 @@ def import_weights(settings: Settings) -> str:
     storage.write_bytes(out, dumps(checkpoint))
     network = checkpoint.network
     console.print(
-        f"{out}: ResNet-{network.depth}, {network.parts} rings of {network.part_dim} numbers, {network.image_size} px, "
+        f"{out}: {network.backbone}, {network.parts} rings of {network.part_dim} numbers, {network.image_size} px, "
         f"{len(checkpoint.locations)} locations"
     )
     return out
@@ -120,8 +120,8 @@ def from_torchvision(
     """The paper's encoder before training: torchvision's backbone, a refinement of random numbers,
     no classifier.
     """
-    depth, width = infer_backbone(state, settings.source)
-    network = PVDAConfig(depth=depth, width=width, image_size=settings.image_size)
+    backbone, width = infer_backbone(state, settings.source)
+    network = PVDAConfig(backbone=backbone, width=width, image_size=settings.image_size)
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(0)  # the same file gives the same embeddings
         encoder = FeatureEncoder(network)

@@ -1,10 +1,10 @@
-"""Weights and config in one file that `torch.load(..., weights_only=True)` reads: no code runs when
-one is opened.
+"""Weights and config in one file that `torch.load(..., weights_only=True)` reads: opening one runs
+no code.
 
-In: a run's state. Out: bytes, and from bytes the encoder they describe. Where the bytes are kept is
-the caller's matter. torch.load compares none of the checksums that its zip has. So a checkpoint
-ends with the hash of all its bytes, as the zip's comment, which torch and zip programs pass over;
-of one from before there were seals the zip's checksums are compared.
+In: a run's state. Out: bytes, and from bytes the encoder that they describe; callers decide where
+the bytes are stored. torch.load compares none of the checksums in its zip, so a checkpoint ends
+with the SHA-256 of all bytes before it, as the zip's comment, which torch and zip programs ignore.
+In files of torch.save without that comment the zip's own checksums are compared.
 """
 
 import dataclasses
@@ -22,9 +22,10 @@ from model.errors import CheckpointError
 from model.pvda import FeatureEncoder
 from model.weights import torch_files
 
-FORMAT = 1
-CHECKSUM_PATTERN = re.compile(rb"pvda\.seal:([0-9a-f]{64}):pvda\.seal")
-CHECKSUM_MARK = b"pvda.seal"
+FORMAT = 2
+"""Version of the fields. 2: the network names its backbone, the recipe has the settings' new names."""
+CHECKSUM_MARK = b"pvda.sha256"
+CHECKSUM_PATTERN = re.compile(rb"pvda\.sha256:([0-9a-f]{64}):pvda\.sha256")
 CHECKSUM_BYTES = 2 * (len(CHECKSUM_MARK) + 1) + 64
 
 
@@ -38,15 +39,15 @@ class Checkpoint:
     locations: list[str]
     "Names of the classifier's outputs, in order."
     epoch: int
-    "Epochs that are over."
+    "Completed epochs."
     history: list[dict[str, Any]]
-    "One row per epoch, as metrics.jsonl has them."
+    "One row per epoch, as in metrics.jsonl."
     state: dict[str, Any]
-    "As `Training.state` gives it; only `modules` where a checkpoint is not meant to be trained on."
+    "`Training.state_dict`; only `modules` in a checkpoint that no training resumes from."
     step: int = 0
-    "Steps taken of the epoch that is not over."
-    running: dict[str, torch.Tensor] = dataclasses.field(default_factory=dict)
-    "Sums of that epoch's measures over these steps."
+    "Steps taken in the epoch that is not complete."
+    metric_sums: dict[str, torch.Tensor] = dataclasses.field(default_factory=dict)
+    "Sums of that epoch's metrics over these steps."
 
     @property
     def encoder_weights(self) -> dict[str, torch.Tensor]:
@@ -63,7 +64,7 @@ def dumps(checkpoint: Checkpoint) -> bytes:
     plain |= {name: json.dumps(plain[name]) for name in ("recipe", "history")}
     buffer = io.BytesIO()
     torch.save(plain, buffer)
-    buffer.seek(-2, io.SEEK_END)  # the length of the zip's comment, which is none
+    buffer.seek(-2, io.SEEK_END)  # the length of the zip's comment, which is empty
     buffer.write(CHECKSUM_BYTES.to_bytes(2, "little"))
     digest = hashlib.sha256(buffer.getbuffer()).hexdigest().encode()
     buffer.write(b":".join([CHECKSUM_MARK, digest, CHECKSUM_MARK]))
@@ -71,87 +72,98 @@ def dumps(checkpoint: Checkpoint) -> bytes:
 
 
 def loads(data: bytes, name: str = "the checkpoint") -> Checkpoint:
-    """The checkpoint that `dumps` made; `name` stands in the message when it is none.
+    """The checkpoint that `dumps` wrote; error messages call it `name`.
 
     Raises CheckpointError.
     """
     check_integrity(data, name)
     try:
         plain = torch_files.read(data)
-        if plain.pop("format") != FORMAT:
-            raise ValueError("another format")
-        network = PVDAConfig(**json.loads(plain.pop("network")))
-        recipe, history = json.loads(plain.pop("recipe")), json.loads(plain.pop("history"))
-        held = Checkpoint(network=network, recipe=recipe, history=history, **plain)
-        _check_fields(held)
-        return held
+        version = plain.pop("format")
+        if version == FORMAT:
+            network = PVDAConfig(**json.loads(plain.pop("network")))
+            recipe, history = json.loads(plain.pop("recipe")), json.loads(plain.pop("history"))
+            checkpoint = Checkpoint(network=network, recipe=recipe, history=history, **plain)
+            _check_fields(checkpoint)
+            return checkpoint
     # torch raises many kinds over a damaged file, struct.error and IndexError among them
     except Exception as error:
         raise CheckpointError(
-            f"{name} is not a checkpoint of format {FORMAT} ({type(error).__name__}); expected a last.pt written by "
-            "jobs/train.py; name that file"
+            f"{name} is not a checkpoint of format {FORMAT} ({type(error).__name__}); expected a "
+            "last.pt written by jobs/train.py; name that file"
         ) from error
+    if version == FORMAT - 1 and type(version) is int:
+        raise CheckpointError(
+            f"{name} is a checkpoint of format {version}, expected format {FORMAT}, in which "
+            "settings have other names; train again with jobs/train.py, or import the weights "
+            "again with jobs/import_weights.py"
+        )
+    raise CheckpointError(
+        f"{name} is not a checkpoint of format {FORMAT} (it names another format); expected a "
+        "last.pt written by jobs/train.py; name that file"
+    )
 
 
 def check_integrity(data: bytes, name: str) -> None:
-    """Raise CheckpointError where the bytes of a checkpoint, or of any file of torch.save's, are
-    not what was written.
+    """Raise CheckpointError where the bytes of a checkpoint, or of any file of torch.save, do not
+    match their checksums.
 
-    0.1 s per 100 MB. Of bytes that are no zip nothing is said.
+    0.1 s per 100 MB. Bytes that are no zip pass.
     """
     view = memoryview(data)
-    seal = CHECKSUM_PATTERN.fullmatch(view[-CHECKSUM_BYTES:])
-    if seal is not None:
-        whole = hashlib.sha256(view[:-CHECKSUM_BYTES]).hexdigest().encode() == seal[1]
-        reason = "its bytes have not the hash at its end"
+    checksum = CHECKSUM_PATTERN.fullmatch(view[-CHECKSUM_BYTES:])
+    if checksum is not None:
+        intact = hashlib.sha256(view[:-CHECKSUM_BYTES]).hexdigest().encode() == checksum[1]
+        reason = "its bytes do not match the checksum at its end"
     elif CHECKSUM_MARK in data[-CHECKSUM_BYTES:]:
-        whole, reason = False, "the hash at its end is damaged"
+        intact, reason = False, "the checksum at its end is damaged"
     elif data[:2] == b"PK":
-        whole, reason = _zip_is_intact(data)
+        intact, reason = _zip_is_intact(data)
     else:
         return
-    if not whole:
+    if not intact:
         raise CheckpointError(
-            f"{name} is damaged ({reason}), expected the bytes that were written; copy it again from where it came from, name "
-            "the checkpoint before it, or make it anew with jobs/train.py"
+            f"{name} is damaged ({reason}), expected the bytes that were written; copy it again "
+            "from where it came from, name the checkpoint before it, or make it anew with "
+            "jobs/train.py"
         )
 
 
 def _zip_is_intact(data: bytes) -> tuple[bool, str]:
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as held:
-            torch_files.require_uncompressed(held, len(data))
-            bad = held.testzip()
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            torch_files.require_uncompressed(archive, len(data))
+            bad = archive.testzip()
     except Exception as error:  # zipfile raises many kinds over a damaged directory
         return False, f"{type(error).__name__}"
-    return bad is None, f"the checksum of {bad} in it is another"
+    return bad is None, f"{bad} in it does not match its checksum"
 
 
-def _check_fields(held: Checkpoint) -> None:
-    """Raise ValueError where a field is of another type, or the weights are of another network than
-    is said.
+def _check_fields(checkpoint: Checkpoint) -> None:
+    """Raise ValueError where a field has another type, or the weights do not fit the network.
 
-    The network is laid out without memory: one that says to be a million times as wide is not built
-    to find out.
+    The network is laid out on the meta device, without memory: a config may claim any size.
     """
     plain = (
-        isinstance(held.recipe, dict)
-        and isinstance(held.history, list)
-        and all(isinstance(row, dict) for row in held.history)
-        and isinstance(held.locations, list)
-        and all(isinstance(location, str) for location in held.locations)
-        and all(type(count) is int and count >= 0 for count in (held.epoch, held.step))
-        and isinstance(held.running, dict)
-        and all(isinstance(value, torch.Tensor) for value in held.running.values())
-        and all(isinstance(module, dict) for module in held.state["modules"].values())
+        isinstance(checkpoint.recipe, dict)
+        and isinstance(checkpoint.history, list)
+        and all(isinstance(row, dict) for row in checkpoint.history)
+        and isinstance(checkpoint.locations, list)
+        and all(isinstance(location, str) for location in checkpoint.locations)
+        and all(type(count) is int and count >= 0 for count in (checkpoint.epoch, checkpoint.step))
+        and isinstance(checkpoint.metric_sums, dict)
+        and all(isinstance(value, torch.Tensor) for value in checkpoint.metric_sums.values())
+        and all(isinstance(module, dict) for module in checkpoint.state["modules"].values())
     )
     if not plain:
         raise ValueError("a field of another type")
     with torch.device("meta"):
-        wanted = {
-            name: tensor.shape for name, tensor in FeatureEncoder(held.network).state_dict().items()
+        expected = {
+            name: tensor.shape
+            for name, tensor in FeatureEncoder(checkpoint.network).state_dict().items()
         }
-    if {name: tensor.shape for name, tensor in held.encoder_weights.items()} != wanted:
+    found = {name: tensor.shape for name, tensor in checkpoint.encoder_weights.items()}
+    if found != expected:
         raise ValueError("weights of another network")
 
 
@@ -169,9 +181,8 @@ def load_encoder(path: str) -> FeatureEncoder:
 
 
 def fingerprint(checkpoint: Checkpoint, preprocessing: str) -> str:
-    """Hash of all that an embedding depends on: weights, network and preprocessing; 64 hexadecimal
-    digits.
-    """
+    """Hash of all that an embedding depends on, 64 hexadecimal digits: weights, network,
+    preprocessing."""
     digest = hashlib.sha256()
     digest.update(
         json.dumps([dataclasses.asdict(checkpoint.network), preprocessing], sort_keys=True).encode()

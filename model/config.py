@@ -4,21 +4,21 @@ offers them before torch is loaded, and a checkpoint carries them."""
 from dataclasses import dataclass
 from typing import Literal
 
-from model.backbones.resnet import BLOCKS, MIN_CHANNELS, STRIDE, Depth, layer1_channels
-from model.parts.ring_pooling import Divisor
+from model.backbones import BACKBONES
 
-MAX_IMAGE_SIZE, MAX_CHANNELS = 16_384, 65_536
-"Beyond any use; a checkpoint from elsewhere may say anything."
+MAX_IMAGE_SIZE, MAX_PART_DIM = 16_384, 65_536
+"Beyond any use; a checkpoint from elsewhere may name any size."
+Divisor = Literal["box", "ring"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class PVDAConfig:
     """Sizes of the networks. The defaults are the paper's at 256 px."""
 
-    depth: Depth = 50
-    "Layers of the ResNet: 18, 34, 50 or 101 [paper: 50]."
+    backbone: str = "resnet50"
+    "Name in BACKBONES: resnet18, resnet34, resnet50 or resnet101 [paper: resnet50]."
     width: float = 1.0
-    "Channels of the ResNet as a multiple of the published ones [paper: 1]."
+    "Channels of the backbone as a multiple of the published ones [paper: 1]."
     image_size: int = 256
     "Side of the square images in pixels [paper: 256, 384]."
     parts: int = 4
@@ -33,33 +33,19 @@ class PVDAConfig:
     "Of the view discriminator's convolutions [paper, fig. 2]."
 
     def __post_init__(self) -> None:
-        if self.depth not in BLOCKS:
+        if self.backbone not in BACKBONES:
             raise ValueError(
-                f"depth is {self.depth}, expected one of {', '.join(map(str, BLOCKS))}"
-            )
-        if layer1_channels(self.depth, self.width) < MIN_CHANNELS:
-            raise ValueError(
-                f"width is {self.width}, which gives layer1 of a ResNet-{self.depth} "
-                f"{layer1_channels(self.depth, self.width)} channels; expected at least {MIN_CHANNELS} (thinner ones crash "
-                "oneDNN); use a larger width"
+                f"backbone is {self.backbone!r}, expected one of {', '.join(BACKBONES)}"
             )
         for name, most in (
             ("image_size", MAX_IMAGE_SIZE),
-            ("part_dim", MAX_CHANNELS),
-            ("discriminator_channels", MAX_CHANNELS),
+            ("part_dim", MAX_PART_DIM),
+            ("discriminator_channels", MAX_PART_DIM),
         ):
             if not 1 <= getattr(self, name) <= most:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected 1 to {most}")
-        if layer1_channels(self.depth, self.width) > MAX_CHANNELS or self.parts < 1:
-            raise ValueError(
-                f"width is {self.width} and parts {self.parts}, expected a network that some machine can hold"
-            )
-        least = max(2 * self.parts, 4) * STRIDE  # the discriminator halves the maps twice
-        if self.image_size < least:
-            raise ValueError(
-                f"image_size is {self.image_size}, expected at least {least} pixels for {self.parts} parts; "
-                "use larger images or fewer parts"
-            )
+        if self.parts < 1:
+            raise ValueError(f"parts is {self.parts}, expected at least 1")
 
     @property
     def embedding_dim(self) -> int:
@@ -74,7 +60,7 @@ Precision = Literal["auto", "float32", "bfloat16"]
 class Optimization:
     """How the weights are moved. The defaults are the paper's."""
 
-    kind: Literal["sgd", "adamw"] = "sgd"
+    optimizer: Literal["sgd", "adamw"] = "sgd"
     """Of the encoder and classifier: SGD with Nesterov momentum [LPN], or AdamW for short runs from
     scratch."""
     backbone_lr: float = 0.001

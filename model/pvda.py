@@ -8,12 +8,9 @@ ring, L locations.
 import torch
 from torch import Tensor, nn
 
-from model.backbones.resnet import ResNet
+from model.backbones.base import build_backbone
 from model.config import PVDAConfig
 from model.parts.ring_pooling import ring_average
-
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"Of red, green and blue in 0..1: what torchvision's weights were trained with."
 
 
 class FeatureEncoder(nn.Module):
@@ -23,13 +20,21 @@ class FeatureEncoder(nn.Module):
     std_31: Tensor
 
     def __init__(self, config: PVDAConfig) -> None:
+        """Raises ValueError where the backbone cannot have that width, or the images are too small
+        for the rings."""
         super().__init__()
         self.parts, self.divisor = config.parts, config.ring_divisor
-        self.backbone = ResNet(config.depth, config.width)
+        self.backbone = build_backbone(config.backbone, config.width)
+        least = max(2 * config.parts, 4) * self.backbone.stride  # D halves the maps twice
+        if config.image_size < least:
+            raise ValueError(
+                f"image_size is {config.image_size}, expected at least {least} pixels for "
+                f"{config.parts} parts; use larger images or fewer parts"
+            )
         self.refine = nn.ModuleList(
             refinement(self.backbone.channels, config.part_dim) for _ in range(config.parts)
         )
-        for name, values in (("mean_31", IMAGENET_MEAN), ("std_31", IMAGENET_STD)):
+        for name, values in (("mean_31", self.backbone.mean), ("std_31", self.backbone.std)):
             self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
 
     def forward(self, images_B3HW: Tensor) -> tuple[Tensor, Tensor]:

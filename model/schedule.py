@@ -21,7 +21,7 @@ class Schedule:
     "What it grows by at each new period [paper]."
     period: int = 140
     "Epochs between two growths of alpha [paper]."
-    shape: Literal["step", "cosine"] = "step"
+    lr_schedule: Literal["step", "cosine"] = "step"
     """`step` is the paper's decay; `cosine` falls to zero over all epochs, for short runs from
     scratch."""
     decay: float = 0.8
@@ -59,7 +59,7 @@ def schedule_at(schedule: Schedule, epoch: float) -> ScheduleState:
     whole = math.floor(epoch)
     periods, within = divmod(whole, schedule.period)
     alpha = schedule.alpha + periods * schedule.alpha_step
-    if schedule.shape == "cosine":
+    if schedule.lr_schedule == "cosine":
         scale = 0.5 * (1 + math.cos(math.pi * min(1.0, epoch / schedule.epochs)))
     else:
         counted = within if schedule.restart else whole

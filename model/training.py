@@ -117,7 +117,7 @@ class Training:
                 nesterov=True,
                 weight_decay=rates.weight_decay,
             )
-            if rates.kind == "sgd"
+            if rates.optimizer == "sgd"
             else AdamW(groups, lr=0.0, weight_decay=rates.weight_decay)
         ]
         if self.discriminator is not None:

@@ -116,7 +116,7 @@ def lively_encoder() -> "FeatureEncoder":
 
     torch.manual_seed(0)
     encoder = FeatureEncoder(
-        PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=16)
+        PVDAConfig(backbone="resnet18", width=0.25, image_size=64, parts=2, part_dim=16)
     ).eval()
     with torch.no_grad():
         for module in encoder.modules():

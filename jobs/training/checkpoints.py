@@ -20,9 +20,6 @@ from pipeline.core import storage
 from pipeline.core.errors import InputError
 
 CHECKPOINT_FILE, METRICS_FILE = "last.pt", "metrics.jsonl"
-BEFORE = {"resizer": "pillow"}
-"""What a recipe did before it had that setting: a checkpoint from then goes on where the setting
-says the same."""
 ARCHIVE_PATTERN = re.compile(r"checkpoint-(\d+)-(\d+)\.pt")
 
 
@@ -83,7 +80,7 @@ def read_checkpoint(run: RunConfig) -> Checkpoint | None:
 
 def require_same_recipe(run: RunConfig, held: Checkpoint, path: str) -> None:
     # Through JSON, as the checkpoint has it: tuples become lists.
-    recipe, trained = json.loads(json.dumps(asdict(run.recipe))), BEFORE | held.recipe
+    recipe, trained = json.loads(json.dumps(asdict(run.recipe))), held.recipe
     changed = sorted(name for name in recipe | trained if trained.get(name) != recipe.get(name))
     if changed:
         raise InputError(

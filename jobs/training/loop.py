@@ -105,7 +105,7 @@ class Worker:
                 ) from error
             self.history, self.metrics = (
                 list(held.history),
-                MetricAccumulator(held.step, held.running),
+                MetricAccumulator(held.step, held.metric_sums),
             )
             if place.rank > 0:  # the checkpoint's count is rank 0's
                 self.metrics.damaged = 0
@@ -172,7 +172,7 @@ class Worker:
         """
         self.means()
         made = make_checkpoint(self.run, self.training, self.stream, self.history)
-        return replace(made, step=self.metrics.steps, running=self.metrics.running())
+        return replace(made, step=self.metrics.steps, metric_sums=self.metrics.state_dict())
 
     def means(self) -> dict[str, float]:
         """Means of the epoch's measures so far; raises Unfinished where one is not finite."""

@@ -19,12 +19,12 @@ class NotFinite(ArithmeticError):
 
 
 class MetricAccumulator:
-    """What the steps of one epoch add up to. `running` and `steps` go on with those of a
-    checkpoint.
+    """What the steps of one epoch add up to. `steps` and `state` are those of a checkpoint
+    that training resumes from.
     """
 
-    def __init__(self, steps: int = 0, running: Mapping[str, Tensor] | None = None) -> None:
-        held = dict(running or {})
+    def __init__(self, steps: int = 0, state: Mapping[str, Tensor] | None = None) -> None:
+        held = dict(state or {})
         self.steps = steps
         "That were added."
         self.damaged = int(held.pop(DAMAGED, 0))
@@ -61,7 +61,7 @@ class MetricAccumulator:
             raise NotFinite(f"{wrong} is {means[wrong]}")
         return means
 
-    def running(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """The sums as a checkpoint holds them."""
         if self._sums is None:
             return {}

@@ -109,7 +109,7 @@ def smoke(epochs: int = 80) -> Recipe:
     return Recipe(
         name="smoke",
         network=PVDAConfig(
-            depth=18,
+            backbone="resnet18",
             width=0.25,
             image_size=64,
             parts=2,
@@ -118,14 +118,14 @@ def smoke(epochs: int = 80) -> Recipe:
             discriminator_channels=64,
         ),
         optimization=Optimization(
-            kind="adamw",
+            optimizer="adamw",
             backbone_lr=3e-3,
             head_lr=3e-3,
             classifier_lr=3e-3,
             discriminator_lr=1e-3,
         ),
         schedule=Schedule(
-            epochs=epochs, shape="cosine", warmup_epochs=4, alpha=0.1, alpha_step=0.0
+            epochs=epochs, lr_schedule="cosine", warmup_epochs=4, alpha=0.1, alpha_step=0.0
         ),
         augmentation=Augmentation(pad=4, rotation=180),
         batch_size=16,

@@ -1,22 +1,16 @@
 """ResNet without its classifier, with torchvision's state-dict names and layer4 kept at stride 1.
 
-In: normalised images (B, 3, H, W). Out: feature maps (B, C, H/16, W/16); C is 2048 for ResNet-50 at
-full width.
+In: normalised images (B, 3, H, W). Out: feature maps (B, C, H/16, W/16); C is 2048 for ResNet-50
+at full width.
 """
 
-from typing import Literal
+import re
+from typing import ClassVar
 
 from torch import Tensor, nn
 
-Depth = Literal[18, 34, 50, 101]
-BLOCKS: dict[Depth, tuple[int, int, int, int]] = {
-    18: (2, 2, 2, 2),
-    34: (3, 4, 6, 3),
-    50: (3, 4, 6, 3),
-    101: (3, 4, 23, 3),
-}
-STRIDE = 16
-"Pixels of the image per cell of the maps: layer4's own halving is removed (PVDA, section 3; LPN)."
+from model.backbones.base import MAX_CHANNELS, Backbone
+
 MIN_CHANNELS = 16
 """Into a strided 1x1 shortcut. In the backward pass of a thinner one, channels last, oneDNN writes
 past its memory on CPUs with AVX-512 (its issue 6035; seen with torch 2.13), and the process crashes
@@ -71,9 +65,7 @@ class Bottleneck(nn.Module):
 
 
 def relus(count: int) -> list[nn.ReLU]:
-    """So many modules, not one used so often: quantisers fuse a ReLU into its convolution by the
-    module that it is.
-    """
+    """`count` modules: quantisers fuse each ReLU into its convolution, so none is shared."""
     return [nn.ReLU(inplace=True) for _ in range(count)]
 
 
@@ -84,20 +76,28 @@ def shortcut(inside: int, outside: int, stride: int) -> nn.Module | None:
     return nn.Sequential(nn.Conv2d(inside, outside, 1, stride, bias=False), nn.BatchNorm2d(outside))
 
 
-def layer1_channels(depth: Depth, width: float) -> int:
-    """Channels that leave layer1 and enter the first strided shortcut."""
-    return round(64 * width) * (BasicBlock if depth < 50 else Bottleneck).expansion
+LAYOUTS: dict[str, tuple[type[BasicBlock | Bottleneck], tuple[int, int, int, int]]] = {
+    "resnet18": (BasicBlock, (2, 2, 2, 2)),
+    "resnet34": (BasicBlock, (3, 4, 6, 3)),
+    "resnet50": (Bottleneck, (3, 4, 6, 3)),
+    "resnet101": (Bottleneck, (3, 4, 23, 3)),
+}
+"The kind of block, and how many of them layer1 to layer4 have."
 
 
-class ResNet(nn.Module):
+class ResNet(Backbone):
     """ResNet-18/34/50/101 up to layer4, `width` times as wide as published."""
 
-    def __init__(self, depth: Depth = 50, width: float = 1.0) -> None:
+    stride = 16  # layer4's own halving is removed (PVDA, section 3; LPN)
+    mean, std = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's, as torchvision trains
+    foreign_names: ClassVar[dict[str, str]] = {}  # torchvision names them so too
+    foreign_extra = ("fc.",)
+
+    def __init__(self, name: str = "resnet50", width: float = 1.0) -> None:
         super().__init__()
-        block = BasicBlock if depth < 50 else Bottleneck
+        block, blocks = LAYOUTS[name]
         base = round(64 * width)
         self.channels = base * 8 * block.expansion
-        "C, the channels of the maps."
         self.conv1 = nn.Conv2d(3, base, 7, 2, 3, bias=False)
         self.bn1 = nn.BatchNorm2d(base)
         self.relu = nn.ReLU(inplace=True)
@@ -105,14 +105,12 @@ class ResNet(nn.Module):
         inside = base
         # Stride 1 in layer4 reaches conv2 (conv1 in a BasicBlock) and downsample.0 of its first
         # block; no dilation.
-        for number, (count, stride) in enumerate(
-            zip(BLOCKS[depth], (1, 2, 2, 1), strict=True), start=1
-        ):
-            width_here = base * 2 ** (number - 1)
+        for number, (count, stride) in enumerate(zip(blocks, (1, 2, 2, 1), strict=True), start=1):
+            layer_width = base * 2 ** (number - 1)
             layer = nn.Sequential()
             for position in range(count):
-                layer.append(block(inside, width_here, stride if position == 0 else 1))
-                inside = width_here * block.expansion
+                layer.append(block(inside, layer_width, stride if position == 0 else 1))
+                inside = layer_width * block.expansion
             self.add_module(f"layer{number}", layer)
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
@@ -123,3 +121,46 @@ class ResNet(nn.Module):
         for name in ("layer1", "layer2", "layer3", "layer4"):
             x = self.get_submodule(name)(x)
         return x
+
+
+def build(name: str, width: float) -> ResNet:
+    """A ResNet of `LAYOUTS`. Raises ValueError for a width that gives too few or too many channels."""
+    # Channels that leave layer1 and enter the first strided shortcut.
+    channels = round(64 * width) * LAYOUTS[name][0].expansion
+    if channels < MIN_CHANNELS:
+        raise ValueError(
+            f"width is {width}, which gives layer1 of {name} {channels} channels; expected at least "
+            f"{MIN_CHANNELS} (thinner ones crash oneDNN); use a larger width"
+        )
+    if channels > MAX_CHANNELS:
+        raise ValueError(
+            f"width is {width}, which gives layer1 of {name} {channels} channels; expected at most "
+            f"{MAX_CHANNELS}; use a smaller width"
+        )
+    return ResNet(name, width)
+
+
+def infer(state: dict[str, Tensor]) -> tuple[str, float]:
+    """Name and width of the ResNet that a state dict with torchvision's names belongs to.
+
+    Raises ValueError that says which blocks it has where that is none of `LAYOUTS`.
+    """
+    positions = {
+        tuple(map(int, found.groups()))
+        for key in state
+        if (found := re.match(r"layer(\d)\.(\d+)\.", key))
+    }
+    blocks = tuple(
+        1 + max((block for at, block in positions if at == layer), default=-1)
+        for layer in (1, 2, 3, 4)
+    )
+    bottleneck = any(re.match(r"layer\d\.\d+\.conv3\.", key) for key in state)
+    conv1 = state.get("conv1.weight")
+    if conv1 is not None and conv1.ndim == 4:
+        for name, (block, counts) in LAYOUTS.items():
+            if counts == blocks and bottleneck == (block is Bottleneck):
+                return name, len(conv1) / 64
+    raise ValueError(
+        f"conv1.weight is {'missing' if conv1 is None else 'there'}, layers 1 to 4 have "
+        f"{', '.join(map(str, blocks))} {'bottleneck' if bottleneck else 'basic'} blocks"
+    )

@@ -3,12 +3,10 @@
 Shapes: B images, C channels, H x W cells, P rings.
 """
 
-from typing import Literal
-
 import torch
 from torch import Tensor
 
-Divisor = Literal["box", "ring"]
+from model.config import Divisor
 
 
 def ring_masks(height: int, width: int, parts: int) -> Tensor:

@@ -1,13 +1,18 @@
-"""Foreign weights -> ours: a torchvision ResNet's state dict loads into the backbone by name."""
+"""Public weights -> our networks: reading a file of weights, and loading it by a table of names.
+
+In: a `.pth` or `.safetensors` file. Out: its tensors by name, the backbone that they belong to, and
+a module that holds them. Each backbone brings its own table; LPN's is in `lpn.py`.
+"""
 
 import re
-from collections.abc import Callable
+from collections.abc import Mapping
 from pathlib import Path
 
 import safetensors.torch
 from torch import Tensor, nn
 
-from model.backbones.resnet import BLOCKS, Depth
+from model.backbones import BACKBONES
+from model.backbones.base import Backbone, families
 from model.checkpoint import check_integrity
 from model.errors import CheckpointError
 from model.weights import torch_files
@@ -60,45 +65,46 @@ def parse_state_dict(data: bytes, name: str) -> dict[str, Tensor]:
     return state
 
 
-def infer_backbone(state: dict[str, Tensor], name: str) -> tuple[Depth, float]:
-    """Depth and width of the ResNet that a state dict with torchvision's names is of.
+def infer_backbone(state: dict[str, Tensor], name: str) -> tuple[str, float]:
+    """Name and width of the backbone that a public state dict from the file `name` belongs to.
 
-    Raises CheckpointError when it is of none that we build.
+    Raises CheckpointError when it is none of BACKBONES.
     """
-    places = {
-        tuple(map(int, found.groups()))
-        for key in state
-        if (found := re.match(r"layer(\d)\.(\d+)\.", key))
-    }
-    blocks = tuple(
-        1 + max((block for at, block in places if at == layer), default=-1)
-        for layer in (1, 2, 3, 4)
-    )
-    bottleneck = any(re.match(r"layer\d\.\d+\.conv3\.", key) for key in state)
-    conv1 = state.get("conv1.weight")
-    if conv1 is not None and conv1.ndim == 4:
-        for depth in BLOCKS:
-            if BLOCKS[depth] == blocks and bottleneck == (depth >= 50):
-                return depth, len(conv1) / 64
+    reasons = []
+    for family in families():
+        try:
+            return family.infer(state)
+        except ValueError as error:
+            reasons.append(str(error))
     raise CheckpointError(
-        f"{name} is of no ResNet that we build: conv1.weight is {'missing' if conv1 is None else 'there'}, layers 1 to 4 have "
-        f"{', '.join(map(str, blocks))} {'bottleneck' if bottleneck else 'basic'} blocks, and the names begin with "
-        f"{', '.join(list(state)[:3]) or 'nothing'}; expected torchvision's names and depth {', '.join(map(str, BLOCKS))}"
+        f"{name} is of no backbone that we build: {'; '.join(reasons)}, and the names begin with "
+        f"{', '.join(list(state)[:3]) or 'nothing'}; expected torchvision's names and one of "
+        f"{', '.join(BACKBONES)}"
     )
 
 
-def load_backbone(backbone: nn.Module, state: dict[str, Tensor], name: str) -> None:
-    """Load a torchvision ResNet's state dict; its classifier `fc.*` is left out.
+def load_backbone(backbone: Backbone, state: dict[str, Tensor], name: str) -> None:
+    """Load public weights by the backbone's table of foreign names; a classifier is left out.
 
     Raises CheckpointError that lists the names which are missing, unexpected or of another shape.
     """
-    given = {key: tensor for key, tensor in state.items() if not key.startswith("fc.")}
+    given = {
+        key: tensor for key, tensor in state.items() if not key.startswith(backbone.foreign_extra)
+    }
     load_renamed(
         backbone,
         given,
         f"{name} does not fit this backbone",
-        "choose the depth that it was made for",
+        "choose the --backbone that it was made for",
+        backbone.foreign_names,
     )
+
+
+def rename(name: str, foreign_names: Mapping[str, str]) -> str:
+    """The foreign name of one of our tensors, by patterns that match the beginning of our names."""
+    for pattern, foreign in foreign_names.items():
+        name = re.sub(f"^{pattern}", foreign, name)
+    return name
 
 
 def load_renamed(
@@ -106,17 +112,17 @@ def load_renamed(
     given: dict[str, Tensor],
     complaint: str,
     remedy: str,
-    foreign: Callable[[str], str] = str,
+    foreign_names: Mapping[str, str],
 ) -> None:
-    """Load `given` where its names and shapes are exactly the module's, each translated by
-    `foreign`.
+    """Load `given` where its names and shapes are exactly the module's, each renamed by
+    `foreign_names`.
 
     Only BatchNorm's count of its batches may be missing: files from before it was counted have
     none, and nothing that we compute depends on it. Raises CheckpointError that lists everything
     else, by its foreign name.
     """
-    held = module.state_dict()
-    own = {foreign(key): tensor for key, tensor in held.items()}
+    state = module.state_dict()
+    own = {rename(key, foreign_names): tensor for key, tensor in state.items()}
     wrong = [
         f"{key} is missing"
         for key in own
@@ -129,4 +135,6 @@ def load_renamed(
     ]  # fmt: skip
     if wrong:
         raise CheckpointError(f"{complaint}: {'; '.join(wrong)}; {remedy}")
-    module.load_state_dict({key: given.get(foreign(key), tensor) for key, tensor in held.items()})
+    module.load_state_dict(
+        {key: given.get(rename(key, foreign_names), tensor) for key, tensor in state.items()}
+    )

@@ -25,7 +25,7 @@ OURS_TO_LPN = {
     r"encoder\.refine\.(\d+)\.([01])\.": r"classifier\1.add_block.\2.",
     r"classifier\.branches\.(\d+)\.": r"classifier\1.classifier.0.",
 }
-"Beginnings of a Learner's names -> LPN's."
+"Beginnings of an EncoderWithClassifier's names -> LPN's."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,13 +61,13 @@ def convert_lpn(state: dict[str, Tensor], name: str, image_size: int = 256) -> C
             f"{name} is no three_view_net of LPN: its classifiers are numbered {numbers or 'not at all'} and its names begin "
             f"with {', '.join(list(state)[:3]) or 'nothing'}; expected classifier0, classifier1, ... and model_1.model.*"
         )
-    depth, width = infer_backbone(backbone_of(state, "model_1"), f"{name} (model_1.model)")
+    backbone, width = infer_backbone(backbone_of(state, "model_1"), f"{name} (model_1.model)")
     left_out = check_shared_backbone(state, name)
     network = PVDAConfig(
-        depth=depth, width=width, image_size=image_size, parts=len(numbers),
+        backbone=backbone, width=width, image_size=image_size, parts=len(numbers),
         part_dim=linear_outputs(state, "classifier0.add_block.0.weight", name), ring_divisor="box",
     )  # fmt: skip
-    learner = EncoderWithClassifier(
+    model = EncoderWithClassifier(
         network, locations := linear_outputs(state, "classifier0.classifier.0.weight", name)
     )
     given = {
@@ -76,23 +76,16 @@ def convert_lpn(state: dict[str, Tensor], name: str, image_size: int = 256) -> C
         if not re.match(r"model_[23]\.model\.|model_1\.model\.fc\.", key)
     }
     load_renamed(
-        learner, given, f"{name} does not fit a ResNet-{depth} with {len(numbers)} rings",
-        "expected a three_view_net of LPN with average pooling", lpn_name,
+        model, given, f"{name} does not fit {backbone} with {len(numbers)} rings",
+        "expected a three_view_net of LPN with average pooling", OURS_TO_LPN,
     )  # fmt: skip
     modules = {
-        "encoder": learner.encoder.state_dict(),
-        "classifier": learner.classifier.state_dict(),
+        "encoder": model.encoder.state_dict(),
+        "classifier": model.classifier.state_dict(),
     }
     return ConvertedWeights(
         network=network, modules=modules, locations=locations, left_out=left_out
     )
-
-
-def lpn_name(ours: str) -> str:
-    """What LPN calls one of a Learner's tensors."""
-    for beginning, theirs in OURS_TO_LPN.items():
-        ours = re.sub(f"^{beginning}", theirs, ours)
-    return ours
 
 
 def backbone_of(state: dict[str, Tensor], view: str) -> dict[str, Tensor]:

@@ -210,7 +210,7 @@ OVERRIDES = [
     "batch-size",
     "seed",
     "image-size",
-    "depth",
+    "backbone",
     "width",
     "parts",
     "part-dim",

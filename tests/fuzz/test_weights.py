@@ -29,7 +29,7 @@ from pipeline.features.settings import ImportSettings
 from tests.fuzz.bounds import bounded, examples
 from tests.fuzz.hostile import VALUES, damaged, twisted, values
 
-NETWORK = PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=8)
+NETWORK = PVDAConfig(backbone="resnet18", width=0.25, image_size=64, parts=2, part_dim=8)
 
 
 @cache
@@ -91,7 +91,7 @@ def test_a_damaged_checkpoint(data: st.DataObject) -> None:
             "locations",
             "epoch",
             "step",
-            "running",
+            "metric_sums",
             "state",
             "more",
         ]
@@ -109,9 +109,9 @@ def test_a_checkpoint_with_something_else_in_a_field(
 
 
 @pytest.mark.parametrize("network", [
-    '{"width": 1e6, "depth": 18}', '{"width": 1e300}', '{"image_size": 1000000000000, "parts": 10000000}',
+    '{"width": 1e6, "backbone": "resnet18"}', '{"width": 1e300}', '{"image_size": 1000000000000, "parts": 10000000}',
     '{"part_dim": 1000000000000}',
-    '{"depth": "18"}', '{"depth": true}', '{"image_size": 64.5}', '{"parts": -1}', '{"parts": 0}', '{"width": NaN}',
+    '{"backbone": "18"}', '{"backbone": true}', '{"backbone": []}', '{"image_size": 64.5}', '{"parts": -1}', '{"parts": 0}', '{"width": NaN}',
     '{"width": -1}', "[]", "null", "[" * 100_000,
     '{"discriminator_channels": 1e9}', '{"ring_divisor": "x"}', '{"dropout": "x"}', '{"dropout": 7}',
 ])  # fmt: skip
@@ -141,7 +141,7 @@ def test_a_tensor_that_is_not_there(tensor: torch.Tensor) -> None:
     state = plain()["state"]["modules"]["encoder"]
     name = next(iter(state))
     open_all(saved(plain() | {"state": {"modules": {"encoder": state | {name: tensor}}}}))
-    open_all(saved(plain() | {"running": {"x": tensor}}))
+    open_all(saved(plain() | {"metric_sums": {"x": tensor}}))
     with bounded(CheckpointError):
         infer_backbone(
             parse_state_dict(

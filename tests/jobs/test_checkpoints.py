@@ -239,7 +239,7 @@ def made(epoch: int, step: int = 0) -> Checkpoint:
         step=step,
         history=[],
         state={"modules": {"encoder": FeatureEncoder(recipe.network).state_dict()}},
-        running={"x": torch.tensor(0.1)},
+        metric_sums={"x": torch.tensor(0.1)},
     )
 
 
@@ -296,7 +296,7 @@ def test_a_tally_goes_on_to_the_same_sums_and_tells_what_is_not_finite() -> None
         whole.add(step)
     for step in steps[:3]:
         first.add(step)
-    held = first.running()
+    held = first.state_dict()
     second = MetricAccumulator(first.steps, held)
     for step in steps[3:]:
         second.add(step)

@@ -20,7 +20,7 @@ from tests.damaging import count_detected, damaged_versions, error_message, rais
 @pytest.fixture
 def held() -> Checkpoint:
     torch.manual_seed(0)
-    network = PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=16)
+    network = PVDAConfig(backbone="resnet18", width=0.25, image_size=64, parts=2, part_dim=16)
     weights = FeatureEncoder(network).state_dict()
     return Checkpoint(
         network=network,

@@ -19,7 +19,13 @@ from model.schedule import ScheduleState
 from model.training import Training
 
 CONFIG = PVDAConfig(
-    depth=18, width=0.25, image_size=64, parts=2, part_dim=8, dropout=0.0, discriminator_channels=16
+    backbone="resnet18",
+    width=0.25,
+    image_size=64,
+    parts=2,
+    part_dim=8,
+    dropout=0.0,
+    discriminator_channels=16,
 )
 STILL = ScheduleState(alpha=0.9, lr_scale=0.0)
 """Rates of zero: gradients are computed and nothing moves, so D's first Adam step cannot blow up a

@@ -23,7 +23,7 @@ from pipeline.images.transforms import Resizer, preprocessing_name, resize
 @pytest.fixture
 def checkpoint(lively_encoder: FeatureEncoder) -> bytes:
     state = {"modules": {"encoder": lively_encoder.state_dict()}}
-    config = PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=16)
+    config = PVDAConfig(backbone="resnet18", width=0.25, image_size=64, parts=2, part_dim=16)
     return dumps(
         Checkpoint(network=config, recipe={}, locations=[], epoch=0, history=[], state=state)
     )

@@ -69,11 +69,11 @@ def test_paper_384_is_the_paper_on_larger_images() -> None:
 def test_lpn_has_no_discriminator_and_ends_after_120_epochs_with_a_tenth_of_its_rates() -> None:
     recipe = lpn()
     assert not recipe.adversary
-    tiny = PVDAConfig(depth=18, width=0.25, part_dim=8)
+    tiny = PVDAConfig(backbone="resnet18", width=0.25, part_dim=8)
     training = Training(tiny, recipe.optimization, 3, adversary=recipe.adversary)
     assert list(training.rates) == ["backbone", "head", "classifier"]
     rates = recipe.optimization
-    assert (rates.kind, rates.backbone_lr, rates.head_lr, rates.classifier_lr) == (
+    assert (rates.optimizer, rates.backbone_lr, rates.head_lr, rates.classifier_lr) == (
         "sgd",
         0.001,
         0.01,
@@ -166,7 +166,7 @@ def test_recipe_paper_trains_a_whole_resnet50_from_torchvisions_weights(
     # step throws conv1 far off.
     given = {
         name: tensor / 5 if name.endswith("bn3.weight") else tensor
-        for name, tensor in ResNet(50).state_dict().items()
+        for name, tensor in ResNet("resnet50").state_dict().items()
     }
     torch.save(
         given | {"fc.weight": torch.zeros(1000, 2048), "fc.bias": torch.zeros(1000)},
@@ -196,8 +196,8 @@ def test_recipe_paper_trains_a_whole_resnet50_from_torchvisions_weights(
     assert "*image_size=128 (not 256)" in ended.output
     checkpoint = loads((tmp_path / "run" / "last.pt").read_bytes())
     shutil.rmtree(tmp_path / "run")  # hundreds of megabytes, which pytest would keep
-    assert (checkpoint.network.depth, checkpoint.network.width, checkpoint.network.parts) == (
-        50,
+    assert (checkpoint.network.backbone, checkpoint.network.width, checkpoint.network.parts) == (
+        "resnet50",
         1.0,
         4,
     )

@@ -286,12 +286,12 @@ def test_an_unknown_recipe_is_answered_with_the_known_ones() -> None:
 def test_the_paper_recipe_is_the_papers() -> None:
     recipe = paper()
     assert (
-        recipe.network.depth,
+        recipe.network.backbone,
         recipe.network.width,
         recipe.network.image_size,
         recipe.network.parts,
     ) == (
-        50,
+        "resnet50",
         1.0,
         256,
         4,
@@ -302,7 +302,7 @@ def test_the_paper_recipe_is_the_papers() -> None:
         recipe.network.discriminator_channels,
     ) == (512, 0.75, 1024)
     rates = recipe.optimization
-    assert (rates.kind, rates.momentum, rates.weight_decay) == ("sgd", 0.9, 5e-4)
+    assert (rates.optimizer, rates.momentum, rates.weight_decay) == ("sgd", 0.9, 5e-4)
     assert (
         rates.backbone_lr,
         rates.head_lr,

@@ -52,7 +52,7 @@ def world(tmp_path: Path, ray_cluster: None, lively_encoder: FeatureEncoder) -> 
     pack(
         University1652(), PackingSettings(root=str(tmp_path / "raw"), out=str(tmp_path / "shards"))
     )
-    network = PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=16)
+    network = PVDAConfig(backbone="resnet18", width=0.25, image_size=64, parts=2, part_dim=16)
     state = {"modules": {"encoder": lively_encoder.state_dict()}}
     plain = Checkpoint(network=network, recipe={}, locations=[], epoch=0, history=[], state=state)
     data = dumps(replace(plain, locations=[f"{place:04d}" for place in range(TRAINED)]))

@@ -44,7 +44,7 @@ def world(tmp_path: Path, lively_encoder: FeatureEncoder) -> dict[str, str]:
     """A checkpoint, an index of places to the north of each other, and a folder with a photo of
     each of the first four.
     """
-    network = PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=16)
+    network = PVDAConfig(backbone="resnet18", width=0.25, image_size=64, parts=2, part_dim=16)
     state = {"modules": {"encoder": lively_encoder.state_dict()}}
     data = dumps(
         Checkpoint(network=network, recipe={}, locations=[], epoch=0, history=[], state=state)

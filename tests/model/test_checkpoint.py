@@ -18,7 +18,7 @@ from model.inference.embed import embed
 from model.pvda import FeatureEncoder
 
 TINY = PVDAConfig(
-    depth=18, width=0.25, image_size=64, parts=2, part_dim=8, discriminator_channels=8
+    backbone="resnet18", width=0.25, image_size=64, parts=2, part_dim=8, discriminator_channels=8
 )
 
 
@@ -72,12 +72,12 @@ NONE_OF_OURS: dict[str, Callable[[bytes], bytes]] = {
     "a state dict": lambda data: saved({"conv1.weight": torch.ones(3)}),
     "a tensor": lambda data: saved(torch.ones(3)),
     "a list": lambda data: saved([1, 2]),
-    "another format": lambda data: saved(torch.load(io.BytesIO(data)) | {"format": 2}),
+    "another format": lambda data: saved(torch.load(io.BytesIO(data)) | {"format": 3}),
     "an unknown setting": lambda data: saved(
         torch.load(io.BytesIO(data)) | {"network": '{"depths": 50}'}
     ),
     "an impossible setting": lambda data: saved(
-        torch.load(io.BytesIO(data)) | {"network": '{"depth": 51}'}
+        torch.load(io.BytesIO(data)) | {"network": '{"backbone": "resnet51"}'}
     ),
     "a pickle that pops an empty stack": lambda data: b"\x80\x020.",
     "a pickle that ends in a number": lambda data: b"\x80\x02X\x05\x00",
@@ -91,7 +91,7 @@ def test_what_is_no_checkpoint_is_refused_in_one_sentence_that_names_it(
     with pytest.raises(CheckpointError) as caught:
         loads(spoil(dumps(held)), "photos/last.pt")
     message = str(caught.value)
-    assert message.startswith("photos/last.pt is not a checkpoint of format 1")
+    assert message.startswith("photos/last.pt is not a checkpoint of format 2")
     assert "expected a last.pt written by jobs/train.py" in message
     assert "\n" not in message
 
@@ -169,5 +169,16 @@ def test_recipe_and_history_are_kept_as_json_so_that_they_open_without_our_code(
 ) -> None:
     plain = torch.load(io.BytesIO(dumps(held)), weights_only=True)
     assert json.loads(plain["recipe"])["name"] == "tiny"
-    assert json.loads(plain["network"])["depth"] == 18
-    assert plain["format"] == 1
+    assert json.loads(plain["network"])["backbone"] == "resnet18"
+    assert plain["format"] == 2
+
+
+def test_loads_of_format_1_says_how_to_make_it_anew(held: Checkpoint) -> None:
+    old = saved(torch.load(io.BytesIO(dumps(held))) | {"format": 1})
+    with pytest.raises(CheckpointError) as caught:
+        loads(old, "run/last.pt")
+    assert str(caught.value) == (
+        "run/last.pt is a checkpoint of format 1, expected format 2, in which settings have other "
+        "names; train again with jobs/train.py, or import the weights again with "
+        "jobs/import_weights.py"
+    )

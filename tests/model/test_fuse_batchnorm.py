@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from model.backbones.resnet import Depth, ResNet
+from model.backbones.resnet import ResNet
 from model.config import PVDAConfig
 from model.inference.fuse_batchnorm import fuse_batchnorm
 from model.pvda import FeatureEncoder
@@ -43,7 +43,9 @@ def test_every_batch_norm_is_felt_so_that_folding_one_wrongly_would_show(
 @torch.no_grad()
 def test_bottlenecks_are_folded_too() -> None:
     torch.manual_seed(0)
-    encoder = FeatureEncoder(PVDAConfig(depth=50, width=0.25, image_size=64, parts=2, part_dim=8))
+    encoder = FeatureEncoder(
+        PVDAConfig(backbone="resnet50", width=0.25, image_size=64, parts=2, part_dim=8)
+    )
     encoder(images(4))  # statistics of a batch
     encoder.eval()
     torch.testing.assert_close(
@@ -65,7 +67,7 @@ def test_an_encoder_in_training_mode_and_a_norm_that_cannot_be_folded_are_refuse
 ) -> None:
     with pytest.raises(ValueError, match=r"is in training mode, .*; call eval\(\)"):
         fuse_batchnorm(lively_encoder.train())
-    lively_encoder.eval().backbone.maxpool = nn.Sequential(nn.BatchNorm2d(16).eval())  # type: ignore[assignment]
+    lively_encoder.eval().backbone.maxpool = nn.Sequential(nn.BatchNorm2d(16).eval())
     with pytest.raises(
         ValueError,
         match=r"backbone\.maxpool\.0 cannot be folded; expected each BatchNorm straight after",
@@ -73,15 +75,18 @@ def test_an_encoder_in_training_mode_and_a_norm_that_cannot_be_folded_are_refuse
         fuse_batchnorm(lively_encoder)
 
 
-@pytest.mark.parametrize(("depth", "convolutions"), [(18, 20), (34, 36), (50, 53), (101, 104)])
+@pytest.mark.parametrize(
+    ("name", "convolutions"),
+    [("resnet18", 20), ("resnet34", 36), ("resnet50", 53), ("resnet101", 104)],
+)
 def test_each_relu_is_a_module_of_its_own_and_has_no_name_in_the_state_dict(
-    depth: Depth, convolutions: int
+    name: str, convolutions: int
 ) -> None:
     """A quantiser tells them apart by the module. The names are torchvision's: nothing but
     convolutions and norms.
     """
     with torch.device("meta"):
-        backbone = ResNet(depth)
+        backbone = ResNet(name)
     shortcuts = sum(
         name.endswith("downsample")
         for name, module in backbone.named_modules()

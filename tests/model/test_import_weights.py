@@ -247,7 +247,7 @@ def test_an_lpn_checkpoint_says_what_it_is_and_where_it_came_from(
 ) -> None:
     checkpoint = imported(tmp_path, three_view_net(made_up()))
     network = checkpoint.network
-    assert (network.depth, network.width, network.image_size) == (18, 0.25, 128)
+    assert (network.backbone, network.width, network.image_size) == ("resnet18", 0.25, 128)
     assert (network.parts, network.part_dim, network.ring_divisor) == (4, 24, "box")
     assert (checkpoint.epoch, checkpoint.history) == (0, [])
     assert checkpoint.locations == [f"unnamed-{number}" for number in range(5)]
@@ -361,8 +361,12 @@ def test_torchvisions_weights_become_a_checkpoint_whose_refinement_is_said_to_be
     ]
     assert "the refinement of the rings is untrained" in capsys.readouterr().err
     checkpoint = loads(Path(outs[0]).read_bytes())
-    assert (checkpoint.network.depth, checkpoint.network.width, checkpoint.network.image_size) == (
-        18,
+    assert (
+        checkpoint.network.backbone,
+        checkpoint.network.width,
+        checkpoint.network.image_size,
+    ) == (
+        "resnet18",
         0.25,
         256,
     )
@@ -455,7 +459,7 @@ def test_a_wrong_call_is_answered_with_the_remedy(tmp_path: Path) -> None:
     ):
         imported(tmp_path, three_view_net(made_up()), image_size=64)
     given = saved(
-        {"conv1.weight": torch.ones(1)} | ResNet(18, 0.25).state_dict(), tmp_path / "r.pth"
+        {"conv1.weight": torch.ones(1)} | ResNet("resnet18", 0.25).state_dict(), tmp_path / "r.pth"
     )
     with pytest.raises(InputError, match="image_size is 64"):
         import_weights(Settings(out=out, torchvision=given, image_size=64))

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from model.backbones.resnet import Depth, ResNet
+from model.backbones.resnet import ResNet
 from model.config import PVDAConfig
 from model.inference.embed import embed, unit_embedding
 from model.pvda import FeatureEncoder, LocationClassifier, ViewDiscriminator, refinement
 
 PAPER = PVDAConfig()
 TINY = PVDAConfig(
-    depth=18, width=0.25, image_size=64, parts=2, part_dim=8, discriminator_channels=8
+    backbone="resnet18", width=0.25, image_size=64, parts=2, part_dim=8, discriminator_channels=8
 )
 
 
@@ -75,25 +75,33 @@ def torchvision_resnet50() -> dict[str, tuple[int, ...]]:
 
 def test_the_backbone_has_the_names_and_shapes_of_torchvisions_resnet50() -> None:
     with torch.device("meta"):
-        own = {name: tuple(tensor.shape) for name, tensor in ResNet(50).state_dict().items()}
+        own = {
+            name: tuple(tensor.shape) for name, tensor in ResNet("resnet50").state_dict().items()
+        }
     wanted = torchvision_resnet50()
     assert len(wanted) == 318
     assert own == wanted
 
 
 @pytest.mark.parametrize(
-    ("depth", "count"), [(18, 11_176_512), (34, 21_284_672), (50, 23_508_032), (101, 42_500_160)]
+    ("name", "count"),
+    [
+        ("resnet18", 11_176_512),
+        ("resnet34", 21_284_672),
+        ("resnet50", 23_508_032),
+        ("resnet101", 42_500_160),
+    ],
 )
 def test_each_depth_has_as_many_parameters_as_published_without_its_classifier(
-    depth: Depth, count: int
+    name: str, count: int
 ) -> None:
     with torch.device("meta"):
-        assert parameters(ResNet(depth)) == count
+        assert parameters(ResNet(name)) == count
 
 
 def test_layer4_keeps_its_resolution_in_the_main_path_and_the_shortcut_without_dilation() -> None:
     with torch.device("meta"):
-        modules = dict(ResNet(50).named_modules())
+        modules = dict(ResNet("resnet50").named_modules())
     strided = {
         name
         for name, module in modules.items()
@@ -250,17 +258,17 @@ def test_the_ring_divisor_is_a_setting_of_the_encoder(divisor: Literal["box", "r
         ),
         ({"image_size": 48, "parts": 1}, "image_size is 48, expected at least 64"),
         (
-            {"depth": 18, "width": 0.2},
-            "width is 0.2, .* ResNet-18 13 channels; expected at least 16 .* use a larger width",
+            {"backbone": "resnet18", "width": 0.2},
+            "width is 0.2, .* resnet18 13 channels; expected at least 16 .* use a larger width",
         ),
-        ({"depth": 20}, "depth is 20, expected one of 18, 34, 50, 101"),
+        ({"backbone": "resnet20"}, "backbone is 'resnet20', expected one of resnet18, .*resnet101"),
     ],
 )
 def test_sizes_that_cannot_be_built_are_refused_with_the_remedy(
     wrong: dict[str, int], sentence: str
 ) -> None:
     with pytest.raises(ValueError, match=sentence):
-        PVDAConfig(**wrong)  # type: ignore[arg-type]
+        FeatureEncoder(PVDAConfig(**wrong))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 4])

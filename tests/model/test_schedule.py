@@ -63,7 +63,7 @@ def test_steps_within_an_epoch_change_nothing_on_the_papers_schedule() -> None:
 
 
 def test_a_cosine_falls_from_one_over_a_half_to_zero() -> None:
-    cosine = Schedule(epochs=80, shape="cosine")
+    cosine = Schedule(epochs=80, lr_schedule="cosine")
     scales = [schedule_at(cosine, epoch).lr_scale for epoch in (0, 20, 40, 60, 80)]
     assert scales == pytest.approx([1, (1 + 0.5**0.5) / 2, 0.5, (1 - 0.5**0.5) / 2, 0])
 
@@ -73,9 +73,9 @@ def test_warm_up_grows_from_zero_by_steps_and_then_leaves_the_shape_as_it_is() -
     assert [schedule_at(warm, epoch).lr_scale for epoch in (0, 1, 2.5, 4, 60)] == pytest.approx(
         [0, 0.25, 0.625, 1, 0.8]
     )
-    cosine = Schedule(epochs=80, shape="cosine", warmup_epochs=4)
+    cosine = Schedule(epochs=80, lr_schedule="cosine", warmup_epochs=4)
     assert schedule_at(cosine, 2).lr_scale == pytest.approx(
-        schedule_at(Schedule(epochs=80, shape="cosine"), 2).lr_scale / 2
+        schedule_at(Schedule(epochs=80, lr_schedule="cosine"), 2).lr_scale / 2
     )
     assert schedule_at(warm, 100) == schedule_at(cold, 100)
 

@@ -21,7 +21,13 @@ from model.schedule import ScheduleState
 from model.training import EncoderWithClassifier, Training
 
 TINY = PVDAConfig(
-    depth=18, width=0.25, image_size=64, parts=2, part_dim=8, dropout=0.0, discriminator_channels=8
+    backbone="resnet18",
+    width=0.25,
+    image_size=64,
+    parts=2,
+    part_dim=8,
+    dropout=0.0,
+    discriminator_channels=8,
 )
 LOCATIONS = 5
 NOW = ScheduleState(alpha=0.9, lr_scale=1.0)
@@ -170,7 +176,7 @@ def test_the_encoder_is_pushed_by_swapped_labels_and_not_by_a_reversed_gradient(
     maps1_BCHW, maps2_BCHW, *_ = training.learner(batch()[0], batch()[2])
     verdict_B2 = _discriminator()(torch.cat([maps1_BCHW, maps2_BCHW]))
     straight = F.cross_entropy(verdict_B2, torch.tensor([0, 0, 0, 1, 1, 1])) * 2
-    first = training.learner.encoder.backbone.conv1.weight
+    first = training.learner.encoder.backbone.get_parameter("conv1.weight")
     [reversed_gradient] = torch.autograd.grad(-straight, first)
     swapped_gradient = (
         adversary["encoder.backbone.conv1.weight"] - plain["encoder.backbone.conv1.weight"]
@@ -270,7 +276,7 @@ def test_the_optimisers_are_those_of_the_paper_unless_a_short_run_asks_for_adamw
         assert (group["momentum"], group["nesterov"], group["weight_decay"]) == (0.9, True, 5e-4)
     [group] = of_discriminator.param_groups
     assert (group["betas"], group["weight_decay"]) == ((0.9, 0.999), 0)
-    assert type(make(optimization=Optimization(kind="adamw")).optimizers[0]) is AdamW
+    assert type(make(optimization=Optimization(optimizer="adamw")).optimizers[0]) is AdamW
 
 
 def test_a_step_tells_its_losses_and_how_often_the_discriminator_was_right() -> None:
@@ -357,7 +363,7 @@ def test_the_location_loss_falls_when_the_same_images_come_again_and_again() -> 
 
 @pytest.mark.parametrize("kind", ["sgd", "adamw"])
 def test_a_run_saved_and_loaded_goes_on_to_the_last_bit(kind: Any) -> None:
-    config, optimization = replace(TINY, dropout=0.5), Optimization(kind=kind)
+    config, optimization = replace(TINY, dropout=0.5), Optimization(optimizer=kind)
     whole = make(config, optimization)
     for seed in range(2):
         whole.step(*batch(seed), NOW)

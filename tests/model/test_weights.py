@@ -7,14 +7,15 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from model.backbones.resnet import BLOCKS, Depth, ResNet
+from model.backbones import BACKBONES
+from model.backbones.resnet import ResNet
 from model.errors import CheckpointError
 from model.weights.load import infer_backbone, load_backbone, read_state_dict
 
 
 def tiny(seed: int) -> ResNet:
     torch.manual_seed(seed)
-    return ResNet(18, 0.25)
+    return ResNet("resnet18", 0.25)
 
 
 def foreign() -> dict[str, Tensor]:
@@ -107,49 +108,52 @@ def test_a_folder_is_refused_in_one_sentence(tmp_path: Path) -> None:
         read_state_dict(str(tmp_path))
 
 
-def published(depth: Depth) -> dict[str, Tensor]:
+def published(backbone: str) -> dict[str, Tensor]:
     """Names and shapes of torchvision's ResNet of that depth, without memory."""
     with torch.device("meta"):
         fc = {
-            "fc.weight": torch.empty(1000, 512 if depth < 50 else 2048),
+            "fc.weight": torch.empty(1000, 512 if backbone in ("resnet18", "resnet34") else 2048),
             "fc.bias": torch.empty(1000),
         }
-        return ResNet(depth).state_dict() | fc
+        return ResNet(backbone).state_dict() | fc
 
 
-@pytest.mark.parametrize(("depth", "tensors"), [(18, 122), (34, 218), (50, 320), (101, 626)])
-def test_a_state_dict_of_each_depth_loads_and_tells_its_depth(depth: Depth, tensors: int) -> None:
-    state = published(depth)
+@pytest.mark.parametrize(
+    ("name", "tensors"),
+    [("resnet18", 122), ("resnet34", 218), ("resnet50", 320), ("resnet101", 626)],
+)
+def test_a_state_dict_of_each_depth_loads_and_tells_its_depth(name: str, tensors: int) -> None:
+    state = published(name)
     assert len(state) == tensors  # as torchvision's have them, the classifier's two included
-    assert infer_backbone(state, "resnet.pth") == (depth, 1.0)
+    assert infer_backbone(state, "resnet.pth") == (name, 1.0)
     with torch.device("meta"):
-        backbone = ResNet(depth)
+        backbone = ResNet(name)
     load_backbone(backbone, state, "resnet.pth")
 
 
-@pytest.mark.parametrize("depth", BLOCKS)
-@pytest.mark.parametrize("other", BLOCKS)
-def test_a_state_dict_of_another_depth_is_refused(depth: Depth, other: Depth) -> None:
+@pytest.mark.parametrize("name", BACKBONES)
+@pytest.mark.parametrize("other", BACKBONES)
+def test_a_state_dict_of_another_depth_is_refused(name: str, other: str) -> None:
     with torch.device("meta"):
-        backbone = ResNet(depth)
-    if depth == other:
+        backbone = ResNet(name)
+    if name == other:
         load_backbone(backbone, published(other), "resnet.pth")
         return
     with pytest.raises(
         CheckpointError,
-        match=r"does not fit this backbone: .*layer.*; choose the depth that it was made",
+        match=r"does not fit this backbone: .*layer.*; choose the --backbone that it was made",
     ):
         load_backbone(backbone, published(other), "resnet.pth")
 
 
 def test_the_width_is_told_too_and_what_is_no_resnet_of_ours_is_refused_by_what_it_has() -> None:
-    assert infer_backbone(foreign(), "thin.pth") == (18, 0.25)
-    resnet152 = published(101) | {
+    assert infer_backbone(foreign(), "thin.pth") == ("resnet18", 0.25)
+    resnet152 = published("resnet101") | {
         f"layer2.{block}.conv3.weight": torch.ones(1) for block in range(4, 8)
     }
     with pytest.raises(
         CheckpointError,
-        match=r"deep\.pth is of no ResNet that we build: .* 3, 8, 23, 3 bottleneck blocks",
+        match=r"deep\.pth is of no backbone that we build: .* 3, 8, 23, 3 bottleneck blocks",
     ):
         infer_backbone(resnet152, "deep.pth")
     with pytest.raises(

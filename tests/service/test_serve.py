@@ -44,7 +44,7 @@ ROOT = Path(__file__).parents[2]
 def road(tmp_path: Path, lively_encoder: FeatureEncoder) -> tuple[Path, Path]:
     """A checkpoint, and an index of three photos that it embedded."""
     state = {"modules": {"encoder": lively_encoder.state_dict()}}
-    config = PVDAConfig(depth=18, width=0.25, image_size=64, parts=2, part_dim=16)
+    config = PVDAConfig(backbone="resnet18", width=0.25, image_size=64, parts=2, part_dim=16)
     data = dumps(
         Checkpoint(network=config, recipe={}, locations=[], epoch=0, history=[], state=state)
     )
