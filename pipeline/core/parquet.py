@@ -1,10 +1,11 @@
-"""Parquet files with checksums: every page has one, and a block before the footer holds the footer's.
+"""Parquet files with checksums: every page has one, and a block before the footer holds the
+footer's.
 
-In: tables and paths. Out: files that any Parquet reader opens, and their rows, or an error if a bit has
-changed. pyarrow trusts a footer: one flipped bit in it may silently change statistics or rows, or end
-the process. So the footer's SHA-256 is compared before pyarrow reads it. The checksum block stands
-between pages and footer, where readers look for nothing: they find pages by their offsets. Files that
-other programs wrote have no such block and are read without it.
+In: tables and paths. Out: files that any Parquet reader opens, and their rows, or an error if a bit
+has changed. pyarrow trusts a footer: one flipped bit in it may silently change statistics or rows,
+or end the process. So the footer's SHA-256 is compared before pyarrow reads it. The checksum block
+stands between pages and footer, where readers look for nothing: they find pages by their offsets.
+Files that other programs wrote have no such block and are read without it.
 """
 
 import hashlib
@@ -24,8 +25,9 @@ DAMAGE_ERRORS = (pa.ArrowException, OSError, ValueError)
 not UTF-8."""
 CHECKSUM_MARK = b"pvda.seal"
 CHECKSUM_BLOCK = re.compile(rb"pvda\.seal:([0-9a-f]{64}):([0-9a-f]{64}):pvda\.seal")
-"""SHA-256 of all bytes before the block, and of that digest with all bytes behind the block. The mark
-stands there twice, so that no flipped bit makes such a file look like one of another program."""
+"""SHA-256 of all bytes before the block, and of that digest with all bytes behind the block. The
+mark stands there twice, so that no flipped bit makes such a file look like one of another
+program."""
 CHECKSUM_BLOCK_BYTES = 2 * (len(CHECKSUM_MARK) + 1) + 2 * 64 + 1
 MAGIC = b"PAR1"
 TRAILER_BYTES = 8
@@ -132,8 +134,8 @@ def _append_checksum(stream: IO[bytes]) -> None:
 
 
 def _check_footer(stream: IO[bytes]) -> tuple[int, bytes] | None:
-    """Where the pages end, and the SHA-256 that they had when they were written; None if the file has
-    no checksum block.
+    """Where the pages end, and the SHA-256 that they had when they were written; None if the file
+    has no checksum block.
 
     Raises ArrowInvalid if the footer is not what was written.
     """

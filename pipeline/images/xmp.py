@@ -1,9 +1,8 @@
 """An XMP packet -> its properties as text, by their names without namespace.
 
-In: XML from a file that anybody may have written. Out: a plain dictionary. A packet with a DOCTYPE
-is refused, as entities need one; size and depth are bounded. Names stand for themselves whatever
-their namespace: makers use the same names in namespaces of their own, and some forget to declare
-them.
+In: XML from a file that anyone may have written. Out: a plain dictionary. A packet with a DOCTYPE
+is refused, because entities need one; size and depth are bounded. Names count whatever their
+namespace: makers use the same names in namespaces of their own, and some forget to declare them.
 """
 
 from xml.parsers import expat
@@ -11,7 +10,7 @@ from xml.parsers import expat
 from pipeline.images.image_blocks import UnreadableTag
 
 MAX_PACKET_BYTES = 1 << 20
-"Bytes of a packet; a JPEG segment holds 64 kB."
+"A JPEG segment holds 64 kB."
 MAX_DEPTH = 32
 "Elements within elements; cameras need five."
 STRUCTURAL_ELEMENTS = {"xmpmeta", "xapmeta", "RDF", "Description", "Seq", "Bag", "Alt", "li"}
@@ -26,7 +25,7 @@ def read_xmp(packet: bytes) -> dict[str, str]:
     """
     if len(packet) > MAX_PACKET_BYTES:
         raise UnreadableTag(f"XMP of {len(packet)} bytes, more than {MAX_PACKET_BYTES}")
-    found: dict[str, str] = {}
+    properties: dict[str, str] = {}
     path: list[str] = []
     text: list[str] = []
 
@@ -37,12 +36,13 @@ def read_xmp(packet: bytes) -> dict[str, str]:
             raise UnreadableTag(f"XMP with more than {MAX_DEPTH} elements within each other")
         for attribute, value in attributes.items():
             if not attribute.startswith(("xmlns", "rdf:")):
-                found.setdefault(_property_name([*path, _local_name(attribute)]), value.strip())
+                named = _property_name([*path, _local_name(attribute)])
+                properties.setdefault(named, value.strip())
 
     def end(_: str) -> None:
-        said = "".join(text).strip()
-        if said:
-            found.setdefault(_property_name(path), said)
+        value = "".join(text).strip()
+        if value:
+            properties.setdefault(_property_name(path), value)
         text.clear()
         path.pop()
 
@@ -54,14 +54,15 @@ def read_xmp(packet: bytes) -> dict[str, str]:
     parser.CharacterDataHandler = text.append
     parser.StartDoctypeDeclHandler = doctype
     try:
-        parser.Parse(packet.strip(b"\0 \t\r\n"), True)  # padding behind the last element is common
+        # Padding behind the last element is common.
+        parser.Parse(packet.strip(b"\0 \t\r\n"), True)
     except expat.ExpatError as error:
-        raise UnreadableTag(f"XMP that is no XML: {error}") from None
+        raise UnreadableTag(f"XMP that is not XML: {error}") from None
     except (ValueError, LookupError) as error:
         if isinstance(error, UnreadableTag):
             raise
-        raise UnreadableTag(f"XMP in an encoding that nobody knows: {error}") from None
-    return found
+        raise UnreadableTag(f"XMP in an unknown encoding: {error}") from None
+    return properties
 
 
 def _local_name(name: str) -> str:

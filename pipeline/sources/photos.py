@@ -98,9 +98,8 @@ class Photos(Source):
         except OSError as error:
             return Rejection(path=whole, reason="unreadable file", found=str(error))
         if self.geotags == "required" and tags.position is None:
-            return Rejection(
-                path=whole, reason="no position", found="neither EXIF nor XMP holds one"
-            )
+            found = "; ".join(tags.ignored) or "neither EXIF nor XMP holds one"
+            return Rejection(path=whole, reason="no position", found=found)
         folder, _, name = path.rpartition("/")
         return ImageRecord(
             path=whole, split=self.split, view=self.view, bytes=size, taken_at=tags.taken_at,

@@ -15,7 +15,7 @@ from typing import Any
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View
-from pipeline.images.camera_tags import parse_number, validate_position
+from pipeline.images.camera_position import parse_number, validate_position
 from pipeline.images.image_blocks import UnreadableTag
 from pipeline.images.inspect import is_image_name
 from pipeline.sources.base import Source
