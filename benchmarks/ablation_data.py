@@ -14,7 +14,7 @@ from model.training import Training
 from pipeline.batches.ordered import decode_samples
 from pipeline.core.records import Split, View
 from pipeline.retrieval.metrics import summarise
-from pipeline.retrieval.ranking import Side, rank, side_of_array
+from pipeline.retrieval.ranking import EmbeddingSet, embedding_set_from_array, rank
 from pipeline.shards.manifest import read_manifest
 from pipeline.shards.pack import pack
 from pipeline.shards.samples import read_shard
@@ -79,9 +79,9 @@ class TestSet:
         }
         encoder.train()
 
-        def embedding_set(split: Split, view: View) -> Side:
+        def embedding_set(split: Split, view: View) -> EmbeddingSet:
             names = self.locations[split, view]
-            return side_of_array(names, names, vectors[split, view])
+            return embedding_set_from_array(names, names, vectors[split, view])
 
         measures: dict[str, float] = {}
         for query, gallery, label in (

@@ -17,8 +17,8 @@ import numpy as np
 
 from pipeline.core.arrays import Ints
 from pipeline.features.table import Floats, PartFooter, PartRows, open_table, write_part
-from pipeline.retrieval.ranking import Blocks, Side, rank, side_of_array
-from pipeline.retrieval.tasks import side_of
+from pipeline.retrieval.ranking import BlockSizes, EmbeddingSet, embedding_set_from_array, rank
+from pipeline.retrieval.tasks import embedding_set_from_table
 
 DIMENSION = 2048
 TASKS = {"drone->satellite": (701, 54, 951, 1), "satellite->drone": (701, 1, 951, 54)}
@@ -40,16 +40,16 @@ def made_vectors(label_Q: Ints, centres_LD: Floats, seed: int, noise: float = 3)
     return vectors_QD
 
 
-def made_side(locations: int, each: int, centres_LD: Floats, seed: int) -> Side:
+def made_side(locations: int, each: int, centres_LD: Floats, seed: int) -> EmbeddingSet:
     """`each` vectors of each of the first `locations` locations."""
     label_Q: Ints = np.repeat(np.arange(locations), each)
     keys, names = np.arange(len(label_Q)).astype(np.str_), label_Q.astype(np.str_)
-    return side_of_array(keys, names, made_vectors(label_Q, centres_LD, seed))
+    return embedding_set_from_array(keys, names, made_vectors(label_Q, centres_LD, seed))
 
 
-def product_seconds(queries: Side, gallery: Side) -> float:
+def product_seconds(queries: EmbeddingSet, gallery: EmbeddingSet) -> float:
     """Seconds of the bare float32 products of the ranking's blocks, without reading."""
-    size = Blocks()
+    size = BlockSizes()
     out = np.empty((size.query_rows, size.gallery_rows), np.float32)
     query_blocks = list(queries.blocks(size.query_rows))
     seconds = 0.0
@@ -61,7 +61,7 @@ def product_seconds(queries: Side, gallery: Side) -> float:
     return seconds
 
 
-def measure(name: str, queries: Side, gallery: Side, rounds: int = ROUNDS) -> None:
+def measure(name: str, queries: EmbeddingSet, gallery: EmbeddingSet, rounds: int = ROUNDS) -> None:
     products, totals = [], []
     for _ in range(rounds):
         products.append(product_seconds(queries, gallery))
@@ -114,10 +114,10 @@ class Interleaved:
     baseline.
     """
 
-    def __init__(self, queries: Side, gallery: Side) -> None:
+    def __init__(self, queries: EmbeddingSet, gallery: EmbeddingSet) -> None:
         self._gallery, self.seconds = gallery, 0.0
-        self._query_blocks = list(queries.blocks(Blocks().query_rows))
-        self._out = np.empty((Blocks().query_rows, Blocks().gallery_rows), np.float32)
+        self._query_blocks = list(queries.blocks(BlockSizes().query_rows))
+        self._out = np.empty((BlockSizes().query_rows, BlockSizes().gallery_rows), np.float32)
         self._recent: dict[int, Floats] = {}
         self._done = 0
         self.side = replace(gallery, blocks=self._blocks)
@@ -151,7 +151,8 @@ def large(scale: float) -> None:
         maker.start()
         maker.join()
         queries, gallery = (
-            side_of(open_table(f"{folder}/{split}")) for split in ("query", "gallery")
+            embedding_set_from_table(open_table(f"{folder}/{split}"))
+            for split in ("query", "gallery")
         )
         timed = Interleaved(queries, gallery)
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

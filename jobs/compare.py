@@ -11,7 +11,7 @@ from jobs.command_line.cli import run
 from pipeline.core import storage
 from pipeline.core.progress import console, results
 from pipeline.evaluation.compare import compare, latex, markdown
-from pipeline.report.inputs import read_findings
+from pipeline.report.inputs import read_evaluation
 
 
 def main(
@@ -26,7 +26,7 @@ def main(
         out: Folder for comparison.md, comparison.tex and comparison.json; a path or a URI.
         published: Add the figures that papers published for University-1652's official test.
     """
-    rows = compare([read_findings(folder) for folder in runs])
+    rows = compare([read_evaluation(folder) for folder in runs])
     results.print(markdown(rows, published), soft_wrap=True)
     if out is not None:
         storage.write_bytes(storage.join(out, "comparison.md"), markdown(rows, published).encode())

@@ -14,10 +14,10 @@ from rich.table import Table
 
 from jobs.command_line.cli import run
 from pipeline.core.progress import results
-from pipeline.evaluation.compare import ABLATION, TABLE
+from pipeline.evaluation.compare import PUBLISHED_ABLATION, PUBLISHED_TABLE
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.settings import EvaluationSettings
-from pipeline.report.inputs import read_besides
+from pipeline.report.inputs import read_extras
 from pipeline.retrieval.parts import part_label
 
 MEASURES = {"r1": "R@1", "r5": "R@5", "r10": "R@10", "r1p": "R@1%", "ap": "AP"}
@@ -34,7 +34,7 @@ def main(settings: EvaluationSettings, published: bool = False) -> None:
     rows = evaluate(settings)
     print_table(rows)
     print_positions(rows)
-    besides = read_besides(settings.out)
+    besides = read_extras(settings.out)
     print_groups(besides["views"], "views")
     print_groups(besides["groups"], "value")
     print_groups(
@@ -71,7 +71,7 @@ def print_published(tasks: list[str]) -> None:
         table.add_column("method")
         for heading in ("pixels", "R@1", "AP"):
             table.add_column(heading, justify="right", no_wrap=True)
-        for line in (*TABLE, *ABLATION):
+        for line in (*PUBLISHED_TABLE, *PUBLISHED_ABLATION):
             if figures := line.of(task):
                 table.add_row(
                     line.method, str(line.pixels), *(f"{figure:.2f}" for figure in figures)

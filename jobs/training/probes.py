@@ -23,7 +23,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.features.table import Floats
 from pipeline.retrieval.metrics import summarise
-from pipeline.retrieval.ranking import Side, rank, side_of_array
+from pipeline.retrieval.ranking import EmbeddingSet, embedding_set_from_array, rank
 from pipeline.shards.samples import read_shard
 
 GAP_IMAGES = 256
@@ -108,9 +108,9 @@ def probe_images(stream: TrainingStream, view: View) -> Iterator[Decoded]:
     return decode_samples(chosen, reading.image_size, reading.threads, 2 * BATCH, reading.resizer)
 
 
-def embedding_set(seen: ProbeFeatures) -> Side:
+def embedding_set(seen: ProbeFeatures) -> EmbeddingSet:
     keys = np.arange(len(seen.locations)).astype(np.str_)
-    return side_of_array(keys, np.array(seen.locations, np.str_), seen.embedding_NE)
+    return embedding_set_from_array(keys, np.array(seen.locations, np.str_), seen.embedding_NE)
 
 
 def view_gap(drone_NC: Floats, satellite_NC: Floats) -> dict[str, float]:

@@ -15,13 +15,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline.core.errors import InputError
-from pipeline.retrieval.bootstrap import measures_of
+from pipeline.retrieval.bootstrap import metrics_with_intervals
 from pipeline.shards import record_table
 from pipeline.shards.manifest import read_manifest
 
 SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
-MOST_VALUES = 12  # a number with more values than a table shows well is binned
-BINS = 6
+MAX_VALUES = 12  # a number with more values than a table shows well is binned
+MAX_BINS = 6
 UNKNOWN = "unknown"
 
 
@@ -65,7 +65,7 @@ def break_down(results: pa.Table, column: str, known: dict[str, Any]) -> list[di
             if here.any():
                 rows.append(
                     {"task": task[0], "protocol": task[1], "by": column, "value": name}
-                    | measures_of(first_Q[here], ap_Q[here], locations_Q[here])
+                    | metrics_with_intervals(first_Q[here], ap_Q[here], locations_Q[here])
                 )
     return rows
 
@@ -77,7 +77,7 @@ def group_names(column: str, values: Sequence[Any]) -> tuple[npt.NDArray[np.str_
     if column == "heading_deg":
         names = [UNKNOWN if v is None else SECTORS[round((v % 360) / 45) % 8] for v in values]
         return np.array(names, np.str_), [*SECTORS, UNKNOWN]
-    if not numeric or len(set(given)) <= MOST_VALUES:
+    if not numeric or len(set(given)) <= MAX_VALUES:
         names = [
             UNKNOWN if v is None else f"{v:g}" if isinstance(v, float) else str(v) for v in values
         ]
@@ -99,10 +99,10 @@ def round_edges(low: float, high: float) -> list[float]:
     """Edges of at most BINS bins of equal, round width (1, 2 or 5 times a power of ten) that
     enclose [low, high].
     """
-    for exponent in range(int(np.floor(np.log10((high - low) / BINS))), 400):
+    for exponent in range(int(np.floor(np.log10((high - low) / MAX_BINS))), 400):
         for unit in (1, 2, 5):
             width = unit * 10.0**exponent
             first, last = int(np.floor(low / width)), int(np.ceil(high / width))
-            if last - first <= BINS:
+            if last - first <= MAX_BINS:
                 return [float(f"{i * width:.12g}") for i in range(first, last + 1)]
     raise AssertionError("unreachable: some width spans the whole range")

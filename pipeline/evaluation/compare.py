@@ -14,16 +14,16 @@ import pyarrow as pa
 
 from pipeline.core.arrays import Doubles
 from pipeline.core.errors import InputError
-from pipeline.report.inputs import Findings, task_of
-from pipeline.retrieval.bootstrap import paired
+from pipeline.report.inputs import EvaluationResults, task_key
+from pipeline.retrieval.bootstrap import paired_difference
 from pipeline.retrieval.metrics import hits_at
 
-COMPARED = ("r1", "ap")
-MAIN = ("drone->satellite", "satellite->drone")
-HEADINGS = {"drone->satellite": "UAV to satellite", "satellite->drone": "satellite to UAV"}
+COMPARED_METRICS = ("r1", "ap")
+MAIN_TASKS = ("drone->satellite", "satellite->drone")
+TASK_HEADINGS = {"drone->satellite": "UAV to satellite", "satellite->drone": "satellite to UAV"}
 
 
-def compare(runs: Sequence[Findings]) -> list[dict[str, Any]]:
+def compare(runs: Sequence[EvaluationResults]) -> list[dict[str, Any]]:
     """One row per run and task that the first run has: its measures and, of every later run, the
     differences of R@1 and AP with their 95 % intervals and p.
 
@@ -44,7 +44,7 @@ def compare(runs: Sequence[Findings]) -> list[dict[str, Any]]:
                 rows.append({"run": run.name, **own} | _differences(run, baseline, base))
     if len(rows) == len(baseline.metrics):
         found = "; ".join(
-            f"{run.name}: {', '.join(' '.join(map(str, task_of(m)[:2])) for m in run.metrics)}"
+            f"{run.name}: {', '.join(' '.join(map(str, task_key(m)[:2])) for m in run.metrics)}"
             for run in runs
         )
         raise InputError(
@@ -53,7 +53,9 @@ def compare(runs: Sequence[Findings]) -> list[dict[str, Any]]:
     return rows
 
 
-def _differences(run: Findings, baseline: Findings, base: dict[str, Any]) -> dict[str, Any]:
+def _differences(
+    run: EvaluationResults, baseline: EvaluationResults, base: dict[str, Any]
+) -> dict[str, Any]:
     ours, theirs = (_by_query(each, base) for each in (run, baseline))
     if ours["query"].to_pylist() != theirs["query"].to_pylist():
         raise InputError(
@@ -62,13 +64,13 @@ def _differences(run: Findings, baseline: Findings, base: dict[str, Any]) -> dic
         )
     locations_Q = np.asarray(theirs["location"].to_pylist(), np.str_)
     found: dict[str, Any] = {}
-    for name in COMPARED:
-        difference = paired(_values(ours, name), _values(theirs, name), locations_Q)
+    for name in COMPARED_METRICS:
+        difference = paired_difference(_values(ours, name), _values(theirs, name), locations_Q)
         found |= {f"{name}_difference_{key}": value for key, value in asdict(difference).items()}
     return found
 
 
-def _by_query(run: Findings, base: dict[str, Any]) -> pa.Table:
+def _by_query(run: EvaluationResults, base: dict[str, Any]) -> pa.Table:
     columns = ("query", "location", "first_match_rank", "ap")
     rows = [{name: row[name] for name in columns} for row in run.results_of(base)]
     return pa.Table.from_pylist(sorted(rows, key=lambda row: str(row["query"])))
@@ -102,14 +104,14 @@ def latex(rows: Sequence[dict[str, Any]], published: bool = False) -> str:
     """The three tables as LaTeX, for a document that loads booktabs."""
     parts = []
     for title, heading, lines in _tables(rows, published):
-        body = [f"  {' & '.join(_escaped(cell) for cell in line)} \\\\" for line in lines]
+        body = [f"  {' & '.join(_escape_latex(cell) for cell in line)} \\\\" for line in lines]
         parts += [
             "\\begin{table}",
             "  \\centering",
-            f"  \\caption{{{_escaped(title)}}}",
+            f"  \\caption{{{_escape_latex(title)}}}",
             f"  \\begin{{tabular}}{{l{'r' * (len(heading) - 1)}}}",
             "  \\toprule",
-            f"  {' & '.join(_escaped(cell) for cell in heading)} \\\\",
+            f"  {' & '.join(_escape_latex(cell) for cell in heading)} \\\\",
             "  \\midrule",
             *body,
             "  \\bottomrule",
@@ -134,22 +136,31 @@ def _tables(
         for task in dict.fromkeys(row["task"] for row in rows)
         if any((run, task) in singles for run in runs)
     ]
-    tasks.sort(key=lambda task: MAIN.index(task) if task in MAIN else len(MAIN))
+    tasks.sort(key=lambda task: MAIN_TASKS.index(task) if task in MAIN_TASKS else len(MAIN_TASKS))
     heading = [
         "Method",
-        *(f"{HEADINGS.get(task, task)} {measure}" for task in tasks for measure in ("R@1", "AP")),
+        *(
+            f"{TASK_HEADINGS.get(task, task)} {measure}"
+            for task in tasks
+            for measure in ("R@1", "AP")
+        ),
     ]
     lines = [
-        [run, *_figures([singles.get((run, task)) for task in tasks], ("r1", "ap"))] for run in runs
+        [run, *_percent_cells([singles.get((run, task)) for task in tasks], ("r1", "ap"))]
+        for run in runs
     ]
-    for line in (*TABLE, *ABLATION) if published else ():
+    for line in (*PUBLISHED_TABLE, *PUBLISHED_ABLATION) if published else ():
         figures = [line.of(task) or (None, None) for task in tasks]
         cells = ["-" if value is None else f"{value:.2f}" for pair in figures for value in pair]
         lines.append([f"{line.method}, {line.pixels} px (published)", *cells])
     tables = [(f"Both directions, percent, {protocols}", heading, lines)]
-    several = {row["run"]: row for row in rows if row["multi_query"] and row["task"] == MAIN[0]}
-    lines = [[run, *_figures([several[run]], ("r1", "r5", "ap"))] for run in runs if run in several]
-    for pixels, known in MULTI_QUERY.items() if published and lines else ():
+    several = {
+        row["run"]: row for row in rows if row["multi_query"] and row["task"] == MAIN_TASKS[0]
+    }
+    lines = [
+        [run, *_percent_cells([several[run]], ("r1", "r5", "ap"))] for run in runs if run in several
+    ]
+    for pixels, known in PUBLISHED_MULTI_QUERY.items() if published and lines else ():
         lines.append([f"PVDA, {pixels} px (published)", *(f"{value:.2f}" for value in known)])
     tables.append(
         (
@@ -160,7 +171,9 @@ def _tables(
     )
     heading = ["Method", "Task", "R@1", "95 % interval", "p", "AP", "95 % interval", "p"]
     lines = [
-        [row["run"], _name(row), *_changes(row)] for row in rows if "r1_difference_mean" in row
+        [row["run"], _name(row), *_difference_cells(row)]
+        for row in rows
+        if "r1_difference_mean" in row
     ]
     tables.append(
         (f"Differences to {runs[0]}, points, paired bootstrap over locations", heading, lines)
@@ -168,7 +181,7 @@ def _tables(
     return [table for table in tables if table[2]]
 
 
-def _figures(rows: Sequence[dict[str, Any] | None], measures: Sequence[str]) -> list[str]:
+def _percent_cells(rows: Sequence[dict[str, Any] | None], measures: Sequence[str]) -> list[str]:
     return [
         f"{100 * float(row[measure]):.2f}" if row else "-" for row in rows for measure in measures
     ]
@@ -176,12 +189,12 @@ def _figures(rows: Sequence[dict[str, Any] | None], measures: Sequence[str]) -> 
 
 def _name(row: dict[str, Any]) -> str:
     task = str(row["task"])
-    return HEADINGS.get(task, task) + (", multi-query" if row["multi_query"] else "")
+    return TASK_HEADINGS.get(task, task) + (", multi-query" if row["multi_query"] else "")
 
 
-def _changes(row: dict[str, Any]) -> list[str]:
+def _difference_cells(row: dict[str, Any]) -> list[str]:
     cells = []
-    for name in COMPARED:
+    for name in COMPARED_METRICS:
         mean, low, high, p = (
             row[f"{name}_difference_{part}"] for part in ("mean", "low", "high", "p")
         )
@@ -189,7 +202,7 @@ def _changes(row: dict[str, Any]) -> list[str]:
     return cells
 
 
-def _escaped(text: str) -> str:
+def _escape_latex(text: str) -> str:
     special = {
         "\\": r"\textbackslash{}",
         "->": r"$\to$",
@@ -206,7 +219,7 @@ def _escaped(text: str) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Published:
+class PublishedResult:
     """One line of the paper's tables; R@1 and AP in percent."""
 
     method: str
@@ -223,32 +236,32 @@ class Published:
         return known.get(task)
 
 
-def _line(method: str, pixels: int, *figures: float) -> Published:
+def _published(method: str, pixels: int, *figures: float) -> PublishedResult:
     a, b, c, d = figures
-    return Published(
+    return PublishedResult(
         method=method, pixels=pixels, drone_to_satellite=(a, b), satellite_to_drone=(c, d)
     )
 
 
-TABLE = (
-    _line("Instance loss", 256, 58.49, 63.31, 71.18, 58.74),
-    _line("LPN", 256, 75.93, 79.14, 86.45, 74.79),
-    _line("USAM", 256, 77.60, 80.55, 86.59, 75.96),
-    _line("PCL", 256, 79.47, 83.63, 87.69, 78.51),
-    _line("FSRA", 256, 82.25, 84.82, 87.87, 81.53),
-    _line("MSBA", 256, 82.33, 84.78, 90.58, 81.61),
-    _line("PVDA", 256, 82.73, 85.19, 92.30, 82.48),
-    _line("Instance loss", 384, 62.99, 67.69, 75.75, 62.09),
-    _line("LCM", 384, 66.65, 70.82, 79.89, 65.38),
-    _line("LPN", 384, 78.02, 80.99, 86.16, 76.56),
-    _line("PCL", 384, 81.63, 85.46, 89.73, 80.84),
-    _line("FSRA", 384, 84.82, 87.03, 87.59, 83.37),
-    _line("MSBA", 384, 86.61, 88.55, 92.15, 84.45),
-    _line("PVDA", 384, 87.34, 89.26, 93.72, 86.04),
+PUBLISHED_TABLE = (
+    _published("Instance loss", 256, 58.49, 63.31, 71.18, 58.74),
+    _published("LPN", 256, 75.93, 79.14, 86.45, 74.79),
+    _published("USAM", 256, 77.60, 80.55, 86.59, 75.96),
+    _published("PCL", 256, 79.47, 83.63, 87.69, 78.51),
+    _published("FSRA", 256, 82.25, 84.82, 87.87, 81.53),
+    _published("MSBA", 256, 82.33, 84.78, 90.58, 81.61),
+    _published("PVDA", 256, 82.73, 85.19, 92.30, 82.48),
+    _published("Instance loss", 384, 62.99, 67.69, 75.75, 62.09),
+    _published("LCM", 384, 66.65, 70.82, 79.89, 65.38),
+    _published("LPN", 384, 78.02, 80.99, 86.16, 76.56),
+    _published("PCL", 384, 81.63, 85.46, 89.73, 80.84),
+    _published("FSRA", 384, 84.82, 87.03, 87.59, 83.37),
+    _published("MSBA", 384, 86.61, 88.55, 92.15, 84.45),
+    _published("PVDA", 384, 87.34, 89.26, 93.72, 86.04),
 )
-ABLATION = (
-    _line("PVDA, constant alpha", 256, 82.00, 84.55, 91.73, 81.96),
-    _line("PVDA, no restart", 256, 81.54, 84.09, 92.30, 81.05),
+PUBLISHED_ABLATION = (
+    _published("PVDA, constant alpha", 256, 82.00, 84.55, 91.73, 81.96),
+    _published("PVDA, no restart", 256, 81.54, 84.09, 92.30, 81.05),
 )
-MULTI_QUERY = {256: (92.01, 98.00, 93.30), 384: (95.29, 98.43, 95.99)}
+PUBLISHED_MULTI_QUERY = {256: (92.01, 98.00, 93.30), 384: (95.29, 98.43, 95.99)}
 "Of PVDA, drone->satellite with a location's images as one query: R@1, R@5, AP by image size."

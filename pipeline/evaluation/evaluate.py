@@ -18,40 +18,50 @@ from pipeline.core.errors import InputError
 from pipeline.core.lock import locks_output
 from pipeline.core.progress import console, progress
 from pipeline.core.records import Split, View
-from pipeline.evaluation.extras import Besides, write_besides
+from pipeline.evaluation.extras import ExtraOutputs, write_extras
 from pipeline.evaluation.settings import EvaluationSettings
 from pipeline.features.table import FeatureTable, Floats, open_table, verify_table
 from pipeline.images.thumbnails import no_images
 from pipeline.report.inputs import (
-    Extras,
-    Findings,
-    read_besides,
+    EvaluationResults,
+    ReportContext,
+    read_evaluation,
     read_extras,
-    read_findings,
+    read_report_context,
 )
-from pipeline.report.page import render
+from pipeline.report.page import render_report
 from pipeline.retrieval.results import (
-    INPUTS,
-    METRICS,
-    RESULTS,
-    is_whole,
+    INPUTS_FILE,
+    METRICS_FILE,
+    RESULTS_FILE,
     read_inputs,
-    read_rows,
+    read_result_rows,
+    results_intact,
     write_inputs,
 )
 from pipeline.retrieval.subsets import vectors_by_key
 from pipeline.retrieval.tasks import (
     METRICS_SCHEMA,
     Task,
+    embedding_set_from_table,
     possible_tasks,
     retrieve,
-    side_of,
 )
 from pipeline.shards.manifest import read_manifest
 from pipeline.shards.samples import fetch
 from pipeline.shards.verify import require_intact
 
-SHOWN = ("title", "shards", "panels", "views", "parts", "by", "exports", "figures", "answer_order")
+OUTPUT_SETTINGS = (
+    "title",
+    "shards",
+    "panels",
+    "views",
+    "parts",
+    "by",
+    "exports",
+    "figures",
+    "answer_order",
+)
 "Settings that change what is written besides the ranking."
 
 
@@ -63,7 +73,7 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
     Raises InputError when the tables do not go together or allow no task, or when the folder holds
     something else.
     """
-    queries, gallery, tasks = plan(settings)
+    queries, gallery, tasks = plan_tasks(settings)
     ranked = {
         "fingerprint": queries.fingerprint, "queries": queries.digest, "gallery": gallery.digest,
         "protocol": settings.protocol, "tasks": [str(task) for task in tasks],
@@ -74,9 +84,11 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
         read_manifest(
             settings.shards
         )  # that there are none is better said before the ranking than after it
-    extras = read_extras(settings.title, settings.run, settings.beside)
-    shown = {name: _plain(getattr(settings, name)) for name in SHOWN} | {"extras": extras.sha256}
-    earlier = _earlier(settings.out)
+    extras = read_report_context(settings.title, settings.run, settings.beside)
+    shown = {name: _as_json(getattr(settings, name)) for name in OUTPUT_SETTINGS} | {
+        "extras": extras.sha256
+    }
+    earlier = _read_earlier_inputs(settings.out)
     if earlier and earlier["ranked"] != ranked:
         different = ", ".join(
             name for name, value in ranked.items() if earlier["ranked"].get(name) != value
@@ -85,7 +97,7 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
             f"{settings.out} holds an evaluation of something else (different {different}); expected the same or an "
             "empty folder; choose another --out"
         )
-    if earlier and not is_whole(settings.out, earlier):
+    if earlier and not results_intact(settings.out, earlier):
         console.print(
             f"{settings.out}: a file is missing or damaged; evaluating again", style="yellow"
         )
@@ -97,22 +109,22 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
     elif earlier:
         # Until all is written anew it is of nothing that could be asked for, and says of no file
         # what is in it.
-        results = read_findings(settings.out).results
+        results = read_evaluation(settings.out).results
         json_files.write_checksummed(
-            storage.join(settings.out, INPUTS), {"ranked": ranked, "shown": {}}
+            storage.join(settings.out, INPUTS_FILE), {"ranked": ranked, "shown": {}}
         )
         _write_besides(settings, queries, gallery, tasks, results)
-        _write_report(settings, queries, gallery, read_findings(settings.out), extras)
+        _write_report(settings, queries, gallery, read_evaluation(settings.out), extras)
         write_inputs(settings.out, {"ranked": ranked, "shown": shown})
         console.print(
             f"{settings.out}: ranked before; wrote report.html and what goes with it anew"
         )
     else:
         _evaluate(settings, queries, gallery, tasks, {"ranked": ranked, "shown": shown}, extras)
-    return read_rows(settings.out, METRICS)
+    return read_result_rows(settings.out, METRICS_FILE)
 
 
-def plan(settings: EvaluationSettings) -> tuple[FeatureTable, FeatureTable, list[Task]]:
+def plan_tasks(settings: EvaluationSettings) -> tuple[FeatureTable, FeatureTable, list[Task]]:
     """The two tables and the tasks they are to be evaluated on.
 
     Raises InputError when they come from different networks, allow no task, or more than the one
@@ -134,7 +146,7 @@ def plan(settings: EvaluationSettings) -> tuple[FeatureTable, FeatureTable, list
     ]
     if not possible:
         raise InputError(
-            f"found {_held(queries, Split.QUERY)} and {_held(gallery, Split.GALLERY)}; expected query rows of one view and "
+            f"found {_describe_rows(queries, Split.QUERY)} and {_describe_rows(gallery, Split.GALLERY)}; expected query rows of one view and "
             "gallery rows of another; embed both splits, or name other views with --query-view and --gallery-view"
         )
     if settings.table:
@@ -151,11 +163,11 @@ def plan(settings: EvaluationSettings) -> tuple[FeatureTable, FeatureTable, list
 
 def _evaluate(
     settings: EvaluationSettings, queries: FeatureTable, gallery: FeatureTable, tasks: list[Task],
-    inputs: dict[str, Any], extras: Extras,
+    inputs: dict[str, Any], extras: ReportContext,
 ) -> None:  # fmt: skip
     begin = time.monotonic()
-    if storage.exists(storage.join(settings.out, INPUTS)):
-        storage.remove(storage.join(settings.out, INPUTS))  # of a run that was not finished
+    if storage.exists(storage.join(settings.out, INPUTS_FILE)):
+        storage.remove(storage.join(settings.out, INPUTS_FILE))  # of a run that was not finished
     found, spent = [], {}
     for task in tasks:
         started = time.monotonic()
@@ -176,7 +188,7 @@ def _evaluate(
         pa.concat_tables([each.queries for each in found]),
     )
     for name, table in (
-        (RESULTS, results),
+        (RESULTS_FILE, results),
         ("metrics.parquet", pa.Table.from_pylist(rows, METRICS_SCHEMA)),
     ):
         parquet.write_table(storage.join(settings.out, name), table)
@@ -184,17 +196,17 @@ def _evaluate(
     _write_besides(settings, queries, gallery, tasks, results)
     spent["views, groups and exports"] = time.monotonic() - started
     started = time.monotonic()
-    findings = Findings(
-        name=settings.title, metrics=rows, results=results, **read_besides(settings.out)
+    findings = EvaluationResults(
+        name=settings.title, metrics=rows, results=results, **read_extras(settings.out)
     )
     _write_report(settings, queries, gallery, findings, extras)
     spent["report"] = time.monotonic() - started
     metrics = storage.encode_json(rows)
     write_inputs(settings.out, inputs, metrics)
-    storage.write_bytes(storage.join(settings.out, METRICS), metrics)
+    storage.write_bytes(storage.join(settings.out, METRICS_FILE), metrics)
     parts = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in spent.items())
     console.print(
-        f"{storage.join(settings.out, METRICS)}: {time.monotonic() - begin:.1f} s ({parts})"
+        f"{storage.join(settings.out, METRICS_FILE)}: {time.monotonic() - begin:.1f} s ({parts})"
     )
 
 
@@ -205,8 +217,8 @@ def _write_besides(
     tasks: list[Task],
     results: pa.Table,
 ) -> None:
-    write_besides(
-        Besides(
+    write_extras(
+        ExtraOutputs(
             out=settings.out,
             protocol=settings.protocol,
             workers=settings.workers,
@@ -228,14 +240,17 @@ def _write_report(
     settings: EvaluationSettings,
     queries: FeatureTable,
     gallery: FeatureTable,
-    findings: Findings,
-    extras: Extras,
+    findings: EvaluationResults,
+    extras: ReportContext,
 ) -> None:
     shards = settings.shards
 
     def vectors(keys: Iterable[str]) -> dict[str, Floats]:
         wanted = set(keys)
-        sides = side_of(queries.select(Split.QUERY)), side_of(gallery.select(Split.GALLERY))
+        sides = (
+            embedding_set_from_table(queries.select(Split.QUERY)),
+            embedding_set_from_table(gallery.select(Split.GALLERY)),
+        )
         return {
             key: vector_D
             for side in sides
@@ -243,7 +258,7 @@ def _write_report(
         }
 
     pictures = (lambda keys: fetch(shards, keys)) if shards else no_images
-    page = render(findings, extras, pictures, vectors, settings.panels)
+    page = render_report(findings, extras, pictures, vectors, settings.panels)
     storage.write_bytes(storage.join(settings.out, "report.html"), page.encode())
     if settings.figures:
         from pipeline.report.figures import (
@@ -253,22 +268,22 @@ def _write_report(
         write_figures(findings, pictures, storage.join(settings.out, "figures"), settings.figures)
 
 
-def _plain(value: Any) -> Any:
+def _as_json(value: Any) -> Any:
     """A setting as JSON gives it back."""
     return list(value) if isinstance(value, tuple) else value
 
 
-def _earlier(out: str) -> dict[str, Any] | None:
-    if not storage.exists(storage.join(out, METRICS)):
+def _read_earlier_inputs(out: str) -> dict[str, Any] | None:
+    if not storage.exists(storage.join(out, METRICS_FILE)):
         return None
     said = read_inputs(out)
     if said is None:
         raise InputError(
-            f"{out} holds a {METRICS} without {INPUTS}; expected an evaluation's folder; choose another --out or delete {out}"
+            f"{out} holds a {METRICS_FILE} without {INPUTS_FILE}; expected an evaluation's folder; choose another --out or delete {out}"
         )
     return said
 
 
-def _held(table: FeatureTable, split: Split) -> str:
+def _describe_rows(table: FeatureTable, split: Split) -> str:
     views = [str(view) for (held, view), count in table.counts.items() if held == split and count]
     return f"{split} rows of {' and '.join(sorted(views)) or 'no view'} in {table.path}"

@@ -21,10 +21,10 @@ from pipeline.features.table import FeatureTable
 from pipeline.shards import record_table
 from pipeline.shards.manifest import read_manifest
 
-MAT_LIMIT = 2**32 - 1  # bytes of one array in a MATLAB 5 file
+MAX_MAT_BYTES = 2**32 - 1  # bytes of one array in a MATLAB 5 file
 
 
-def file_names(shards: str) -> dict[str, str]:
+def source_file_names(shards: str) -> dict[str, str]:
     """The name of the file that each key was made from, without its folder."""
     names: dict[str, str] = {}
     for shard in read_manifest(shards).shards:
@@ -95,9 +95,9 @@ def mat_bytes(
     content: dict[str, Any] = {}
     for name, table in sides.items():
         size = table.rows * table.dimension * 4
-        if size > MAT_LIMIT:
+        if size > MAX_MAT_BYTES:
             raise InputError(
-                f"the {name} features take {size:,} bytes; expected at most {MAT_LIMIT:,}, all that an array of a .mat file "
+                f"the {name} features take {size:,} bytes; expected at most {MAX_MAT_BYTES:,}, all that an array of a .mat file "
                 "can hold; leave the export out and read the Parquet table"
             )
         known, folder = labels[name], f"{name}_{'-'.join(table.views)}"
@@ -112,7 +112,7 @@ def mat_bytes(
     return stream.getvalue()
 
 
-def read_order(path: str) -> list[str]:
+def read_answer_order(path: str) -> list[str]:
     """The lines of a challenge's list of query names, without folders.
 
     Raises InputError when there is no such file.

@@ -18,19 +18,19 @@ from pipeline.core import storage
 from pipeline.core.progress import progress
 from pipeline.core.records import View
 from pipeline.evaluation import breakdowns, exports
-from pipeline.evaluation.settings import Export
+from pipeline.evaluation.settings import ExportFormat
 from pipeline.features.table import FeatureTable
 from pipeline.retrieval import view_gap
 from pipeline.retrieval.metrics import Protocol
 from pipeline.retrieval.parts import measure_parts
-from pipeline.retrieval.results import GAP, GROUPS, PARTS, VIEWS
-from pipeline.retrieval.subsets import taken
-from pipeline.retrieval.tasks import Task, sides_of
-from pipeline.retrieval.views import view_curve
+from pipeline.retrieval.results import GAP_FILE, GROUPS_FILE, PARTS_FILE, VIEWS_FILE
+from pipeline.retrieval.subsets import take_rows
+from pipeline.retrieval.tasks import Task, task_embedding_sets
+from pipeline.retrieval.views import measure_views
 
 
 @dataclass(frozen=True, kw_only=True)
-class Besides:
+class ExtraOutputs:
     """What to write; each field as in evaluation.EvaluationSettings."""
 
     out: str
@@ -39,13 +39,13 @@ class Besides:
     views: bool
     parts: bool
     by: tuple[str, ...]
-    exports: tuple[Export, ...]
+    exports: tuple[ExportFormat, ...]
     shards: str | None
     answer_order: str | None
 
 
-def write_besides(
-    wanted: Besides,
+def write_extras(
+    wanted: ExtraOutputs,
     queries: FeatureTable,
     gallery: FeatureTable,
     tasks: list[Task],
@@ -63,18 +63,18 @@ def write_besides(
     ]
     if wanted.views and several:
         with progress(None, "by number of views", "scores") as meter:
-            curve = view_curve(
+            curve = measure_views(
                 several[0], queries, gallery, wanted.protocol, wanted.workers, meter.advance
             )
         if curve:
-            storage.write_json(storage.join(wanted.out, VIEWS), curve)
+            storage.write_json(storage.join(wanted.out, VIEWS_FILE), curve)
     if wanted.by and wanted.shards:
         groups: list[dict[str, Any]] = []
         for column in wanted.by:
             groups += breakdowns.break_down(
                 results, column, breakdowns.read_column(wanted.shards, column)
             )
-        storage.write_json(storage.join(wanted.out, GROUPS), groups)
+        storage.write_json(storage.join(wanted.out, GROUPS_FILE), groups)
     if wanted.parts:
         with progress(None, "by part of the embedding", "scores") as meter:
             parts = [
@@ -85,9 +85,9 @@ def write_besides(
                 )
             ]
         if parts:
-            storage.write_json(storage.join(wanted.out, PARTS), parts)
+            storage.write_json(storage.join(wanted.out, PARTS_FILE), parts)
     if gaps := _gaps(single, queries, gallery):
-        storage.write_json(storage.join(wanted.out, GAP), gaps)
+        storage.write_json(storage.join(wanted.out, GAP_FILE), gaps)
     for task in single:
         _export(
             wanted,
@@ -108,16 +108,16 @@ def _gaps(tasks: list[Task], queries: FeatureTable, gallery: FeatureTable) -> li
         views = frozenset((task.query_view, task.gallery_view))
         if views in gaps:
             continue
-        sides = sides_of(task, queries, gallery, "full")
-        rows = view_gap.choose(sides[0].locations, sides[1].locations)
-        asked, given = (taken(side, rows_N) for side, rows_N in zip(sides, rows, strict=True))
+        sides = task_embedding_sets(task, queries, gallery, "full")
+        rows = view_gap.choose_common_rows(sides[0].locations, sides[1].locations)
+        asked, given = (take_rows(side, rows_N) for side, rows_N in zip(sides, rows, strict=True))
         if len(np.unique(asked.locations_N)) > 1:
-            gaps[views] = {"task": task.name} | view_gap.describe(asked, given)
+            gaps[views] = {"task": task.name} | view_gap.describe_gap(asked, given)
     return list(gaps.values())
 
 
 def _export(
-    wanted: Besides,
+    wanted: ExtraOutputs,
     task: Task,
     ending: str,
     queries: FeatureTable,
@@ -129,7 +129,7 @@ def _export(
         storage.write_bytes(storage.join(wanted.out, f"pytorch_result{ending}.mat"), data)
     if "answer" in wanted.exports:
         mask = pc.and_(pc.equal(results["task"], task.name), pc.invert(results["multi_query"]))
-        names = exports.file_names(wanted.shards) if wanted.shards else None
-        order = exports.read_order(wanted.answer_order) if wanted.answer_order else None
+        names = exports.source_file_names(wanted.shards) if wanted.shards else None
+        order = exports.read_answer_order(wanted.answer_order) if wanted.answer_order else None
         text = exports.answer_text(results.filter(mask).to_pylist(), names, order)
         storage.write_bytes(storage.join(wanted.out, f"answer{ending}.txt"), text.encode())

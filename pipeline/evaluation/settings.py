@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pipeline.core.errors import InputError
-from pipeline.report.options import PANELS, Format
+from pipeline.report.options import DEFAULT_PANELS, FigureFormat
 from pipeline.retrieval.metrics import Protocol
 
 ViewName = Literal["drone", "satellite", "street", "google"]
-Export = Literal["answer", "mat"]
+ExportFormat = Literal["answer", "mat"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +43,7 @@ class EvaluationSettings:
     network's."""
     title: str = "Retrieval evaluation"
     "Headline of the report."
-    panels: int = PANELS
+    panels: int = DEFAULT_PANELS
     """Hits, and as many misses, that the report shows of each task; a few are open, the others
     unfold."""
     workers: int = 0
@@ -59,9 +59,9 @@ class EvaluationSettings:
     by: tuple[str, ...] = ()
     """Columns of the shards' records to break the measures down by, such as altitude_m or
     heading_deg; with --shards."""
-    exports: tuple[Export, ...] = ()
+    exports: tuple[ExportFormat, ...] = ()
     "answer: the challenge's answer.txt. mat: the features as pytorch_result.mat."
-    figures: tuple[Format, ...] = ()
+    figures: tuple[FigureFormat, ...] = ()
     "Formats, png or pdf, in which to write figures for a paper, into the folder figures/."
     answer_order: str | None = None
     """Text file with the queries' file names in the challenge's order, one a line; with --exports
@@ -93,7 +93,7 @@ class EvaluationSettings:
             )
         if self.panels < 0:
             raise InputError(
-                f"--panels is {self.panels}, expected 0 or more; leave it out for {PANELS}"
+                f"--panels is {self.panels}, expected 0 or more; leave it out for {DEFAULT_PANELS}"
             )
         if self.workers < 0:
             raise InputError(

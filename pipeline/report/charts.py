@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report.inputs import Findings
+from pipeline.report.inputs import EvaluationResults
 from pipeline.report.svg import Chart, Frame, Tick, nice_ticks
 
-BINS = 24
+SCORE_BINS = 24
 
 
 def views_chart(title: str, rows: Sequence[Mapping[str, Any]]) -> Chart | None:
@@ -56,7 +56,7 @@ def scores_chart(title: str, rows: Sequence[Mapping[str, Any]]) -> Chart | None:
         return None
     low, high = min(*right, *wrong), max(*right, *wrong)
     x_ticks = nice_ticks(low, high)
-    edges = np.linspace(x_ticks[0], x_ticks[-1], BINS + 1)
+    edges = np.linspace(x_ticks[0], x_ticks[-1], SCORE_BINS + 1)
     shares = {
         name: np.histogram(scores, edges)[0] / len(scores)
         for name, scores in (("wrong", wrong), ("right", right))
@@ -115,7 +115,7 @@ class Scatter:
     "What, its value, and what it means."
 
 
-def scatter(gap: Mapping[str, Any], beside: Findings | None = None) -> Scatter:
+def scatter(gap: Mapping[str, Any], beside: EvaluationResults | None = None) -> Scatter:
     """One row of view_gap.json; its figures with those of another evaluation, where that has them.
     Both axes have one scale, as distances in the embedding have."""
     query_view, gallery_view = gap["task"].split("->")

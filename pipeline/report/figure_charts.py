@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.report import map_sheet
-from pipeline.report.charts import BINS, best_scores
+from pipeline.report.charts import SCORE_BINS, best_scores
 from pipeline.report.error_map import ErrorMap
 from pipeline.report.svg import CURVE_POINTS
 from pipeline.report.tasks import TaskView, first_ranks
@@ -40,7 +40,7 @@ def scores_figure(tasks: Sequence[TaskView]) -> Figure:
     figure, sheets = _sheet(len(tasks))
     for axes, task in zip(sheets, tasks, strict=True):
         both = best_scores(task.rows)
-        edges = np.histogram_bin_edges(np.concatenate(both), BINS).tolist()
+        edges = np.histogram_bin_edges(np.concatenate(both), SCORE_BINS).tolist()
         for scores, name, (colour, dashes) in zip(both, ("true", "wrong"), STYLES, strict=False):
             if scores:
                 weights = np.full(len(scores), 100 / len(scores))
@@ -144,7 +144,7 @@ def gap_figure(gap: Row) -> Figure:
 
 def map_figure(drawn: ErrorMap) -> Figure:
     """The page's map of errors."""
-    figure, [axes] = _sheet(1, COLUMN * map_sheet.HEIGHT / map_sheet.WIDTH)
+    figure, [axes] = _sheet(1, COLUMN * map_sheet.MAP_HEIGHT / map_sheet.MAP_WIDTH)
     for x1, y1, x2, y2, _ in drawn.lines:
         axes.plot([x1, x2], [y1, y2], color=RED, linewidth=0.4, alpha=drawn.opacity, zorder=1)
         axes.plot(x2, y2, "o", color=RED, markersize=1.2, zorder=1)
@@ -161,19 +161,22 @@ def map_figure(drawn: ErrorMap) -> Figure:
             [p.x for p in places], [p.y for p in places], "o", markersize=3, label=name, **look
         )
     length, text = drawn.bar
-    left, bottom = map_sheet.MARGIN, map_sheet.HEIGHT - 6
+    left, bottom = map_sheet.MAP_MARGIN, map_sheet.MAP_HEIGHT - 6
     axes.plot([left, left + length], [bottom, bottom], color="black", linewidth=1)
     axes.text(left + length + 6, bottom, text, va="center")
     axes.annotate(
         "N",
-        (map_sheet.WIDTH - 16, map_sheet.HEIGHT - 30),
-        (map_sheet.WIDTH - 16, map_sheet.HEIGHT - 4),
+        (map_sheet.MAP_WIDTH - 16, map_sheet.MAP_HEIGHT - 30),
+        (map_sheet.MAP_WIDTH - 16, map_sheet.MAP_HEIGHT - 4),
         ha="center",
         va="center",
         arrowprops={"arrowstyle": "->", "linewidth": 0.8},
     )
     axes.set(
-        xlim=(0, map_sheet.WIDTH), ylim=(map_sheet.HEIGHT, 0), aspect="equal", title=drawn.title
+        xlim=(0, map_sheet.MAP_WIDTH),
+        ylim=(map_sheet.MAP_HEIGHT, 0),
+        aspect="equal",
+        title=drawn.title,
     )
     axes.set_axis_off()
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0), ncols=2)

@@ -20,10 +20,10 @@ from pipeline.images.decode import DecodeError, decode
 from pipeline.images.thumbnails import ImageLoader
 from pipeline.report import figure_charts
 from pipeline.report.error_map import error_map
-from pipeline.report.inputs import Extras, Findings
-from pipeline.report.options import Format
-from pipeline.report.panels import ANSWERS, is_hit
-from pipeline.report.tasks import Choice, choose, task_view
+from pipeline.report.inputs import EvaluationResults, ReportContext
+from pipeline.report.options import FigureFormat
+from pipeline.report.panels import MAX_ANSWERS, is_hit
+from pipeline.report.tasks import PanelChoice, choose_panels, task_view
 from pipeline.retrieval.parts import part_label
 
 ROWS = 3  # hits, misses and places of a figure with pictures: what fits a page beside its caption
@@ -48,14 +48,20 @@ NO_DATES = {"png": {"Software": None}, "pdf": {"CreationDate": None}}
 
 
 def write_figures(
-    findings: Findings, pictures: ImageLoader, folder: str, formats: tuple[Format, ...]
+    findings: EvaluationResults,
+    pictures: ImageLoader,
+    folder: str,
+    formats: tuple[FigureFormat, ...],
 ) -> list[str]:
     """Write every figure that the evaluation has data for into `folder`; returns their names
     without endings.
 
     Without pictures at hand there are no figures of hits and misses.
     """
-    tasks = [task_view(row, findings.results_of(row), Extras(title="")) for row in findings.metrics]
+    tasks = [
+        task_view(row, findings.results_of(row), ReportContext(title=""))
+        for row in findings.metrics
+    ]
     single = [task for task in tasks if not task.row["multi_query"]]
     makers: dict[str, Callable[[], Figure]] = {
         "recall": partial(figure_charts.recall_figure, tasks)
@@ -84,7 +90,7 @@ def write_figures(
     for task in single:
         if drawn := error_map(task.name, task.rows):
             makers[f"map-{task.anchor}"] = partial(figure_charts.map_figure, drawn)
-    choices = choose(tasks, ROWS)
+    choices = choose_panels(tasks, ROWS)
     images = pictures(sorted(set[str]().union(*(choice.keys for choice in choices))))
     for choice in choices if images else ():
         name = choice.task.anchor
@@ -100,7 +106,7 @@ def write_figures(
     return list(makers)
 
 
-def _saved(figure: Figure, kind: Format) -> bytes:
+def _saved(figure: Figure, kind: FigureFormat) -> bytes:
     stream = io.BytesIO()
     figure.savefig(
         stream, format=kind, bbox_inches="tight", pad_inches=0.03, metadata=NO_DATES[kind]
@@ -119,24 +125,24 @@ Images = Mapping[str, bytes]
 RIGHT, WRONG = "#16803c", "#c8322b"
 
 
-def panels_figure(choice: Choice, images: Images) -> Figure:
+def panels_figure(choice: PanelChoice, images: Images) -> Figure:
     """A query a row with its best answers, framed green where right and red where wrong: hits, then
     misses.
     """
     rows = [*choice.hits, *choice.misses]
-    figure, cells = _sheet(max(len(rows), 1), 1 + ANSWERS)
+    figure, cells = _sheet(max(len(rows), 1), 1 + MAX_ANSWERS)
     for line, row in zip(cells, rows, strict=False):
         _picture(line[0], _image(images.get(row["query"])), "hit" if is_hit(row) else "miss")
         _answers(line[1:], row, images)
     return figure
 
 
-def pairs_figure(choice: Choice, images: Images) -> Figure:
+def pairs_figure(choice: PanelChoice, images: Images) -> Figure:
     """A place a row: one image and its best answers on the left, all images and theirs on the
     right.
     """
     pairs = choice.pairs.shown
-    half = 1 + ANSWERS
+    half = 1 + MAX_ANSWERS
     figure, cells = _sheet(len(pairs), 2 * half + 1, [1.0] * half + [GAP] + [1.0] * half)
     for line, pair in zip(cells, pairs, strict=True):
         _picture(line[0], _image(images.get(pair.single["query"])), "one image")

@@ -14,13 +14,21 @@ import pyarrow.compute as pc
 from pipeline.core import parquet, storage
 from pipeline.core.errors import InputError
 from pipeline.features.table import Floats
-from pipeline.retrieval.results import GAP, GROUPS, METRICS, PARTS, RESULTS, VIEWS, read_rows
+from pipeline.retrieval.results import (
+    GAP_FILE,
+    GROUPS_FILE,
+    METRICS_FILE,
+    PARTS_FILE,
+    RESULTS_FILE,
+    VIEWS_FILE,
+    read_result_rows,
+)
 
-Vectors = Callable[[Iterable[str]], dict[str, Floats]]
+VectorLoader = Callable[[Iterable[str]], dict[str, Floats]]
 "Embeddings (D,) by key; keys that are not known are absent."
-COLUMNS = frozenset({"query", "task", "protocol", "multi_query", "first_match_rank", "ap"})
+REQUIRED_COLUMNS = frozenset({"query", "task", "protocol", "multi_query", "first_match_rank", "ap"})
 "Columns of a result that are always there."
-BESIDES = {"views": VIEWS, "groups": GROUPS, "parts": PARTS, "gaps": GAP}
+EXTRA_FILES = {"views": VIEWS_FILE, "groups": GROUPS_FILE, "parts": PARTS_FILE, "gaps": GAP_FILE}
 
 
 def no_vectors(keys: Iterable[str]) -> dict[str, Floats]:
@@ -28,7 +36,7 @@ def no_vectors(keys: Iterable[str]) -> dict[str, Floats]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Findings:
+class EvaluationResults:
     """One evaluation."""
 
     name: str
@@ -52,7 +60,7 @@ class Findings:
         figures survives.
         """
         for own in self.metrics:
-            if task_of(own) == task_of(row):
+            if task_key(own) == task_key(row):
                 if (own["queries"], own["gallery"]) != (row["queries"], row["gallery"]):
                     raise InputError(
                         f"{self.name} ranked {own['queries']} queries in {own['gallery']} rows for {own['task']}, this "
@@ -71,20 +79,20 @@ class Findings:
         return rows
 
 
-def task_of(row: dict[str, Any]) -> tuple[str, str, bool]:
+def task_key(row: dict[str, Any]) -> tuple[str, str, bool]:
     return row["task"], row["protocol"], row["multi_query"]
 
 
-def read_findings(folder: str) -> Findings:
+def read_evaluation(folder: str) -> EvaluationResults:
     """A finished evaluation.
 
     Raises InputError when there is none.
     """
-    if not storage.exists(storage.join(folder, METRICS)):
+    if not storage.exists(storage.join(folder, METRICS_FILE)):
         raise InputError(
             f"no finished evaluation at {folder}: found no metrics.json; make one with jobs/evaluate.py"
         )
-    path = storage.join(folder, RESULTS)
+    path = storage.join(folder, RESULTS_FILE)
     try:
         results = parquet.read_table(path)
     except parquet.DAMAGE_ERRORS as error:
@@ -92,17 +100,19 @@ def read_findings(folder: str) -> Findings:
             f"{path} cannot be read ({error}), expected the rows of a finished evaluation; delete {folder} and evaluate again "
             "with jobs/evaluate.py"
         ) from None
-    metrics = read_rows(folder, METRICS)
-    if not set(results.column_names) >= COLUMNS or not all(_is_measured(row) for row in metrics):
+    metrics = read_result_rows(folder, METRICS_FILE)
+    if not set(results.column_names) >= REQUIRED_COLUMNS or not all(
+        _is_measured(row) for row in metrics
+    ):
         raise InputError(
             f"the evaluation at {folder} holds rows or columns that jobs/evaluate.py does not write; delete {folder} and "
             "evaluate again with jobs/evaluate.py"
         )
-    return Findings(
+    return EvaluationResults(
         name=folder.rstrip("/").rsplit("/", 1)[-1],
         metrics=metrics,
         results=results,
-        **read_besides(folder),
+        **read_extras(folder),
     )
 
 
@@ -116,21 +126,21 @@ def _is_measured(row: dict[str, Any]) -> bool:
     )
 
 
-def read_besides(folder: str) -> dict[str, tuple[dict[str, Any], ...]]:
+def read_extras(folder: str) -> dict[str, tuple[dict[str, Any], ...]]:
     """What an evaluation holds besides its measures, by the names of Findings' fields; empty where
     it was not taken.
 
     Raises InputError where a file is not what was written.
     """
-    return {name: tuple(read_rows(folder, file)) for name, file in BESIDES.items()}
+    return {name: tuple(read_result_rows(folder, file)) for name, file in EXTRA_FILES.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Extras:
+class ReportContext:
     """What the report shows besides the evaluation itself."""
 
     title: str
-    beside: Findings | None = None
+    beside: EvaluationResults | None = None
     training: tuple[dict[str, Any], ...] = ()
     "Rows of the run's metrics.jsonl, one per epoch."
 
@@ -144,14 +154,14 @@ class Extras:
         return hashlib.sha256(json.dumps([self.title, beside, self.training]).encode()).hexdigest()
 
 
-def read_extras(title: str, run: str | None, beside: str | None) -> Extras:
+def read_report_context(title: str, run: str | None, beside: str | None) -> ReportContext:
     """Read what was named.
 
     Raises InputError when a folder does not hold what it should.
     """
-    return Extras(
+    return ReportContext(
         title=title,
-        beside=read_findings(beside) if beside else None,
+        beside=read_evaluation(beside) if beside else None,
         training=tuple(read_training(run)) if run else (),
     )
 

@@ -13,14 +13,14 @@ from pipeline.core.arrays import Doubles
 from pipeline.core.geo import EARTH_RADIUS_M
 from pipeline.report.svg import Tick, nice_ticks
 
-WIDTH, HEIGHT, MARGIN = 520, 360, 22
-SMALLEST_M = 100.0  # across: a single place gets a map too
-GRID_FROM_M = 50_000.0  # meridians and parallels mean something from here on
+MAP_WIDTH, MAP_HEIGHT, MAP_MARGIN = 520, 360, 22
+MIN_SPAN_M = 100.0  # across: a single place gets a map too
+GRID_MIN_SPAN_M = 50_000.0  # meridians and parallels mean something from here on
 METRES_PER_DEGREE = EARTH_RADIUS_M * math.pi / 180
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sheet:
+class MapSheet:
     """From positions to the map's coordinates."""
 
     south: float
@@ -33,7 +33,7 @@ class Sheet:
     "Map units per metre, at the middle latitude."
 
     @classmethod
-    def around(cls, at_N2: Doubles) -> "Sheet":
+    def around(cls, at_N2: Doubles) -> "MapSheet":
         """A map that holds these positions (latitude, longitude)."""
         south, north = float(at_N2[:, 0].min()), float(at_N2[:, 0].max())
         meridians = np.unique(at_N2[:, 1] % 360)
@@ -45,8 +45,8 @@ class Sheet:
         shrink = math.cos(math.radians((south + north) / 2))
         tall_m, wide_m = ((north - south) * METRES_PER_DEGREE, wide * METRES_PER_DEGREE * shrink)
         scale = min(
-            (WIDTH - 2 * MARGIN) / max(wide_m, SMALLEST_M),
-            (HEIGHT - 2 * MARGIN) / max(tall_m, SMALLEST_M),
+            (MAP_WIDTH - 2 * MAP_MARGIN) / max(wide_m, MIN_SPAN_M),
+            (MAP_HEIGHT - 2 * MAP_MARGIN) / max(tall_m, MIN_SPAN_M),
         )
         return cls(south=south, north=north, west=west, wide=wide, scale=scale)
 
@@ -60,12 +60,14 @@ class Sheet:
             east - 360 if east > (360 + self.wide) / 2 else east
         )  # rounding may put the first meridian behind the last
         return round(
-            WIDTH / 2 + (east - self.wide / 2) * METRES_PER_DEGREE * self._shrink * self.scale, 1
+            MAP_WIDTH / 2 + (east - self.wide / 2) * METRES_PER_DEGREE * self._shrink * self.scale,
+            1,
         )
 
     def y(self, lat: float) -> float:
         return round(
-            HEIGHT / 2 - (lat - (self.south + self.north) / 2) * METRES_PER_DEGREE * self.scale, 1
+            MAP_HEIGHT / 2 - (lat - (self.south + self.north) / 2) * METRES_PER_DEGREE * self.scale,
+            1,
         )
 
     def xy(self, at_N2: Doubles) -> list[tuple[float, float]]:
@@ -73,10 +75,10 @@ class Sheet:
 
     def bar(self) -> tuple[float, str]:
         """The longest round distance that takes at most a third of the map."""
-        most = WIDTH / 3 / self.scale
+        most = MAP_WIDTH / 3 / self.scale
         unit = 10.0 ** math.floor(math.log10(most))
         length = max(step * unit for step in (1, 2, 5) if step * unit <= most)
-        return round(length * self.scale, 1), metres(length)
+        return round(length * self.scale, 1), format_metres(length)
 
     def meridians(self) -> tuple[Tick, ...]:
         """Round longitudes across a map of a country or more."""
@@ -92,14 +94,14 @@ class Sheet:
         return tuple(Tick(at=self.y(lat), label=_degrees(lat, "NS")) for lat in inside)
 
     def _wants_grid(self) -> bool:
-        return WIDTH / self.scale >= GRID_FROM_M
+        return MAP_WIDTH / self.scale >= GRID_MIN_SPAN_M
 
 
 def _degrees(value: float, letters: str) -> str:
     return f"{abs(value):g}°" + (f" {letters[value < 0]}" if value else "")
 
 
-def metres(value: float) -> str:
+def format_metres(value: float) -> str:
     """As people say it: 12 m, 1.2 km, 3,400 km."""
     if value < 999.5:
         return f"{value:.0f} m"

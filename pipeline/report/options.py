@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-Format = Literal["png", "pdf"]
+FigureFormat = Literal["png", "pdf"]
 "Of the figures for a paper."
-PANELS = 4
+DEFAULT_PANELS = 4
 "Hits, and as many misses, that the report shows of each task."

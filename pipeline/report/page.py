@@ -17,29 +17,29 @@ from pipeline.images.thumbnails import ImageLoader, ThumbnailCache
 from pipeline.report import charts, map_sheet, svg
 from pipeline.report.charts import scatter, scores_chart, views_chart
 from pipeline.report.error_map import distance_chart, error_map
-from pipeline.report.inputs import Extras, Findings, Vectors, no_vectors
-from pipeline.report.options import PANELS
+from pipeline.report.inputs import EvaluationResults, ReportContext, VectorLoader, no_vectors
+from pipeline.report.options import DEFAULT_PANELS
 from pipeline.report.panels import make_panel
 from pipeline.report.tables import group_tables, part_tables
-from pipeline.report.tasks import MEASURES, Choice, choose, task_view
-from pipeline.retrieval.subsets import evenly
+from pipeline.report.tasks import METRIC_LABELS, PanelChoice, choose_panels, task_view
+from pipeline.retrieval.subsets import evenly_spaced
 
-PROTOCOLS = {
+PROTOCOL_TEXTS = {
     "full": "the official protocol: the whole gallery is ranked, with its distractors",
     "queried-only": "the reduced protocol: gallery images of places that are not queried are left out, so its figures do "
     "not compare with those of the official one",
 }
-OPENED = (
+OPEN_PANELS = (
     6  # panels of a kind that are open from the start, spread over all of them; the others unfold
 )
 
 
-def render(
-    findings: Findings,
-    extras: Extras,
+def render_report(
+    findings: EvaluationResults,
+    extras: ReportContext,
     pictures: ImageLoader,
-    vectors: Vectors = no_vectors,
-    panels: int = PANELS,
+    vectors: VectorLoader = no_vectors,
+    panels: int = DEFAULT_PANELS,
 ) -> str:
     """The page, with at most `panels` hits and as many misses of each task, and as many places
     asked for in both ways.
@@ -50,10 +50,12 @@ def render(
     environment.filters |= {
         "percent": lambda value: f"{100 * value:.2f}",
         "points": lambda value: f"{100 * value:+.2f}",
-        "metres": map_sheet.metres,
-        "opened": lambda items: [(i + 1, items[i]) for i in evenly(len(items), OPENED)],
+        "metres": map_sheet.format_metres,
+        "opened": lambda items: [(i + 1, items[i]) for i in evenly_spaced(len(items), OPEN_PANELS)],
         "folded": lambda items: [
-            (i + 1, items[i]) for i in range(len(items)) if i not in evenly(len(items), OPENED)
+            (i + 1, items[i])
+            for i in range(len(items))
+            if i not in evenly_spaced(len(items), OPEN_PANELS)
         ],
     }
     tasks = [task_view(row, findings.results_of(row), extras) for row in findings.metrics]
@@ -71,7 +73,7 @@ def render(
         *(scores_chart(f"{task.name}, scores", task.rows) for task in single),
         *(distance_chart(f"{task.name}, distance", task.rows) for task in single),
     ]
-    choices = choose(tasks, panels)
+    choices = choose_panels(tasks, panels)
     keys = sorted(set[str]().union(*(choice.keys for choice in choices)))
     parts = {row["task"]: row["parts"] for row in findings.parts}
     album, known = ThumbnailCache(pictures(keys)), vectors(keys) if parts else {}
@@ -79,8 +81,8 @@ def render(
     return environment.get_template("report.html").render(
         title=extras.title,
         fingerprint=findings.metrics[0]["fingerprint"],
-        protocol=PROTOCOLS[findings.metrics[0]["protocol"]],
-        measures=MEASURES,
+        protocol=PROTOCOL_TEXTS[findings.metrics[0]["protocol"]],
+        measures=METRIC_LABELS,
         tasks=tasks,
         beside=extras.beside.name if extras.beside else None,
         evidence=[chart for chart in evidence if chart],
@@ -100,7 +102,7 @@ def render(
 
 
 def _section(
-    choice: Choice, album: ThumbnailCache, known: Mapping[str, Floats], parts: int
+    choice: PanelChoice, album: ThumbnailCache, known: Mapping[str, Floats], parts: int
 ) -> dict[str, Any]:
     """A task's panels."""
     hits, misses = (

@@ -12,14 +12,14 @@ from typing import Any
 from pipeline.features.table import Floats
 from pipeline.images.thumbnails import ANSWER_PX, QUERY_PX, ThumbnailCache
 from pipeline.retrieval.parts import cosines_by_part
-from pipeline.retrieval.subsets import evenly
+from pipeline.retrieval.subsets import evenly_spaced
 
-ANSWERS = 5
-MOSAIC, MOSAIC_PX = 9, 96  # images that stand for a merged query, three a row
+MAX_ANSWERS = 5
+MOSAIC_IMAGES, MOSAIC_PX = 9, 96  # images that stand for a merged query, three a row
 
 
 @dataclass(frozen=True, kw_only=True)
-class Answer:
+class PanelAnswer:
     """A gallery image under a query."""
 
     rank: int
@@ -41,9 +41,9 @@ class Panel:
     location: str
     pictures: tuple[str | None, ...]
     "One; of a merged query, up to nine of the images that it is the mean of."
-    answers: tuple[Answer, ...]
+    answers: tuple[PanelAnswer, ...]
     first_match_rank: int | None
-    truth: Answer | None
+    truth: PanelAnswer | None
     "The best true match, where it is not among the answers."
 
 
@@ -51,19 +51,19 @@ def is_hit(row: Mapping[str, Any]) -> bool:
     return bool(row["first_match_rank"] == 1)
 
 
-def sureness(row: Mapping[str, Any]) -> tuple[float, str]:
+def confidence_order(row: Mapping[str, Any]) -> tuple[float, str]:
     """Orders rows from the surest (highest best score) to the least sure."""
     return -row["top_scores"][0], row["query"]
 
 
-def distance(row: Mapping[str, Any]) -> tuple[float, str]:
+def error_order(row: Mapping[str, Any]) -> tuple[float, str]:
     """Orders rows from the farthest off (no match at all, then the worst first rank) to the nearly
     right.
     """
     return -(row["first_match_rank"] or math.inf), row["query"]
 
 
-def spread(
+def spread_over_locations(
     rows: Sequence[Mapping[str, Any]],
     count: int,
     order: Callable[[Mapping[str, Any]], tuple[float, str]],
@@ -78,14 +78,14 @@ def spread(
     for row in ordered:
         first_of_location.setdefault(row["location"], row)
     pool = list(first_of_location.values()) if len(first_of_location) >= count else ordered
-    return [pool[i] for i in evenly(len(pool), count)]
+    return [pool[i] for i in evenly_spaced(len(pool), count)]
 
 
-def keys_shown(rows: Iterable[Mapping[str, Any]]) -> set[str]:
+def panel_keys(rows: Iterable[Mapping[str, Any]]) -> set[str]:
     """Keys of all images on the panels of these rows."""
     keys: set[str] = set()
     for row in rows:
-        keys |= {row["query"], *row["top_keys"][:ANSWERS]}
+        keys |= {row["query"], *row["top_keys"][:MAX_ANSWERS]}
         keys |= {row["first_match_key"]} - {None}
     return keys
 
@@ -97,18 +97,18 @@ def make_panel(
     """One query's panel. `vectors`: embeddings (D,) by key, of `parts` parts; `merged`: keys of the
     images that the query is the mean of."""
 
-    def answer(rank: int, key: str, location: str, score: float) -> Answer:
+    def answer(rank: int, key: str, location: str, score: float) -> PanelAnswer:
         asked, given = (vectors or {}).get(row["query"]), (vectors or {}).get(key)
-        return Answer(
+        return PanelAnswer(
             rank=rank, key=key, location=location, score=score, right=location == row["location"],
             picture=album.get(key, ANSWER_PX),
             parts=() if parts < 2 or asked is None or given is None
             else tuple(cosines_by_part(asked[None], given[None], parts)[0].tolist()),
         )  # fmt: skip
 
-    best = zip(row["top_keys"][:ANSWERS], row["top_locations"], row["top_scores"], strict=False)
+    best = zip(row["top_keys"][:MAX_ANSWERS], row["top_locations"], row["top_scores"], strict=False)
     first, key = row["first_match_rank"], row["first_match_key"]
-    apart = first is not None and first > ANSWERS
+    apart = first is not None and first > MAX_ANSWERS
     shown = [(key, MOSAIC_PX) for key in merged] or [(row["query"], QUERY_PX)]
     return Panel(
         key=row["query"],

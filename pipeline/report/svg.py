@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.core.arrays import Ints
-from pipeline.retrieval.metrics import one_percent, recall_at
+from pipeline.retrieval.metrics import one_percent_k, recall_at
 
 WIDTH, HEIGHT = 340, 190
 LEFT, RIGHT, TOP, BOTTOM = 40, 12, 12, 26
@@ -118,7 +118,7 @@ def recall_chart(
     """Recall@K over K on a logarithmic axis, with dots at K = 1, 5, 10 and the top 1 %."""
     frame = Frame(0, max(math.log10(gallery), 0.3), 0, 1)
     ks = sorted({min(gallery, round(k)) for k in np.geomspace(1, max(gallery, 1), CURVE_POINTS)})
-    named = {k for k in (1, 5, 10, one_percent(gallery)) if k <= gallery}
+    named = {k for k in (1, 5, 10, one_percent_k(gallery)) if k <= gallery}
 
     def points(first: Ints, among: Iterable[int]) -> list[Point]:
         return [(math.log10(k), recall_at(k, first)) for k in among]

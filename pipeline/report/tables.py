@@ -9,7 +9,7 @@ from pipeline.retrieval.parts import part_label
 
 
 @dataclass(frozen=True, kw_only=True)
-class Line:
+class TableRow:
     """One group: figures as fractions."""
 
     label: str
@@ -22,11 +22,11 @@ class Line:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Table:
+class WhiskerTable:
     title: str
     heading: str
     "Of the labels."
-    lines: tuple[Line, ...]
+    lines: tuple[TableRow, ...]
     overall: float
     "R@1 of the whole task, a hairline in every row."
 
@@ -45,15 +45,17 @@ class Table:
 
 def group_tables(
     groups: Sequence[Mapping[str, Any]], names: Mapping[str, str], r1: Mapping[str, float]
-) -> list[Table]:
+) -> list[WhiskerTable]:
     """One table for each task and column of groups.json. `names`, `r1`: of each task, as the page
     calls it, and its R@1.
     """
-    found: dict[tuple[str, str], list[Line]] = {}
+    found: dict[tuple[str, str], list[TableRow]] = {}
     for row in groups:
         found.setdefault((row["task"], row["by"]), []).append(_line(str(row["value"]), row))
     return [
-        Table(title=names[task], heading=by.replace("_", " "), lines=tuple(lines), overall=r1[task])
+        WhiskerTable(
+            title=names[task], heading=by.replace("_", " "), lines=tuple(lines), overall=r1[task]
+        )
         for (task, by), lines in found.items()
         if len(lines) > 1  # one group is the whole task
     ]
@@ -61,19 +63,19 @@ def group_tables(
 
 def part_tables(
     parts: Sequence[Mapping[str, Any]], names: Mapping[str, str], r1: Mapping[str, float]
-) -> list[Table]:
+) -> list[WhiskerTable]:
     """One table for each task of parts.json."""
-    found: dict[str, list[Line]] = {}
+    found: dict[str, list[TableRow]] = {}
     for row in parts:
         found.setdefault(row["task"], []).append(_line(part_label(row), row))
     return [
-        Table(title=names[task], heading="part", lines=tuple(lines), overall=r1[task])
+        WhiskerTable(title=names[task], heading="part", lines=tuple(lines), overall=r1[task])
         for task, lines in found.items()
     ]
 
 
-def _line(label: str, row: Mapping[str, Any]) -> Line:
-    return Line(
+def _line(label: str, row: Mapping[str, Any]) -> TableRow:
+    return TableRow(
         label=label,
         queries=row["queries"],
         r1=row["r1"],

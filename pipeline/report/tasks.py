@@ -9,13 +9,20 @@ from typing import Any
 import numpy as np
 
 from pipeline.core.arrays import Ints
-from pipeline.report.inputs import Extras
-from pipeline.report.panels import MOSAIC, distance, is_hit, keys_shown, spread, sureness
+from pipeline.report.inputs import ReportContext
+from pipeline.report.panels import (
+    MOSAIC_IMAGES,
+    confidence_order,
+    error_order,
+    is_hit,
+    panel_keys,
+    spread_over_locations,
+)
 from pipeline.report.svg import Chart, recall_chart
 from pipeline.retrieval import metrics
-from pipeline.retrieval.subsets import evenly
+from pipeline.retrieval.subsets import evenly_spaced
 
-MEASURES = {"r1": "R@1", "r5": "R@5", "r10": "R@10", "r1p": "R@1%", "ap": "AP"}
+METRIC_LABELS = {"r1": "R@1", "r5": "R@5", "r10": "R@10", "r1p": "R@1%", "ap": "AP"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,14 +52,17 @@ class TaskView:
     chart: Chart
 
 
-def task_view(row: Mapping[str, Any], rows: list[dict[str, Any]], extras: Extras) -> TaskView:
+def task_view(
+    row: Mapping[str, Any], rows: list[dict[str, Any]], extras: ReportContext
+) -> TaskView:
     """Raises InputError when the evaluation beside ranked other images."""
     query_view, gallery_view = row["task"].split("->")
     other = extras.beside.of(dict(row)) if extras.beside else None
     matches_Q = np.array([each["matches"] for each in rows], np.int64)
     name = f"{query_view} → {gallery_view}" + (", multi-query" if row["multi_query"] else "")
     bounds = {
-        measure: (row.get(f"{measure}_low"), row.get(f"{measure}_high")) for measure in MEASURES
+        measure: (row.get(f"{measure}_low"), row.get(f"{measure}_high"))
+        for measure in METRIC_LABELS
     }
     return TaskView(
         row=row,
@@ -64,8 +74,8 @@ def task_view(row: Mapping[str, Any], rows: list[dict[str, Any]], extras: Extras
         other=other,
         first=sum(map(is_hit, rows)),
         unmatched=int(np.count_nonzero(matches_Q == 0)),
-        chance=metrics.chance(matches_Q, row["gallery"]),
-        one_percent=metrics.one_percent(row["gallery"]),
+        chance=metrics.chance_recall(matches_Q, row["gallery"]),
+        one_percent=metrics.one_percent_k(row["gallery"]),
         sure={
             measure: (low, high)
             for measure, (low, high) in bounds.items()
@@ -77,7 +87,7 @@ def task_view(row: Mapping[str, Any], rows: list[dict[str, Any]], extras: Extras
 
 
 def _recall_chart(
-    name: str, row: Mapping[str, Any], rows: list[dict[str, Any]], extras: Extras | None
+    name: str, row: Mapping[str, Any], rows: list[dict[str, Any]], extras: ReportContext | None
 ) -> Chart:
     beside = extras.beside if extras else None
     beside_Q = first_ranks(beside.results_of(dict(row))) if beside else None
@@ -96,7 +106,7 @@ Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pair:
+class QueryPair:
     """A place asked for by one image and by all."""
 
     single: Row
@@ -107,8 +117,8 @@ class Pair:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pairs:
-    shown: tuple[Pair, ...]
+class QueryPairs:
+    shown: tuple[QueryPair, ...]
     places: int
     "With at least one image that misses."
     mended: int
@@ -118,7 +128,7 @@ class Pairs:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Choice:
+class PanelChoice:
     """Of one task."""
 
     task: TaskView
@@ -126,7 +136,7 @@ class Choice:
     "From the surest to the least sure."
     misses: list[Row]
     "From the farthest off to the nearly right."
-    pairs: Pairs
+    pairs: QueryPairs
 
     @property
     def keys(self) -> set[str]:
@@ -136,25 +146,29 @@ class Choice:
             *self.misses,
             *(row for pair in self.pairs.shown for row in (pair.single, pair.merged)),
         ]
-        return keys_shown(rows) | {key for pair in self.pairs.shown for key in pair.images}
+        return panel_keys(rows) | {key for pair in self.pairs.shown for key in pair.images}
 
 
-def choose(tasks: Sequence[TaskView], count: int) -> list[Choice]:
+def choose_panels(tasks: Sequence[TaskView], count: int) -> list[PanelChoice]:
     """At most `count` hits, misses and pairs of each task of single queries."""
     single = [task for task in tasks if not task.row["multi_query"]]
     merged = {task.row["task"]: task.rows for task in tasks if task.row["multi_query"]}
     return [
-        Choice(
+        PanelChoice(
             task=task,
-            hits=spread([row for row in task.rows if is_hit(row)], count, sureness),
-            misses=spread([row for row in task.rows if not is_hit(row)], count, distance),
-            pairs=pair_up(task.rows, merged.get(task.row["task"], []), count),
+            hits=spread_over_locations(
+                [row for row in task.rows if is_hit(row)], count, confidence_order
+            ),
+            misses=spread_over_locations(
+                [row for row in task.rows if not is_hit(row)], count, error_order
+            ),
+            pairs=pair_queries(task.rows, merged.get(task.row["task"], []), count),
         )
         for task in single
     ]
 
 
-def pair_up(single: Sequence[Row], merged: Sequence[Row], count: int) -> Pairs:
+def pair_queries(single: Sequence[Row], merged: Sequence[Row], count: int) -> QueryPairs:
     """At most `count` of the places with an image that misses, from the one that merging leaves
     farthest off to those that it finds first; evenly spaced in that order."""
     images: dict[str, list[Row]] = {}
@@ -163,11 +177,11 @@ def pair_up(single: Sequence[Row], merged: Sequence[Row], count: int) -> Pairs:
     known = [row for row in merged if row["location"] in images]
     missed = [row for row in known if not all(is_hit(each) for each in images[row["location"]])]
     pairs = []
-    for row in spread(missed, count, distance):
+    for row in spread_over_locations(missed, count, error_order):
         of_place = images[row["location"]]
-        keys = tuple(of_place[i]["query"] for i in evenly(len(of_place), MOSAIC))
-        pairs.append(Pair(single=min(of_place, key=distance), merged=row, images=keys))
-    return Pairs(
+        keys = tuple(of_place[i]["query"] for i in evenly_spaced(len(of_place), MOSAIC_IMAGES))
+        pairs.append(QueryPair(single=min(of_place, key=error_order), merged=row, images=keys))
+    return QueryPairs(
         shown=tuple(pairs),
         places=len(missed),
         mended=sum(map(is_hit, missed)),

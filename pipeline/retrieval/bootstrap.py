@@ -15,12 +15,12 @@ from pipeline.core.arrays import Doubles, Ints, Strings
 from pipeline.retrieval import metrics
 
 
-def measures_of(first_Q: Ints, ap_Q: Doubles, locations_Q: Strings) -> dict[str, Any]:
+def metrics_with_intervals(first_Q: Ints, ap_Q: Doubles, locations_Q: Strings) -> dict[str, Any]:
     """R@1, R@5 and AP of some queries, the first and the last with 95 % intervals; how many they
     are, of how many places.
     """
     hit_Q = metrics.hits_at(1, first_Q)
-    low, high = intervals(np.stack([hit_Q, ap_Q], axis=1), locations_Q)
+    low, high = confidence_intervals(np.stack([hit_Q, ap_Q], axis=1), locations_Q)
     return {
         "queries": len(first_Q),
         "locations": len(np.unique(locations_Q)),
@@ -34,10 +34,10 @@ def measures_of(first_Q: Ints, ap_Q: Doubles, locations_Q: Strings) -> dict[str,
     }
 
 
-SAMPLES = 2_000
-SEED = 0
-LEVEL = 0.95
-WEIGHTS_AT_ONCE = 4_000_000  # weights drawn at once: 32 MB
+BOOTSTRAP_SAMPLES = 2_000
+BOOTSTRAP_SEED = 0
+CONFIDENCE_LEVEL = 0.95
+WEIGHTS_PER_BLOCK = 4_000_000  # weights drawn at once: 32 MB
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,10 @@ class Difference:
 
 
 def resampled_means(
-    values_QM: Doubles, locations_Q: Strings, samples: int = SAMPLES, seed: int = SEED
+    values_QM: Doubles,
+    locations_Q: Strings,
+    samples: int = BOOTSTRAP_SAMPLES,
+    seed: int = BOOTSTRAP_SEED,
 ) -> Doubles:
     """Means (S, M) over queries of locations drawn with replacement, as many as there are.
 
@@ -67,7 +70,7 @@ def resampled_means(
         [np.bincount(location_Q, weights=column_Q) for column_Q in values_QM.T], axis=1
     )
     rng = np.random.default_rng(seed)
-    means, step = [], max(1, WEIGHTS_AT_ONCE // len(names))
+    means, step = [], max(1, WEIGHTS_PER_BLOCK // len(names))
     for first in range(0, samples, step):
         weight_SL = rng.multinomial(
             len(names), np.full(len(names), 1 / len(names)), min(step, samples - first)
@@ -76,27 +79,30 @@ def resampled_means(
     return np.concatenate(means)
 
 
-def intervals(
-    values_QM: Doubles, locations_Q: Strings, samples: int = SAMPLES, seed: int = SEED
+def confidence_intervals(
+    values_QM: Doubles,
+    locations_Q: Strings,
+    samples: int = BOOTSTRAP_SAMPLES,
+    seed: int = BOOTSTRAP_SEED,
 ) -> Doubles:
     """The 95 % percentile interval of each measure's mean, (2, M): low, high. NaN without queries."""
     if not len(values_QM):
         return np.full((2, values_QM.shape[1]), np.nan)
     means_SM = resampled_means(values_QM, locations_Q, samples, seed)
-    return np.quantile(means_SM, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
+    return np.quantile(means_SM, [(1 - CONFIDENCE_LEVEL) / 2, (1 + CONFIDENCE_LEVEL) / 2], axis=0)
 
 
-def paired(
+def paired_difference(
     run_Q: Doubles,
     baseline_Q: Doubles,
     locations_Q: Strings,
-    samples: int = SAMPLES,
-    seed: int = SEED,
+    samples: int = BOOTSTRAP_SAMPLES,
+    seed: int = BOOTSTRAP_SEED,
 ) -> Difference:
     """The difference of two runs' means over the same queries, in the same order."""
     change_Q1 = (run_Q - baseline_Q)[:, None]
     means_S = resampled_means(change_Q1, locations_Q, samples, seed)[:, 0]
-    low, high = np.quantile(means_S, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    low, high = np.quantile(means_S, [(1 - CONFIDENCE_LEVEL) / 2, (1 + CONFIDENCE_LEVEL) / 2])
     beyond = min(np.count_nonzero(means_S <= 0), np.count_nonzero(means_S >= 0))
     return Difference(
         mean=float(change_Q1.mean()),

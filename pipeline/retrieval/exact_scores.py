@@ -27,35 +27,37 @@ from pipeline.core.arrays import Doubles, Ints
 from pipeline.core.errors import InputError
 from pipeline.features.table import Floats
 
-GRID = np.float32(2.0**26)
+GRID_SCALE = np.float32(2.0**26)
 STRIP_ROWS = (
     64  # rows put on the grid at once: half a megabyte at 2,048 dimensions stays in a core's cache
 )
-TOLERANCE = 0.01  # how far from 1 a vector's length may lie: what float16 and rounding take
-ROUNDING = 2.0**-24  # the largest relative error of one float32 operation
+LENGTH_TOLERANCE = 0.01  # how far from 1 a vector's length may lie: what float16 and rounding take
+UNIT_ROUNDOFF = 2.0**-24  # the largest relative error of one float32 operation
 # an order key: 32 bits of score, 1 bit "wrong location", 31 bits of row (up to 2,147,483,648 rows)
 ROW_BITS = 31
 LAST_ROW = 2**ROW_BITS - 1
-WRONG = 1 << ROW_BITS
+WRONG_BIT = 1 << ROW_BITS
 NO_KEY = np.iinfo(np.int64).min
-PAIR_ROWS = (
+PAIR_BLOCK_ROWS = (
     128  # pairs scored at once: four megabytes of float64 at 2,048 dimensions stay near the core
 )
-PAIRS_UP_TO = 3  # measured: below so many entries a query, scoring pairs beats going query by query
-FEW = (
+MAX_ENTRIES_BY_PAIR = (
+    3  # measured: below so many entries a query, scoring pairs beats going query by query
+)
+MAX_SPARSE_SHARE = (
     1 / 12
 )  # of a block's entries: up to so many, fewer where each has many matches to be held against, are taken apart
-WHOLE_FROM = (
+DENSE_FROM_SHARE = (
     1 / 32
 )  # measured: from this share of doubts, a float64 product of everything beats row by row
 # measured: to so many matches with rows in doubt, looking for these rows beats sorting all of them
 # again
-FEW_BANDS = 12
+MAX_SCANNED_BANDS = 12
 # measured: from so many matches a query, sorting a row of scores beats comparing it with each match
-SORT_FROM = 6
+SORT_FROM_MATCHES = 6
 
 
-def on_grid(vectors_BD: Floats) -> Floats:
+def round_to_grid(vectors_BD: Floats) -> Floats:
     """Unit vectors with every component rounded to a multiple of 2^-26.
 
     Raises InputError when one is not of unit length, within the 1 % that float16 and rounding take.
@@ -64,16 +66,16 @@ def on_grid(vectors_BD: Floats) -> Floats:
     for first in range(0, len(vectors_BD), STRIP_ROWS):
         strip, out = vectors_BD[first : first + STRIP_ROWS], grid_BD[first : first + STRIP_ROWS]
         length_B = np.sqrt(np.einsum("bd,bd->b", strip, strip))
-        fits_B = np.abs(length_B - 1) < TOLERANCE
+        fits_B = np.abs(length_B - 1) < LENGTH_TOLERANCE
         if not np.all(fits_B):
             row = int(np.argmin(fits_B))
             raise InputError(
                 f"row {first + row} of a block of features has length {length_B[row]:.4g}; expected unit length; normalise "
                 "the features, or embed the shards again with jobs/embed_gallery.py"
             )
-        np.multiply(strip, GRID, out=out)
+        np.multiply(strip, GRID_SCALE, out=out)
         np.rint(out, out=out)
-        np.multiply(out, 1 / GRID, out=out)
+        np.multiply(out, 1 / GRID_SCALE, out=out)
     return grid_BD
 
 
@@ -85,16 +87,18 @@ def error_bound(dimension: int) -> float:
     Algorithms, 2nd ed., section 3.1); u = 2^-24. The score itself is rounded once. 1.2e-4 at 2,048
     dimensions; real errors are a hundred times smaller.
     """
-    longest = 1 + 2 * TOLERANCE
-    return longest**2 * (dimension * ROUNDING / (1 - dimension * ROUNDING) + ROUNDING)
+    longest = 1 + 2 * LENGTH_TOLERANCE
+    return longest**2 * (
+        dimension * UNIT_ROUNDOFF / (1 - dimension * UNIT_ROUNDOFF) + UNIT_ROUNDOFF
+    )
 
 
-def below(score: Floats, bound: float) -> Floats:
+def lower_bound(score: Floats, bound: float) -> Floats:
     """What a float32 product must reach so that its score may reach `score`: rounded downwards."""
     return np.nextafter((score - np.float64(bound)).astype(np.float32), np.float32(-np.inf))
 
 
-def above(score: Floats, bound: float) -> Floats:
+def upper_bound(score: Floats, bound: float) -> Floats:
     """What a float32 product must exceed so that its score surely exceeds `score`: rounded upwards."""
     return np.nextafter((score + np.float64(bound)).astype(np.float32), np.float32(np.inf))
 
@@ -112,13 +116,13 @@ def exact_entries(queries_QD: Floats, gallery_BD: Floats, flat_N: Ints) -> Float
     query_N, row_N = np.divmod(flat_N, len(gallery_BD))
     starts = np.flatnonzero(np.diff(query_N, prepend=-1))
     asked = query_N[starts]
-    if len(flat_N) > WHOLE_FROM * len(queries_QD) * len(gallery_BD):
+    if len(flat_N) > DENSE_FROM_SHARE * len(queries_QD) * len(gallery_BD):
         scores = queries_QD[asked].astype(np.float64) @ gallery_BD.astype(np.float64).T
         return np.asarray(scores[np.searchsorted(asked, query_N), row_N], np.float32)
     scores_N = np.empty(len(flat_N), np.float32)
-    if len(flat_N) < PAIRS_UP_TO * len(asked):
-        for first in range(0, len(flat_N), PAIR_ROWS):
-            some = slice(first, first + PAIR_ROWS)
+    if len(flat_N) < MAX_ENTRIES_BY_PAIR * len(asked):
+        for first in range(0, len(flat_N), PAIR_BLOCK_ROWS):
+            some = slice(first, first + PAIR_BLOCK_ROWS)
             scores_N[some] = exact_pairs(queries_QD[query_N[some]], gallery_BD[row_N[some]])
         return scores_N
     for query, (begin, end) in zip(asked, pairwise([*starts.tolist(), len(flat_N)]), strict=True):
@@ -127,7 +131,7 @@ def exact_entries(queries_QD: Floats, gallery_BD: Floats, flat_N: Ints) -> Float
     return scores_N
 
 
-def settle(
+def resolve_scores(
     scores_QB: Floats, owner_P: Ints, score_P: Floats, bounds_P: tuple[Floats, Floats], floor_Q: Floats,
     exact: Callable[[Ints], Floats],
 ) -> tuple[Ints, Floats, Ints]:  # fmt: skip
@@ -145,17 +149,20 @@ def settle(
     lowest_Q = floor_Q.copy()
     np.minimum.at(lowest_Q, owner_P, bounds_P[0])
     reach_QB = scores_QB >= lowest_Q[:, None]
-    if np.count_nonzero(reach_QB) * (1 + _most(owner_P) / 32) <= FEW * reach_QB.size:
-        return _settle_few(
+    if (
+        np.count_nonzero(reach_QB) * (1 + _max_count(owner_P) / 32)
+        <= MAX_SPARSE_SHARE * reach_QB.size
+    ):
+        return _resolve_sparse(
             scores_QB, np.flatnonzero(reach_QB), owner_P, score_P, bounds_P, floor_Q, exact
         )
-    flat_N = doubtful(scores_QB, owner_P, *bounds_P, floor_Q)
+    flat_N = uncertain_entries(scores_QB, owner_P, *bounds_P, floor_Q)
     exact_N = exact(flat_N)
     scores_QB.reshape(-1)[flat_N] = exact_N
     return flat_N, exact_N, count_ahead(scores_QB, owner_P, score_P)
 
 
-def _settle_few(
+def _resolve_sparse(
     scores_QB: Floats, flat_C: Ints, owner_P: Ints, score_P: Floats, bounds_P: tuple[Floats, Floats], floor_Q: Floats,
     exact: Callable[[Ints], Floats],
 ) -> tuple[Ints, Floats, Ints]:  # fmt: skip
@@ -163,29 +170,29 @@ def _settle_few(
     score_C, query_C = scores_QB.reshape(-1)[flat_C], flat_C // scores_QB.shape[1]
     doubt_C = score_C >= floor_Q[query_C]
     for low_Q1, high_Q1 in zip(
-        *(_columns(owner_P, p, len(scores_QB)) for p in bounds_P), strict=True
+        *(_match_columns(owner_P, p, len(scores_QB)) for p in bounds_P), strict=True
     ):
         doubt_C |= (score_C >= low_Q1[query_C, 0]) & (score_C <= high_Q1[query_C, 0])
     exact_N = exact(flat_C[doubt_C])
     score_C[doubt_C] = exact_N
     ahead_P = np.empty(len(owner_P), np.int64)
-    nth_P = _nth(owner_P)
-    for m, at_Q1 in enumerate(_columns(owner_P, score_P, len(scores_QB))):
+    nth_P = _index_within_owner(owner_P)
+    for m, at_Q1 in enumerate(_match_columns(owner_P, score_P, len(scores_QB))):
         ahead_Q = np.bincount(query_C[score_C >= at_Q1[query_C, 0]], minlength=len(scores_QB))
         ahead_P[nth_P == m] = ahead_Q[owner_P[nth_P == m]]
     return flat_C[doubt_C], exact_N, ahead_P
 
 
-def doubtful(
+def uncertain_entries(
     scores_QB: Floats, owner_P: Ints, low_P: Floats, high_P: Floats, floor_Q: Floats
 ) -> Ints:
     """Flat indices, ascending, of the entries within [low, high] of a match of their query or at
     its floor and above.
     """
     doubt_QB = scores_QB >= floor_Q[:, None]
-    if _most(owner_P) < SORT_FROM:
+    if _max_count(owner_P) < SORT_FROM_MATCHES:
         for low_Q1, high_Q1 in zip(
-            *(_columns(owner_P, p, len(scores_QB)) for p in (low_P, high_P)), strict=True
+            *(_match_columns(owner_P, p, len(scores_QB)) for p in (low_P, high_P)), strict=True
         ):
             near_QB = scores_QB >= low_Q1
             near_QB &= scores_QB <= high_Q1
@@ -198,7 +205,7 @@ def doubtful(
         begin_P = np.searchsorted(ordered_B, low_P[first:last])
         end_P = np.searchsorted(ordered_B, high_P[first:last], side="right")
         near_P = np.flatnonzero(end_P > begin_P)
-        if len(near_P) <= FEW_BANDS:
+        if len(near_P) <= MAX_SCANNED_BANDS:
             for low, high in zip(
                 low_P[first:last][near_P], high_P[first:last][near_P], strict=True
             ):
@@ -214,11 +221,11 @@ def doubtful(
 
 def count_ahead(scores_QB: Floats, owner_P: Ints, score_P: Floats) -> Ints:
     """For each match, the entries of its query that score as it does or better (P,)."""
-    if _most(owner_P) < SORT_FROM:
-        ahead_MQ = np.zeros((_most(owner_P), len(scores_QB)), np.int64)
-        for m, at_Q1 in enumerate(_columns(owner_P, score_P, len(scores_QB))):
+    if _max_count(owner_P) < SORT_FROM_MATCHES:
+        ahead_MQ = np.zeros((_max_count(owner_P), len(scores_QB)), np.int64)
+        for m, at_Q1 in enumerate(_match_columns(owner_P, score_P, len(scores_QB))):
             ahead_MQ[m] = np.count_nonzero(scores_QB >= at_Q1, axis=1)
-        return np.asarray(ahead_MQ[_nth(owner_P), owner_P])
+        return np.asarray(ahead_MQ[_index_within_owner(owner_P), owner_P])
     ahead_P = np.empty(len(owner_P), np.int64)
     bounds = np.searchsorted(owner_P, np.arange(len(scores_QB) + 1))
     for query, (first, last) in enumerate(pairwise(bounds)):
@@ -237,36 +244,36 @@ def order_keys(scores: Floats) -> Ints:
     return bits.astype(np.int64) << 32
 
 
-def scores_of(keys: Ints) -> Floats:
+def scores_from_keys(keys: Ints) -> Floats:
     """The scores that keys were made from; where there is no key, minus infinity."""
     bits = (keys >> 32).astype(np.int32)
     scores = (bits ^ ((bits >> 31) & 0x7FFFFFFF)).view(np.float32)
     return np.where(keys == NO_KEY, np.float32(-np.inf), scores)
 
 
-def merged(best_QK: Ints, owner_N: Ints, key_N: Ints) -> Ints:
+def merge_top_k(best_QK: Ints, owner_N: Ints, key_N: Ints) -> Ints:
     """The K highest keys of each query, ascending, out of the best so far (Q, K) and new ones whose
     owners ascend.
     """
     if not len(owner_N):
         return best_QK
-    new_QN = np.full((len(best_QK), _most(owner_N)), NO_KEY)
-    new_QN[owner_N, _nth(owner_N)] = key_N
+    new_QN = np.full((len(best_QK), _max_count(owner_N)), NO_KEY)
+    new_QN[owner_N, _index_within_owner(owner_N)] = key_N
     return np.sort(np.concatenate([best_QK, new_QN], axis=1), axis=1)[:, new_QN.shape[1] :]
 
 
-def _most(owner_P: Ints) -> int:
+def _max_count(owner_P: Ints) -> int:
     return int(np.bincount(owner_P).max(initial=0))
 
 
-def _nth(owner_P: Ints) -> Ints:
+def _index_within_owner(owner_P: Ints) -> Ints:
     """Place of each entry among those of its owner, from 0."""
     count = np.bincount(owner_P)
     return np.asarray(np.arange(len(owner_P)) - (np.cumsum(count) - count)[owner_P])
 
 
-def _columns(owner_P: Ints, value_P: Floats, queries: int) -> list[Floats]:
+def _match_columns(owner_P: Ints, value_P: Floats, queries: int) -> list[Floats]:
     """The first, second, ... value of each query as columns (Q, 1); infinity where it has fewer."""
-    columns_MQ1 = np.full((_most(owner_P), queries, 1), np.inf, np.float32)
-    columns_MQ1[_nth(owner_P), owner_P, 0] = value_P
+    columns_MQ1 = np.full((_max_count(owner_P), queries, 1), np.inf, np.float32)
+    columns_MQ1[_index_within_owner(owner_P), owner_P, 0] = value_P
     return list(columns_MQ1)

@@ -29,7 +29,7 @@ def spatial_distance_metric(query_Q2: Doubles, answers_QK2: Doubles) -> Doubles:
     return np.asarray((np.exp(-SDM_SCALE * degrees_QK) * weight_K).sum(axis=1) / weight_K.sum())
 
 
-def measures(query_Q2: Doubles, answers_QK2: Doubles) -> dict[str, float | int | None]:
+def distance_metrics(query_Q2: Doubles, answers_QK2: Doubles) -> dict[str, float | int | None]:
     """Distance error of the best answer and SDM@K, over the queries whose position is known; None
     of each where no query's is, or an answer's is not: a gallery that is tagged in part would
     flatter whoever answers with its tagged rows."""

@@ -25,7 +25,7 @@ queried locations alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scores:
+class RetrievalMetrics:
     """The measures of one task; fractions from 0 to 1."""
 
     r1: float
@@ -57,7 +57,7 @@ def recall_at(k: int, first_Q: Ints) -> float:
     return float(np.mean(hits_at(k, first_Q))) if len(first_Q) else 0.0
 
 
-def one_percent(gallery: int) -> int:
+def one_percent_k(gallery: int) -> int:
     """The K of the field's "top 1 %": `CMC[round(0.01 * N)]`, whose index starts at 0; R@11 of 951,
     R@515 of 51,355.
 
@@ -84,28 +84,28 @@ def average_precisions(ranks_P: Ints, owner_P: Ints, queries: int) -> Doubles:
     return np.asarray(total_Q / np.maximum(count_Q, 1), np.float64)
 
 
-def chance(matches_Q: Ints, gallery: int) -> float:
+def chance_recall(matches_Q: Ints, gallery: int) -> float:
     """R@1 of a ranking drawn by lot: the share of the gallery that is right, averaged over the
     queries.
     """
     return float(np.mean(matches_Q / gallery)) if len(matches_Q) and gallery else 0.0
 
 
-def per_query(first_Q: Ints, ap_Q: Doubles, gallery: int) -> Doubles:
+def per_query_values(first_Q: Ints, ap_Q: Doubles, gallery: int) -> Doubles:
     """What `summarise` takes the means of: hits at 1, 5, 10 and the top 1 %, and average precision
     (Q, 5).
     """
     return np.stack(
-        [*(hits_at(k, first_Q) for k in (1, 5, 10, one_percent(gallery))), ap_Q], axis=1
+        [*(hits_at(k, first_Q) for k in (1, 5, 10, one_percent_k(gallery))), ap_Q], axis=1
     )
 
 
-def summarise(first_Q: Ints, ap_Q: Doubles, gallery: int) -> Scores:
+def summarise(first_Q: Ints, ap_Q: Doubles, gallery: int) -> RetrievalMetrics:
     """The measures of one task from its queries' first ranks and average precisions."""
-    return Scores(
+    return RetrievalMetrics(
         r1=recall_at(1, first_Q),
         r5=recall_at(5, first_Q),
         r10=recall_at(10, first_Q),
-        r1p=recall_at(one_percent(gallery), first_Q),
+        r1p=recall_at(one_percent_k(gallery), first_Q),
         ap=float(np.mean(ap_Q)) if len(ap_Q) else 0.0,
     )

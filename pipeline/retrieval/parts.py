@@ -16,18 +16,18 @@ from typing import Any
 import numpy as np
 
 from pipeline.features.table import FeatureTable, Floats
-from pipeline.retrieval.bootstrap import measures_of
+from pipeline.retrieval.bootstrap import metrics_with_intervals
 from pipeline.retrieval.metrics import Protocol
-from pipeline.retrieval.ranking import Blocks, Side, rank_spread
-from pipeline.retrieval.tasks import Task, sides_of
+from pipeline.retrieval.ranking import BlockSizes, EmbeddingSet, rank_distributed
+from pipeline.retrieval.tasks import Task, task_embedding_sets
 
-MOST_PARTS = (
+MAX_PARTS = (
     16  # twice what the field's networks have; a vector of signs would else pass for D parts
 )
-TOLERANCE = 2e-3
+PART_TOLERANCE = 2e-3
 """Of a part's length times sqrt(P): what float16 costs; ten times less than lengths of unmade parts
 differ at 2,048 dimensions."""
-ROWS_ASKED = 64  # by so many rows parts of equal length are no accident
+PROBE_ROWS = 64  # by so many rows parts of equal length are no accident
 
 
 def count_parts(vectors_ND: Floats) -> int:
@@ -35,17 +35,17 @@ def count_parts(vectors_ND: Floats) -> int:
     there is none.
     """
     rows, dimension = vectors_ND.shape
-    for parts in range(min(MOST_PARTS, dimension // 2), 1, -1):
+    for parts in range(min(MAX_PARTS, dimension // 2), 1, -1):
         if rows and dimension % parts == 0:
             length_NP = np.linalg.norm(vectors_ND.reshape(rows, parts, -1), axis=2) * np.sqrt(parts)
-            if np.abs(length_NP - 1).max() < TOLERANCE:
+            if np.abs(length_NP - 1).max() < PART_TOLERANCE:
                 return parts
     return 1
 
 
-def parts_of_side(side: Side) -> int:
+def detect_parts(side: EmbeddingSet) -> int:
     """`count_parts` of a side's first rows."""
-    first_BD = next(iter(side.blocks(ROWS_ASKED)), np.empty((0, 1), np.float32))
+    first_BD = next(iter(side.blocks(PROBE_ROWS)), np.empty((0, 1), np.float32))
     return count_parts(first_BD)
 
 
@@ -57,7 +57,7 @@ def cosines_by_part(one_ND: Floats, other_ND: Floats, parts: int) -> Floats:
     )
 
 
-def side_of_parts(side: Side, parts: int, kept: Sequence[int]) -> Side:
+def select_parts(side: EmbeddingSet, parts: int, kept: Sequence[int]) -> EmbeddingSet:
     """The side as if its embedding were these parts alone (numbered from 0), again of unit length."""
     scale = np.float32(np.sqrt(parts / len(kept)))
 
@@ -76,7 +76,7 @@ def measure_parts(
     protocol: Protocol = "full",
     workers: int = 0,
     advance: Callable[[int], None] = lambda scores: None,
-    blocks: Blocks | None = None,
+    blocks: BlockSizes | None = None,
 ) -> list[dict[str, Any]]:
     """R@1, R@5 and AP with 95 % intervals, `kept` being "alone" (this part only) or "without" (all
     others).
@@ -84,9 +84,9 @@ def measure_parts(
     Of two parts the one without the other is that other alone, and is left out. Raises InputError as
     `retrieval.retrieve` does.
     """
-    sides = sides_of(task, queries, gallery, protocol)
-    parts = parts_of_side(sides[0])
-    if parts < 2 or parts_of_side(sides[1]) != parts:
+    sides = task_embedding_sets(task, queries, gallery, protocol)
+    parts = detect_parts(sides[0])
+    if parts < 2 or detect_parts(sides[1]) != parts:
         return []
     every = tuple(range(parts))
     ways: list[tuple[str, int, tuple[int, ...]]] = [("alone", part, (part,)) for part in every]
@@ -96,8 +96,8 @@ def measure_parts(
         ]
     rows = []
     for kept, part, numbers in ways:
-        asked, given = (side_of_parts(side, parts, numbers) for side in sides)
-        found = rank_spread(asked, given, 0, workers, advance, blocks)
+        asked, given = (select_parts(side, parts, numbers) for side in sides)
+        found = rank_distributed(asked, given, 0, workers, advance, blocks)
         named = {
             "task": task.name,
             "protocol": protocol,
@@ -105,7 +105,7 @@ def measure_parts(
             "part": part + 1,
             "kept": kept,
         }
-        rows.append(named | measures_of(found.first_rank_Q, found.ap_Q, asked.locations))
+        rows.append(named | metrics_with_intervals(found.first_rank_Q, found.ap_Q, asked.locations))
     return rows
 
 

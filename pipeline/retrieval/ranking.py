@@ -24,13 +24,13 @@ from pipeline.core.arrays import Doubles, Ints, Strings
 from pipeline.core.prefetch import prefetch
 from pipeline.features.table import Floats
 from pipeline.retrieval import exact_scores, metrics
-from pipeline.retrieval.exact_scores import LAST_ROW, NO_KEY, WRONG, on_grid
+from pipeline.retrieval.exact_scores import LAST_ROW, NO_KEY, WRONG_BIT, round_to_grid
 
-BLOCKS_AHEAD = 1  # read while another is ranked; each takes 34 MB at 2,048 dimensions
+PREFETCH_BLOCKS = 1  # read while another is ranked; each takes 34 MB at 2,048 dimensions
 
 
 @dataclass(frozen=True, kw_only=True)
-class Side:
+class EmbeddingSet:
     """The queries or the gallery: names in memory, unit vectors in blocks."""
 
     keys: Strings
@@ -43,10 +43,10 @@ class Side:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Blocks:
+class BlockSizes:
     """How the work is cut. Changes memory and speed, never a result."""
 
-    held_queries: int = 65_536
+    queries_in_memory: int = 65_536
     """Queries in memory at once; the gallery is read twice for each such group. 0.5 GB at 2,048
     dimensions."""
     query_rows: int = 2_048
@@ -72,20 +72,20 @@ class Ranking:
     top_scores_QK: Floats
 
 
-def side_of_array(keys: Strings, locations: Strings, vectors_QD: Floats) -> Side:
+def embedding_set_from_array(keys: Strings, locations: Strings, vectors_QD: Floats) -> EmbeddingSet:
     """Vectors that are in memory."""
 
     def blocks(rows: int) -> Iterator[Floats]:
         return (vectors_QD[begin : begin + rows] for begin in range(0, len(vectors_QD), rows))
 
-    return Side(keys=keys, locations=locations, blocks=blocks)
+    return EmbeddingSet(keys=keys, locations=locations, blocks=blocks)
 
 
 def rank(
-    queries: Side,
-    gallery: Side,
+    queries: EmbeddingSet,
+    gallery: EmbeddingSet,
     top: int = 10,
-    blocks: Blocks | None = None,
+    blocks: BlockSizes | None = None,
     advance: Callable[[int], None] = lambda scores: None,
 ) -> Ranking:
     """Rank the gallery for every query, exactly. `advance` is told how many scores have been
@@ -93,7 +93,7 @@ def rank(
 
     Raises InputError when a vector is not of unit length.
     """
-    cut = blocks or Blocks()
+    cut = blocks or BlockSizes()
     names, code = np.unique(
         np.concatenate([queries.locations, gallery.locations]), return_inverse=True
     )
@@ -102,20 +102,22 @@ def rank(
     count_by_code = np.bincount(gallery_code, minlength=len(names))
     begin_by_code = np.cumsum(count_by_code) - count_by_code
     groups, begin = [], 0
-    for held_QD in _regrouped(queries.blocks(cut.held_queries), cut.held_queries):
-        code_Q = query_code[begin : begin + len(held_QD)]
+    for group_QD in _rechunk(queries.blocks(cut.queries_in_memory), cut.queries_in_memory):
+        code_Q = query_code[begin : begin + len(group_QD)]
         matches_Q = count_by_code[code_Q]
-        owner_P = np.repeat(np.arange(len(held_QD)), matches_Q)
+        owner_P = np.repeat(np.arange(len(group_QD)), matches_Q)
         nth_P = np.arange(len(owner_P)) - np.repeat(np.cumsum(matches_Q) - matches_Q, matches_Q)
         row_P = rows_by_code[np.repeat(begin_by_code[code_Q], matches_Q) + nth_P]
         groups.append(
-            _rank_held(held_QD, gallery, owner_P, row_P, min(top, len(gallery.keys)), cut, advance)
+            _rank_group(
+                group_QD, gallery, owner_P, row_P, min(top, len(gallery.keys)), cut, advance
+            )
         )
-        begin += len(held_QD)
-    return joined(groups)
+        begin += len(group_QD)
+    return concat_rankings(groups)
 
 
-def joined(rankings: Sequence[Ranking]) -> Ranking:
+def concat_rankings(rankings: Sequence[Ranking]) -> Ranking:
     """The rankings of consecutive queries as one."""
     fields = Ranking.__dataclass_fields__
     return Ranking(
@@ -123,30 +125,33 @@ def joined(rankings: Sequence[Ranking]) -> Ranking:
     )
 
 
-def _rank_held(
-    held_QD: Floats,
-    gallery: Side,
+def _rank_group(
+    group_QD: Floats,
+    gallery: EmbeddingSet,
     owner_P: Ints,
     row_P: Ints,
     top: int,
-    cut: Blocks,
+    cut: BlockSizes,
     advance: Callable[[int], None],
 ) -> Ranking:
-    queries = len(held_QD)
-    bound = exact_scores.error_bound(held_QD.shape[1])
-    score_P = _scores_of_pairs(held_QD, gallery, owner_P, row_P, cut)
-    low_P, high_P = exact_scores.below(score_P, bound), exact_scores.above(score_P, bound)
+    queries = len(group_QD)
+    bound = exact_scores.error_bound(group_QD.shape[1])
+    score_P = _match_scores(group_QD, gallery, owner_P, row_P, cut)
+    low_P, high_P = (
+        exact_scores.lower_bound(score_P, bound),
+        exact_scores.upper_bound(score_P, bound),
+    )
     ahead_P = np.zeros(len(owner_P), np.int64)
     best_QK = np.full((queries, top), NO_KEY)
     room = np.empty(cut.query_rows * cut.gallery_rows, np.float32)
     begin = 0
     for block_BD in prefetch(
-        _regrouped(gallery.blocks(cut.gallery_rows), cut.gallery_rows), BLOCKS_AHEAD
+        _rechunk(gallery.blocks(cut.gallery_rows), cut.gallery_rows), PREFETCH_BLOCKS
     ):
         end = begin + len(block_BD)
         for first in range(0, queries, cut.query_rows):
             part = slice(first, min(first + cut.query_rows, queries))
-            part_QD = held_QD[part]
+            part_QD = group_QD[part]
             scores_QB = room[: len(part_QD) * len(block_BD)].reshape(len(part_QD), len(block_BD))
             np.matmul(part_QD, block_BD.T, out=scores_QB)
             pairs = slice(*np.searchsorted(owner_P, [part.start, part.stop]))
@@ -154,55 +159,57 @@ def _rank_held(
             scores_QB[
                 owner[here], row_P[pairs][here] - begin
             ] = -np.inf  # true matches are known: wrong rows are counted
-            flat_N, exact_N, ahead = exact_scores.settle(
+            flat_N, exact_N, ahead = exact_scores.resolve_scores(
                 scores_QB,
                 owner,
                 score_P[pairs],
                 (low_P[pairs], high_P[pairs]),
-                _floors(scores_QB, best_QK[part], bound),
+                _top_k_floors(scores_QB, best_QK[part], bound),
                 partial(exact_scores.exact_entries, part_QD, block_BD),
             )
             ahead_P[pairs] += ahead
             query_N, in_block_N = np.divmod(flat_N, len(block_BD))
-            key_N = exact_scores.order_keys(exact_N) | WRONG | (LAST_ROW - begin - in_block_N)
+            key_N = exact_scores.order_keys(exact_N) | WRONG_BIT | (LAST_ROW - begin - in_block_N)
             better = key_N > best_QK[part][query_N, 0] if top else np.zeros(len(key_N), np.bool_)
-            best_QK[part] = exact_scores.merged(best_QK[part], query_N[better], key_N[better])
+            best_QK[part] = exact_scores.merge_top_k(best_QK[part], query_N[better], key_N[better])
             advance(scores_QB.size)
         begin = end
-    return _ranking(best_QK, owner_P, row_P, score_P, ahead_P)
+    return _make_ranking(best_QK, owner_P, row_P, score_P, ahead_P)
 
 
-def _floors(scores_QB: Floats, best_QK: Ints, bound: float) -> Floats:
+def _top_k_floors(scores_QB: Floats, best_QK: Ints, bound: float) -> Floats:
     """For each query what a float32 product must reach to be one of the best K: K of this block, or
     of those before, are surely no worse. Never minus infinity, which marks true matches."""
     top = best_QK.shape[1]
     if not top:
         return np.full(len(best_QK), np.inf, np.float32)
-    floor_Q = exact_scores.below(exact_scores.scores_of(best_QK[:, 0]), bound)
+    floor_Q = exact_scores.lower_bound(exact_scores.scores_from_keys(best_QK[:, 0]), bound)
     if scores_QB.shape[1] >= top and np.isneginf(floor_Q).any():
         kth_Q = np.partition(scores_QB, -top, axis=1)[:, -top]
-        floor_Q = np.maximum(floor_Q, exact_scores.below(kth_Q, 2 * bound))
+        floor_Q = np.maximum(floor_Q, exact_scores.lower_bound(kth_Q, 2 * bound))
     return np.maximum(floor_Q, np.finfo(np.float32).min)
 
 
-def _scores_of_pairs(
-    held_QD: Floats, gallery: Side, owner_P: Ints, row_P: Ints, cut: Blocks
+def _match_scores(
+    group_QD: Floats, gallery: EmbeddingSet, owner_P: Ints, row_P: Ints, cut: BlockSizes
 ) -> Floats:
     """Scores of the true matches alone."""
     by_row = np.argsort(row_P, kind="stable")
     sorted_P, score_P, begin = row_P[by_row], np.zeros(len(row_P), np.float32), 0
-    for block_BD in _regrouped(gallery.blocks(cut.gallery_rows), cut.gallery_rows):
+    for block_BD in _rechunk(gallery.blocks(cut.gallery_rows), cut.gallery_rows):
         low, high = np.searchsorted(sorted_P, [begin, begin + len(block_BD)])
-        for first in range(low, high, exact_scores.PAIR_ROWS):
-            pairs = by_row[first : min(first + exact_scores.PAIR_ROWS, high)]
+        for first in range(low, high, exact_scores.PAIR_BLOCK_ROWS):
+            pairs = by_row[first : min(first + exact_scores.PAIR_BLOCK_ROWS, high)]
             score_P[pairs] = exact_scores.exact_pairs(
-                held_QD[owner_P[pairs]], block_BD[row_P[pairs] - begin]
+                group_QD[owner_P[pairs]], block_BD[row_P[pairs] - begin]
             )
         begin += len(block_BD)
     return score_P
 
 
-def _ranking(best_QK: Ints, owner_P: Ints, row_P: Ints, score_P: Floats, ahead_P: Ints) -> Ranking:
+def _make_ranking(
+    best_QK: Ints, owner_P: Ints, row_P: Ints, score_P: Floats, ahead_P: Ints
+) -> Ranking:
     """`ahead_P`: wrong rows ahead of each match; to these come the matches of the same query that
     rank before it.
     """
@@ -217,7 +224,7 @@ def _ranking(best_QK: Ints, owner_P: Ints, row_P: Ints, score_P: Floats, ahead_P
     first_row_Q, first_score_Q = np.full(queries, -1), np.full(queries, np.nan, np.float32)
     first_row_Q[with_match], first_score_Q[with_match] = row_P[first], score_P[first]
     shown = nth_P < best_QK.shape[1]
-    top_QK = exact_scores.merged(best_QK, owner_P[shown], key_P[shown])[:, ::-1]
+    top_QK = exact_scores.merge_top_k(best_QK, owner_P[shown], key_P[shown])[:, ::-1]
     return Ranking(
         matches_Q=count_Q,
         first_rank_Q=metrics.first_match_ranks(rank_P, owner_P, queries),
@@ -225,37 +232,37 @@ def _ranking(best_QK: Ints, owner_P: Ints, row_P: Ints, score_P: Floats, ahead_P
         first_score_Q=first_score_Q,
         ap_Q=metrics.average_precisions(rank_P, owner_P, queries),
         top_rows_QK=LAST_ROW - (top_QK & LAST_ROW),
-        top_scores_QK=exact_scores.scores_of(top_QK),
+        top_scores_QK=exact_scores.scores_from_keys(top_QK),
     )
 
 
-def _regrouped(blocks: Iterator[Floats], rows: int) -> Iterator[Floats]:
+def _rechunk(blocks: Iterator[Floats], rows: int) -> Iterator[Floats]:
     """On the grid, in blocks of `rows` rows (the last one fewer): tables come in parts of any size."""
     waiting: list[Floats] = []
     count = 0
     for block_BD in blocks:
-        waiting.append(on_grid(block_BD))
+        waiting.append(round_to_grid(block_BD))
         count += len(block_BD)
         while count >= rows:
-            whole_BD = _concatenated(waiting)
+            whole_BD = _concatenate(waiting)
             yield whole_BD[:rows]
             waiting, count = [whole_BD[rows:]], count - rows
     if count:
-        yield _concatenated(waiting)
+        yield _concatenate(waiting)
 
 
-def _concatenated(blocks: list[Floats]) -> Floats:
+def _concatenate(blocks: list[Floats]) -> Floats:
     some = [block_BD for block_BD in blocks if len(block_BD)]
     return some[0] if len(some) == 1 else np.concatenate(some)
 
 
-def rank_spread(
-    queries: Side,
-    gallery: Side,
+def rank_distributed(
+    queries: EmbeddingSet,
+    gallery: EmbeddingSet,
     top: int,
     workers: int,
     advance: Callable[[int], None],
-    blocks: Blocks | None = None,
+    blocks: BlockSizes | None = None,
 ) -> Ranking:
     """As `ranking.rank`, with `workers` Ray tasks of one core each; 0 ranks in this process.
 
@@ -266,8 +273,8 @@ def rank_spread(
     if workers < 1 or count < 2:
         return rank(queries, gallery, top, blocks, advance)
     cluster.connect()
-    cut = blocks or Blocks()
-    rows = max(1, min(cut.held_queries, -(-count // workers)))
+    cut = blocks or BlockSizes()
+    rows = max(1, min(cut.queries_in_memory, -(-count // workers)))
     parts = [(begin, min(begin + rows, count)) for begin in range(0, count, rows)]
     sides = ray.put((queries, gallery))
     found: dict[tuple[int, int], Ranking] = {}
@@ -276,10 +283,10 @@ def rank_spread(
     ):
         found[part] = ranking
         advance((part[1] - part[0]) * len(gallery.keys))
-    return joined([found[part] for part in parts])
+    return concat_rankings([found[part] for part in parts])
 
 
-def rows_between(side: Side, begin: int, end: int) -> Side:
+def slice_rows(side: EmbeddingSet, begin: int, end: int) -> EmbeddingSet:
     """Some consecutive rows of a side."""
 
     def blocks(rows: int) -> Iterator[Floats]:
@@ -292,10 +299,14 @@ def rows_between(side: Side, begin: int, end: int) -> Side:
             if len(kept_BD):
                 yield kept_BD
 
-    return Side(keys=side.keys[begin:end], locations=side.locations[begin:end], blocks=blocks)
+    return EmbeddingSet(
+        keys=side.keys[begin:end], locations=side.locations[begin:end], blocks=blocks
+    )
 
 
 @ray.remote(num_cpus=1)
-def _rank_part(sides: tuple[Side, Side], part: tuple[int, int], top: int, cut: Blocks) -> Any:
+def _rank_part(
+    sides: tuple[EmbeddingSet, EmbeddingSet], part: tuple[int, int], top: int, cut: BlockSizes
+) -> Any:
     queries, gallery = sides
-    return rank(rows_between(queries, *part), gallery, top, cut)
+    return rank(slice_rows(queries, *part), gallery, top, cut)

@@ -12,9 +12,14 @@ from typing import Any
 from pipeline.core import json_files, parquet, storage
 from pipeline.core.errors import InputError
 
-METRICS, RESULTS, INPUTS = "metrics.json", "queries.parquet", "evaluation.json"
-VIEWS, GROUPS, PARTS, GAP = "views.json", "groups.json", "parts.json", "view_gap.json"
-FILES = "files"
+METRICS_FILE, RESULTS_FILE, INPUTS_FILE = "metrics.json", "queries.parquet", "evaluation.json"
+VIEWS_FILE, GROUPS_FILE, PARTS_FILE, GAP_FILE = (
+    "views.json",
+    "groups.json",
+    "parts.json",
+    "view_gap.json",
+)
+CHECKSUMS_FIELD = "files"
 
 
 def write_inputs(folder: str, inputs: Mapping[str, Any], metrics: bytes | None = None) -> None:
@@ -23,12 +28,14 @@ def write_inputs(folder: str, inputs: Mapping[str, Any], metrics: bytes | None =
     """
     files = {
         name: _hash(data)
-        for name in (VIEWS, GROUPS, PARTS, GAP, METRICS)
+        for name in (VIEWS_FILE, GROUPS_FILE, PARTS_FILE, GAP_FILE, METRICS_FILE)
         if (data := _bytes(folder, name))
     }
     if metrics is not None:
-        files[METRICS] = _hash(metrics)
-    json_files.write_checksummed(storage.join(folder, INPUTS), {**inputs, FILES: files})
+        files[METRICS_FILE] = _hash(metrics)
+    json_files.write_checksummed(
+        storage.join(folder, INPUTS_FILE), {**inputs, CHECKSUMS_FIELD: files}
+    )
 
 
 def read_inputs(folder: str) -> dict[str, Any] | None:
@@ -36,30 +43,35 @@ def read_inputs(folder: str) -> dict[str, Any] | None:
 
     Raises InputError where it is not what was written.
     """
-    path = storage.join(folder, INPUTS)
+    path = storage.join(folder, INPUTS_FILE)
     try:
         return json_files.read_checksummed(path) if storage.exists(path) else None
     except ValueError as error:
-        raise _damaged(folder, INPUTS, str(error)) from None
+        raise _damaged(folder, INPUTS_FILE, str(error)) from None
 
 
-def is_whole(folder: str, inputs: Mapping[str, Any]) -> bool:
+def results_intact(folder: str, inputs: Mapping[str, Any]) -> bool:
     """Whether every list and the queries' rows of a finished evaluation are what was written."""
-    lists = inputs.get(FILES, {}).items()
-    return parquet.parquet_intact(storage.join(folder, RESULTS)) and all(
+    lists = inputs.get(CHECKSUMS_FIELD, {}).items()
+    return parquet.parquet_intact(storage.join(folder, RESULTS_FILE)) and all(
         (data := _bytes(folder, name)) and _hash(data) == said for name, said in lists
     )
 
 
-def read_rows(folder: str, name: str) -> list[dict[str, Any]]:
+def read_result_rows(folder: str, name: str) -> list[dict[str, Any]]:
     """The rows of one of its lists; none where it was not made.
 
     Raises InputError where it is not what was written.
     """
-    said, data = (read_inputs(folder) or {}).get(FILES, {}).get(name), _bytes(folder, name)
+    said, data = (
+        (read_inputs(folder) or {}).get(CHECKSUMS_FIELD, {}).get(name),
+        _bytes(folder, name),
+    )
     if said is not None and (data is None or _hash(data) != said):
         raise _damaged(
-            folder, name, f"it has not the hash that {INPUTS} says" if data else "it is not there"
+            folder,
+            name,
+            f"it has not the hash that {INPUTS_FILE} says" if data else "it is not there",
         )
     try:
         rows = [] if data is None else json.loads(data)

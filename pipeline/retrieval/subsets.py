@@ -11,14 +11,14 @@ import numpy as np
 
 from pipeline.core.arrays import Ints, Strings
 from pipeline.features.table import Floats
-from pipeline.retrieval.exact_scores import on_grid
-from pipeline.retrieval.ranking import Side, side_of_array
+from pipeline.retrieval.exact_scores import round_to_grid
+from pipeline.retrieval.ranking import EmbeddingSet, embedding_set_from_array
 
 BLOCK_ROWS = 4_096  # 32 MB at 2,048 dimensions
 
 
 @dataclass(frozen=True, kw_only=True)
-class Chosen:
+class RowSample:
     """Rows of a side with their vectors."""
 
     keys_N: Strings
@@ -26,16 +26,16 @@ class Chosen:
     vectors_ND: Floats
 
 
-def taken(side: Side, rows_N: Ints) -> Chosen:
+def take_rows(side: EmbeddingSet, rows_N: Ints) -> RowSample:
     """These rows, in the order asked for."""
-    return Chosen(
+    return RowSample(
         keys_N=side.keys[rows_N],
         locations_N=side.locations[rows_N],
-        vectors_ND=vectors_of(side, rows_N),
+        vectors_ND=read_vectors(side, rows_N),
     )
 
 
-def evenly(total: int, most: int) -> Ints:
+def evenly_spaced(total: int, most: int) -> Ints:
     """At most `most` of the numbers below `total`, evenly spaced from the first to the last,
     ascending.
     """
@@ -44,7 +44,7 @@ def evenly(total: int, most: int) -> Ints:
     return np.round(np.linspace(0, total - 1, most)).astype(np.int64)
 
 
-def vectors_of(side: Side, rows_N: Ints) -> Floats:
+def read_vectors(side: EmbeddingSet, rows_N: Ints) -> Floats:
     """Vectors (N, D) of these rows, in the order asked for; the side is read once, no more than a
     block of it in memory.
     """
@@ -62,21 +62,21 @@ def vectors_of(side: Side, rows_N: Ints) -> Floats:
     return found_ND
 
 
-def vectors_by_key(side: Side, keys: Iterable[str]) -> dict[str, Floats]:
+def vectors_by_key(side: EmbeddingSet, keys: Iterable[str]) -> dict[str, Floats]:
     """Vectors (D,) of the rows with these keys; keys that the side does not hold are absent."""
     rows_N = np.flatnonzero(np.isin(side.keys, np.array(sorted(keys), np.str_)))
     return (
-        dict(zip(side.keys[rows_N].tolist(), vectors_of(side, rows_N), strict=True))
+        dict(zip(side.keys[rows_N].tolist(), read_vectors(side, rows_N), strict=True))
         if len(rows_N)
         else {}
     )
 
 
-VIEWS = (1, 2, 3, 6, 9, 18, 27, 54)  # the divisors of University-1652's 54 views
-MEAN_ROWS = 4_096  # rows added to their means at once: 64 MB of float64 at 2,048 dimensions
+VIEW_COUNTS = (1, 2, 3, 6, 9, 18, 27, 54)  # the divisors of University-1652's 54 views
+MEAN_BLOCK_ROWS = 4_096  # rows added to their means at once: 64 MB of float64 at 2,048 dimensions
 
 
-def mean_by_location(side: Side) -> Side:
+def mean_by_location(side: EmbeddingSet) -> EmbeddingSet:
     """One query per location: the mean of its vectors, brought to unit length; its key is the
     location's name.
     """
@@ -84,15 +84,15 @@ def mean_by_location(side: Side) -> Side:
     return mean_by_group(side, location_Q, names, names)
 
 
-def views_possible(side: Side) -> list[int]:
+def possible_view_counts(side: EmbeddingSet) -> list[int]:
     """Those of VIEWS that every location has enough images for, so that all are measured on the
     same locations.
     """
     _, count_L = np.unique(side.locations, return_counts=True)
-    return [views for views in VIEWS if len(count_L) and views <= count_L.min()]
+    return [views for views in VIEW_COUNTS if len(count_L) and views <= count_L.min()]
 
 
-def mean_by_views(side: Side, views: int) -> Side:
+def mean_by_views(side: EmbeddingSet, views: int) -> EmbeddingSet:
     """Queries of `views` images each: of c images of a location, c // views groups, the rest left
     out.
 
@@ -119,10 +119,12 @@ def mean_by_views(side: Side, views: int) -> Side:
     return mean_by_group(side, group_Q, keys_G, locations_G)
 
 
-def mean_by_group(side: Side, group_Q: Ints, keys_G: Strings, locations_G: Strings) -> Side:
+def mean_by_group(
+    side: EmbeddingSet, group_Q: Ints, keys_G: Strings, locations_G: Strings
+) -> EmbeddingSet:
     """The mean at unit length of each group's vectors; rows of group -1 are left out."""
     total_GD, begin = np.zeros((len(keys_G), 0)), 0
-    for block_BD in side.blocks(MEAN_ROWS):
+    for block_BD in side.blocks(MEAN_BLOCK_ROWS):
         if not begin:
             total_GD = np.zeros((len(keys_G), block_BD.shape[1]))
         group_B = group_Q[begin : begin + len(block_BD)]
@@ -133,8 +135,8 @@ def mean_by_group(side: Side, group_Q: Ints, keys_G: Strings, locations_G: Strin
             # Sums on the grid are exact, so the mean does not depend on the order of the rows
             # either.
             total_GD[groups] += np.add.reduceat(
-                on_grid(block_BD)[order_B].astype(np.float64), starts, axis=0
+                round_to_grid(block_BD)[order_B].astype(np.float64), starts, axis=0
             )
     length_G1 = np.linalg.norm(total_GD, axis=1, keepdims=True)
     mean_GD = (total_GD / np.maximum(length_G1, np.finfo(np.float64).tiny)).astype(np.float32)
-    return side_of_array(keys_G, locations_G, mean_GD)
+    return embedding_set_from_array(keys_G, locations_G, mean_GD)

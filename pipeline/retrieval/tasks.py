@@ -18,13 +18,13 @@ from pipeline.core.geo import haversine_m
 from pipeline.core.records import Split, View
 from pipeline.features.table import FeatureTable, Floats
 from pipeline.retrieval import geo_metrics, metrics
-from pipeline.retrieval.bootstrap import intervals
+from pipeline.retrieval.bootstrap import confidence_intervals
 from pipeline.retrieval.metrics import Protocol
-from pipeline.retrieval.ranking import Blocks, Ranking, Side, rank_spread
+from pipeline.retrieval.ranking import BlockSizes, EmbeddingSet, Ranking, rank_distributed
 from pipeline.retrieval.subsets import mean_by_location
 
-TOP = 10
-MEASURES = ("r1", "r5", "r10", "r1p", "ap")
+TOP_K = 10
+METRIC_NAMES = ("r1", "r5", "r10", "r1p", "ap")
 
 METRICS_SCHEMA = pa.schema(
     [
@@ -40,7 +40,7 @@ METRICS_SCHEMA = pa.schema(
         ("ap", pa.float64()),
         ("fingerprint", pa.string()),
         # 95 % bootstrap over locations
-        *((f"{name}_{end}", pa.float64()) for name in MEASURES for end in ("low", "high")),
+        *((f"{name}_{end}", pa.float64()) for name in METRIC_NAMES for end in ("low", "high")),
         # queries with a position; 0 where distances cannot be told, and then they are null
         ("geo_queries", pa.int64()),
         ("distance_median_m", pa.float64()),
@@ -102,14 +102,16 @@ def possible_tasks(queries: FeatureTable, gallery: FeatureTable) -> list[Task]:
     ]
 
 
-def side_of(table: FeatureTable) -> Side:
+def embedding_set_from_table(table: FeatureTable) -> EmbeddingSet:
     """The selected rows of a feature table."""
     labels = table.labels()
     places = np.stack([labels.lats, labels.lons], axis=1)
-    return Side(keys=labels.keys, locations=labels.locations, blocks=table.blocks, positions=places)
+    return EmbeddingSet(
+        keys=labels.keys, locations=labels.locations, blocks=table.blocks, positions=places
+    )
 
 
-def only_locations(side: Side, locations: Strings) -> Side:
+def filter_locations(side: EmbeddingSet, locations: Strings) -> EmbeddingSet:
     """The rows that show one of these locations: the gallery of the protocol `queried-only`."""
     keep = np.isin(side.locations, locations)
 
@@ -122,7 +124,7 @@ def only_locations(side: Side, locations: Strings) -> Side:
                 yield kept_BD
 
     places = None if side.positions is None else side.positions[keep]
-    return Side(
+    return EmbeddingSet(
         keys=side.keys[keep], locations=side.locations[keep], blocks=blocks, positions=places
     )
 
@@ -142,7 +144,7 @@ def retrieve(
     queries: FeatureTable,
     gallery: FeatureTable,
     protocol: Protocol = "full",
-    blocks: Blocks | None = None,
+    blocks: BlockSizes | None = None,
     advance: Callable[[int], None] = lambda scores: None,
     workers: int = 0,
 ) -> TaskResults:
@@ -151,27 +153,27 @@ def retrieve(
 
     Raises InputError when no gallery row is left, or a feature is not of unit length.
     """
-    query_side, gallery_side = sides_of(task, queries, gallery, protocol)
-    found = rank_spread(query_side, gallery_side, TOP, workers, advance, blocks)
+    query_side, gallery_side = task_embedding_sets(task, queries, gallery, protocol)
+    found = rank_distributed(query_side, gallery_side, TOP_K, workers, advance, blocks)
     return TaskResults(
         metrics=_metric_row(task, protocol, query_side, gallery_side, found, queries.fingerprint),
         queries=_result_rows(task, protocol, query_side, gallery_side, found),
     )
 
 
-def sides_of(
+def task_embedding_sets(
     task: Task, queries: FeatureTable, gallery: FeatureTable, protocol: Protocol
-) -> tuple[Side, Side]:
+) -> tuple[EmbeddingSet, EmbeddingSet]:
     """What is ranked for what.
 
     Raises InputError when nothing is left of either.
     """
-    query_side = side_of(queries.select(Split.QUERY, task.query_view))
-    gallery_side = side_of(gallery.select(Split.GALLERY, task.gallery_view))
+    query_side = embedding_set_from_table(queries.select(Split.QUERY, task.query_view))
+    gallery_side = embedding_set_from_table(gallery.select(Split.GALLERY, task.gallery_view))
     if task.multi_query:
         query_side = mean_by_location(query_side)
     if protocol == "queried-only":
-        gallery_side = only_locations(gallery_side, query_side.locations)
+        gallery_side = filter_locations(gallery_side, query_side.locations)
     if not len(gallery_side.keys) or not len(query_side.keys):
         raise InputError(
             f"{task} has {len(query_side.keys)} queries and {len(gallery_side.keys)} gallery rows under the protocol "
@@ -181,7 +183,12 @@ def sides_of(
 
 
 def _metric_row(
-    task: Task, protocol: Protocol, queries: Side, gallery: Side, found: Ranking, fingerprint: str
+    task: Task,
+    protocol: Protocol,
+    queries: EmbeddingSet,
+    gallery: EmbeddingSet,
+    found: Ranking,
+    fingerprint: str,
 ) -> dict[str, Any]:
     scores = metrics.summarise(found.first_rank_Q, found.ap_Q, len(gallery.keys))
     row: dict[str, Any] = {
@@ -190,26 +197,27 @@ def _metric_row(
         "multi_query": task.multi_query,
         "queries": len(queries.keys),
         "gallery": len(gallery.keys),
-        **{name: getattr(scores, name) for name in MEASURES},
+        **{name: getattr(scores, name) for name in METRIC_NAMES},
         "fingerprint": fingerprint,
     }
-    bounds = intervals(
-        metrics.per_query(found.first_rank_Q, found.ap_Q, len(gallery.keys)), queries.locations
+    bounds = confidence_intervals(
+        metrics.per_query_values(found.first_rank_Q, found.ap_Q, len(gallery.keys)),
+        queries.locations,
     )
-    for name, (low, high) in zip(MEASURES, bounds.T.tolist(), strict=True):
+    for name, (low, high) in zip(METRIC_NAMES, bounds.T.tolist(), strict=True):
         row |= {f"{name}_low": low, f"{name}_high": high}
     unknown = np.full((len(queries.keys), 2), np.nan)
     given = _positions(gallery)
     asked = unknown if np.isnan(given).any() else _positions(queries)
-    return row | geo_metrics.measures(asked, given[found.top_rows_QK])
+    return row | geo_metrics.distance_metrics(asked, given[found.top_rows_QK])
 
 
-def _positions(side: Side) -> Doubles:
+def _positions(side: EmbeddingSet) -> Doubles:
     return np.full((len(side.keys), 2), np.nan) if side.positions is None else side.positions
 
 
 def _result_rows(
-    task: Task, protocol: Protocol, queries: Side, gallery: Side, found: Ranking
+    task: Task, protocol: Protocol, queries: EmbeddingSet, gallery: EmbeddingSet, found: Ranking
 ) -> pa.Table:
     unmatched_Q = found.first_rank_Q == 0
     count, kept = found.top_rows_QK.shape

@@ -15,11 +15,11 @@ import numpy as np
 
 from pipeline.core.arrays import Doubles, Ints, Strings
 from pipeline.features.table import Floats
-from pipeline.retrieval.subsets import Chosen, evenly
+from pipeline.retrieval.subsets import RowSample, evenly_spaced
 
-MOST_ROWS = 400
+MAX_ROWS_PER_VIEW = 400
 "Of each view: more points than a picture can tell apart, and an eigenproblem of half a second."
-MOST_JOINED = 40
+MAX_JOINED_PAIRS = 40
 "True pairs that a picture joins with lines."
 PERCENTILES = (5, 95)
 DECIMALS = 5  # of what is written: below the error of float32 sums
@@ -36,14 +36,14 @@ class Projection:
     "Share of the variance along either axis, both views weighing alike."
 
 
-def choose(
-    query_locations: Strings, gallery_locations: Strings, most: int = MOST_ROWS
+def choose_common_rows(
+    query_locations: Strings, gallery_locations: Strings, most: int = MAX_ROWS_PER_VIEW
 ) -> tuple[Ints, Ints]:
     """Rows of either side: as many of each common place as `most` allows, of at most `most` places,
     evenly spread.
     """
     places = np.intersect1d(query_locations, gallery_locations)
-    places_L = places[evenly(len(places), most)]
+    places_L = places[evenly_spaced(len(places), most)]
     each = max(1, most // max(len(places_L), 1))
     chosen = []
     for locations in (query_locations, gallery_locations):
@@ -52,13 +52,14 @@ def choose(
             np.searchsorted(locations[order], places_L, side=side) for side in ("left", "right")
         ]
         rows = [
-            order[begin:end][evenly(end - begin, each)] for begin, end in zip(*bounds, strict=True)
+            order[begin:end][evenly_spaced(end - begin, each)]
+            for begin, end in zip(*bounds, strict=True)
         ]
         chosen.append(np.concatenate([np.empty(0, np.int64), *rows]))
     return chosen[0], chosen[1]
 
 
-def project(query_ND: Floats, gallery_MD: Floats) -> Projection:
+def project_pca(query_ND: Floats, gallery_MD: Floats) -> Projection:
     """Onto the two directions of greatest variance round the middle of the views' means; either
     view weighs a half.
     """
@@ -96,7 +97,7 @@ def mean_distance(query_ND: Floats, gallery_MD: Floats) -> float:
     return float(np.linalg.norm(means[1] - means[0]) / max(np.sqrt(np.mean(squares)), 1e-12))
 
 
-def cosines(scores: Floats) -> dict[str, float | int]:
+def cosine_summary(scores: Floats) -> dict[str, float | int]:
     """Mean and 5th and 95th percentile of some pairs' cosines."""
     low, high = np.percentile(scores, PERCENTILES) if len(scores) else (np.nan, np.nan)
     mean = scores.mean(dtype=np.float64) if len(scores) else np.nan
@@ -106,7 +107,7 @@ def cosines(scores: Floats) -> dict[str, float | int]:
     }
 
 
-def describe(query: Chosen, gallery: Chosen) -> dict[str, Any]:
+def describe_gap(query: RowSample, gallery: RowSample) -> dict[str, Any]:
     """The gap in figures, the points, and the index pairs of points to join: one true pair each of
     evenly chosen places.
 
@@ -117,7 +118,7 @@ def describe(query: Chosen, gallery: Chosen) -> dict[str, Any]:
     if same_NM.all():
         raise ValueError("the rows show one place, expected several; choose rows of more places")
     scores_NM = query.vectors_ND @ gallery.vectors_ND.T
-    picture = project(query.vectors_ND, gallery.vectors_ND)
+    picture = project_pca(query.vectors_ND, gallery.vectors_ND)
     named = [
         {"key": key, "location": place, "side": side}
         for side, rows in (("query", query), ("gallery", gallery))
@@ -126,13 +127,13 @@ def describe(query: Chosen, gallery: Chosen) -> dict[str, Any]:
     places, first_L = np.unique(query.locations_N, return_index=True)
     joined = [
         [int(first_L[i]), len(query.keys_N) + int(np.argmax(same_NM[first_L[i]]))]
-        for i in evenly(len(places), MOST_JOINED)
+        for i in evenly_spaced(len(places), MAX_JOINED_PAIRS)
     ]
     return {
         "shares": [round(share, DECIMALS) for share in picture.shares],
         "distance": round(mean_distance(query.vectors_ND, gallery.vectors_ND), DECIMALS),
-        "true": cosines(scores_NM[same_NM]),
-        "other": cosines(scores_NM[~same_NM]),
+        "true": cosine_summary(scores_NM[same_NM]),
+        "other": cosine_summary(scores_NM[~same_NM]),
         "points": [
             name | {"x": round(x, DECIMALS), "y": round(y, DECIMALS)}
             for name, (x, y) in zip(named, picture.points_S2.tolist(), strict=True)

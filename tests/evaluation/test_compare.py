@@ -13,14 +13,14 @@ from pipeline.core.errors import InputError
 from pipeline.evaluation.compare import compare, latex, markdown
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.settings import EvaluationSettings
-from pipeline.report.inputs import Findings, read_findings
+from pipeline.report.inputs import EvaluationResults, read_evaluation
 from pipeline.retrieval.tasks import RESULTS_SCHEMA
 from tests.evaluation.test_evaluate import TEST_SET, made_table
 
 
 def run(
     name: str, ranks: list[int | None], task: str = "drone->satellite", multi: bool = False
-) -> Findings:
+) -> EvaluationResults:
     """An evaluation of queries of two images a location, from their first ranks."""
     rows = [
         {
@@ -48,7 +48,7 @@ def run(
         "ap": sum(float(row["ap"] or 0) for row in rows) / len(rows),
         "fingerprint": "f",
     }
-    return Findings(
+    return EvaluationResults(
         name=name, metrics=[metrics], results=pa.Table.from_pylist(rows, RESULTS_SCHEMA)
     )
 
@@ -99,7 +99,7 @@ def test_multi_query_has_its_own_table() -> None:
         ([run("a", [1]), run("b", [1, 1])], r"b ranked 2 queries .* expected the same images"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(runs: list[Findings], sentence: str) -> None:
+def test_what_cannot_be_compared_is_refused(runs: list[EvaluationResults], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         compare(runs)
 
@@ -116,7 +116,7 @@ def test_finished_folders_are_compared(tmp_path: Path) -> None:
         table = made_table(tmp_path / f"t{seed}", TEST_SET, seed=seed)
         evaluate(EvaluationSettings(table=table, out=str(tmp_path / name)))
     rows: list[dict[str, Any]] = compare(
-        [read_findings(str(tmp_path / name)) for name in ("base", "again")]
+        [read_evaluation(str(tmp_path / name)) for name in ("base", "again")]
     )
     assert [row["run"] for row in rows] == ["base", "again"] * 3
     assert markdown(rows).count("###") == 3

@@ -40,7 +40,14 @@ from pipeline.index.metadata import (
 from pipeline.locate.calibration import Calibration, read_calibration, write_calibration
 from pipeline.locate.logistic import LogisticModel
 from pipeline.locate.reliability import ReliabilityBin
-from pipeline.retrieval.results import INPUTS, METRICS, VIEWS, read_inputs, read_rows, write_inputs
+from pipeline.retrieval.results import (
+    INPUTS_FILE,
+    METRICS_FILE,
+    VIEWS_FILE,
+    read_inputs,
+    read_result_rows,
+    write_inputs,
+)
 from pipeline.shards import record_table
 from pipeline.shards.manifest import MANIFEST, Manifest, Shard, read_manifest
 from pipeline.shards.record_table import Packed
@@ -323,15 +330,15 @@ def test_an_evaluation_is_read_back_as_it_was_written_or_not_at_all(tmp_path: Pa
             "ap": 0.5,
         }
     ]
-    storage.write_json(str(tmp_path / VIEWS), [{"views": 3, "r1": 0.5}])
+    storage.write_json(str(tmp_path / VIEWS_FILE), [{"views": 3, "r1": 0.5}])
     write_inputs(
         str(tmp_path), {"ranked": {"queries": "q" * 64}, "shown": {}}, storage.encode_json(metrics)
     )
-    storage.write_json(str(tmp_path / METRICS), metrics)
-    for name, listed in ((METRICS, METRICS), (VIEWS, VIEWS)):
-        read = partial(read_rows, str(tmp_path), listed)
+    storage.write_json(str(tmp_path / METRICS_FILE), metrics)
+    for name, listed in ((METRICS_FILE, METRICS_FILE), (VIEWS_FILE, VIEWS_FILE)):
+        read = partial(read_result_rows, str(tmp_path), listed)
         assert count_detected(tmp_path / name, read, 200) == 201
-    path = tmp_path / INPUTS
+    path = tmp_path / INPUTS_FILE
     assert (
         count_detected(path, raising_if_missing(path, lambda: read_inputs(str(tmp_path))), 200)
         > 150

@@ -15,7 +15,7 @@ import pytest
 from pipeline.core.records import Split, View
 from pipeline.features.table import Floats, PartFooter, PartRows, open_table, write_part
 from pipeline.retrieval.metrics import Protocol
-from pipeline.retrieval.ranking import Blocks
+from pipeline.retrieval.ranking import BlockSizes
 from pipeline.retrieval.tasks import Task, retrieve
 
 Listed = list[tuple[str, Floats]]
@@ -105,7 +105,7 @@ def test_every_figure_is_that_of_a_loop_over_the_queries(
         if protocol == "queried-only":
             shown = [row for row in shown if row[0] in {place for place, _ in asked}]
         expected = by_hand(asked, shown)
-        for cut in (Blocks(), Blocks(held_queries=50, query_rows=7, gallery_rows=5)):
+        for cut in (BlockSizes(), BlockSizes(queries_in_memory=50, query_rows=7, gallery_rows=5)):
             found = retrieve(
                 Task(query_view=ask, gallery_view=show), opened, opened, protocol, cut
             ).metrics

@@ -41,7 +41,7 @@ from pipeline.locate.calibration import (
 )
 from pipeline.locate.logistic import LogisticModel
 from pipeline.locate.reliability import ReliabilityBin
-from pipeline.report.inputs import read_findings, read_training
+from pipeline.report.inputs import read_evaluation, read_training
 from pipeline.shards.manifest import Manifest, Shard, read_manifest
 from pipeline.shards.pack import find_finished
 from pipeline.shards.record_table import Packed, read_packed, read_part
@@ -326,7 +326,7 @@ def test_a_finished_evaluation_and_a_runs_curves(folder: Path, data: st.DataObje
     put(data, out / "metrics.json", METRICS)
     put(data, out / "views.json", METRICS)
     with bounded(InputError):
-        read_findings(str(out))
+        read_evaluation(str(out))
     put(data, out / "metrics.jsonl", {"epoch": 1, "step": 3}, checksum=False)
     with bounded(InputError):
         read_training(str(out))

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.evaluation.evaluate import plan
+from pipeline.evaluation.evaluate import plan_tasks
 from pipeline.evaluation.settings import EvaluationSettings
 from pipeline.features.table import open_table
 from pipeline.index.build import build_index
@@ -159,10 +159,10 @@ def test_an_evaluation_looks_at_every_byte_of_its_tables_when_asked(
 ) -> None:
     spoilt = Path(shutil.copytree(table, tmp_path / "table"))
     asked = EvaluationSettings(table=str(spoilt), out=str(tmp_path / "out"), verify=True)
-    plan(asked)
+    plan_tasks(asked)
     path = next(spoilt.glob("query*"))
     path.write_bytes(path.read_bytes().replace(b"query", b"quary", 1))
     with pytest.raises(
         InputError, match=rf"{path} is not a readable Parquet file .*embed its shard again"
     ):
-        plan(asked)
+        plan_tasks(asked)

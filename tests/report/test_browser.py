@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from pipeline.report import page as report
-from pipeline.report.inputs import Extras, Findings
+from pipeline.report.inputs import EvaluationResults, ReportContext
 from pipeline.retrieval.tasks import RESULTS_SCHEMA
 from tests.report.test_sections import GAP, GROUPS, PARTS
 
@@ -71,7 +71,7 @@ def result(location: str, first: int | None, multi: bool = False) -> dict[str, A
     }
 
 
-def findings(rows: list[dict[str, Any]], name: str) -> Findings:
+def findings(rows: list[dict[str, Any]], name: str) -> EvaluationResults:
     counts = {
         "task": "drone->satellite",
         "protocol": "full",
@@ -104,7 +104,7 @@ def findings(rows: list[dict[str, Any]], name: str) -> Findings:
     groups = tuple(GROUPS[0] | {"value": value} for value in (LONG, "50 to 100"))
     merged = [result(row["location"], 1, multi=True) for row in rows]
     of_merged = metrics | {"multi_query": True, "queries": len(merged), "geo_queries": 0}
-    return Findings(
+    return EvaluationResults(
         name=name,
         metrics=[metrics, of_merged],
         views=views,
@@ -140,10 +140,10 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> str:
         {"epoch": e, "location_loss": 9 / e, "view_loss": 0.7, "alpha": 0.9 + e // 5}
         for e in range(1, 9)
     )
-    extras = Extras(title="A town", beside=findings(rows, LONG), training=training)
+    extras = ReportContext(title="A town", beside=findings(rows, LONG), training=training)
     path: Path = tmp_path_factory.mktemp("page") / "report.html"
     vector = np.full(4, 0.5, np.float32)
-    path.write_text(report.render(
+    path.write_text(report.render_report(
         findings(rows, "out"), extras, lambda keys: dict.fromkeys(keys, stream.getvalue()),
         lambda keys: dict.fromkeys(keys, vector), panels=12,
     ))  # fmt: skip

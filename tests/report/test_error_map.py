@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from pipeline.core.geo import haversine_m
 from pipeline.report.error_map import distance_chart, error_map
-from pipeline.report.map_sheet import HEIGHT, WIDTH, Sheet, metres
+from pipeline.report.map_sheet import MAP_HEIGHT, MAP_WIDTH, MapSheet, format_metres
 
 Position = tuple[float, float]
 
@@ -55,7 +55,7 @@ def test_a_line_leads_from_a_place_to_where_its_wrong_answer_lies() -> None:
 
 
 def test_the_scale_bar_is_a_round_distance_at_the_maps_scale() -> None:
-    sheet = Sheet.around(np.array([A, B, C]))
+    sheet = MapSheet.around(np.array([A, B, C]))
     length, said = sheet.bar()
     metres_across = (sheet.x(B[1]) - sheet.x(A[1])) / sheet.scale
     assert metres_across == pytest.approx(float(haversine_m(np.array(A), np.array(B))), rel=2e-3)
@@ -65,23 +65,23 @@ def test_the_scale_bar_is_a_round_distance_at_the_maps_scale() -> None:
 
 
 def test_places_on_both_sides_of_the_180th_meridian_are_neighbours() -> None:
-    sheet = Sheet.around(np.array([(-17.0, 179.0), (-18.0, -179.0), (-17.5, 178.0)]))
+    sheet = MapSheet.around(np.array([(-17.0, 179.0), (-18.0, -179.0), (-17.5, 178.0)]))
     assert sheet.wide == pytest.approx(3)
     assert sheet.x(178.0) < sheet.x(179.0) < sheet.x(-179.0)
 
 
 @given(at=st.lists(st.tuples(st.floats(-89, 89), st.floats(-180, 180)), min_size=1, max_size=8))
 def test_every_place_lies_on_the_sheet_wherever_on_earth(at: list[Position]) -> None:
-    sheet = Sheet.around(np.array(at))
+    sheet = MapSheet.around(np.array(at))
     for x, y in sheet.xy(np.array(at)):
-        assert -0.2 <= x <= WIDTH + 0.2
-        assert -0.2 <= y <= HEIGHT + 0.2
+        assert -0.2 <= x <= MAP_WIDTH + 0.2
+        assert -0.2 <= y <= MAP_HEIGHT + 0.2
     assert all(math.isfinite(tick.at) for tick in (*sheet.meridians(), *sheet.parallels()))
-    assert 0 < sheet.bar()[0] <= WIDTH / 3 + 0.1
+    assert 0 < sheet.bar()[0] <= MAP_WIDTH / 3 + 0.1
 
 
 def test_a_world_map_has_meridians_and_parallels() -> None:
-    sheet = Sheet.around(np.array([(51.5, -0.1), (40.7, -74.0), (-33.9, 151.2)]))
+    sheet = MapSheet.around(np.array([(51.5, -0.1), (40.7, -74.0), (-33.9, 151.2)]))
     assert {"0°", "50° N"} <= {tick.label for tick in sheet.parallels()}
     assert [tick.label for tick in sheet.meridians()] == ["100° W", "0°", "100° E"]
     assert sheet.x(-74.0) < sheet.x(-0.1) < sheet.x(151.2)
@@ -132,4 +132,4 @@ def test_distances_are_drawn_as_the_share_within_so_many_metres() -> None:
     ],
 )
 def test_distances_are_said_as_people_say_them(value: float, said: str) -> None:
-    assert metres(value) == said
+    assert format_metres(value) == said

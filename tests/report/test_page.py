@@ -16,8 +16,14 @@ from pipeline.core.errors import InputError
 from pipeline.images.thumbnails import ThumbnailCache, no_images, thumbnail
 from pipeline.report import page as report
 from pipeline.report.charts import scores_chart, views_chart
-from pipeline.report.inputs import Extras, Findings, read_training
-from pipeline.report.panels import distance, keys_shown, make_panel, spread, sureness
+from pipeline.report.inputs import EvaluationResults, ReportContext, read_training
+from pipeline.report.panels import (
+    confidence_order,
+    error_order,
+    make_panel,
+    panel_keys,
+    spread_over_locations,
+)
 from pipeline.report.svg import nice_ticks, recall_chart, training_charts
 from pipeline.retrieval.tasks import RESULTS_SCHEMA
 
@@ -44,7 +50,7 @@ def result(
     }
 
 
-def findings(rows: list[dict[str, Any]], name: str = "out", r1: float = 0.5) -> Findings:
+def findings(rows: list[dict[str, Any]], name: str = "out", r1: float = 0.5) -> EvaluationResults:
     metrics = {
         "task": "drone->satellite",
         "protocol": "full",
@@ -58,7 +64,7 @@ def findings(rows: list[dict[str, Any]], name: str = "out", r1: float = 0.5) -> 
         "ap": 0.625,
         "fingerprint": "abcdef0123456789" * 4,
     }
-    return Findings(
+    return EvaluationResults(
         name=name, metrics=[metrics], results=pa.Table.from_pylist(rows, RESULTS_SCHEMA)
     )
 
@@ -72,11 +78,11 @@ def jpeg(colour: str, size: tuple[int, int] = (400, 300)) -> bytes:
 TOWN = [result("0001", 1), result("0002", 3), result("0003", 40), result("0004", None)]
 
 
-def page(rows: list[dict[str, Any]] = TOWN, extras: Extras | None = None) -> str:
-    pictures = {key: jpeg("olive") for key in keys_shown(rows)}
-    return report.render(
+def page(rows: list[dict[str, Any]] = TOWN, extras: ReportContext | None = None) -> str:
+    pictures = {key: jpeg("olive") for key in panel_keys(rows)}
+    return report.render_report(
         findings(rows),
-        extras or Extras(title="Town"),
+        extras or ReportContext(title="Town"),
         lambda keys: {key: pictures[key] for key in keys},
     )
 
@@ -116,7 +122,7 @@ def test_hostile_names_stay_names() -> None:
     evil = "<script>alert(1)</script>\"'"
     text = page(
         [result(evil, 1), result(evil, 2, 0.8)],
-        Extras(title=evil, training=({"epoch": 1, "location_loss": 1.0},)),
+        ReportContext(title=evil, training=({"epoch": 1, "location_loss": 1.0},)),
     )
     assert "<script" not in text
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
@@ -131,13 +137,15 @@ def test_the_page_needs_nothing_but_itself() -> None:
 
 
 def test_without_pictures_the_page_says_how_to_get_them() -> None:
-    text = report.render(findings(TOWN), Extras(title="Town"), no_images)
+    text = report.render_report(findings(TOWN), ReportContext(title="Town"), no_images)
     assert "evaluate again with <code>--shards</code>" in text
     assert "<img" not in text
 
 
 def test_another_evaluation_stands_beside_with_the_difference() -> None:
-    text = page(extras=Extras(title="Town", beside=findings(TOWN, name="untrained", r1=0.125)))
+    text = page(
+        extras=ReportContext(title="Town", beside=findings(TOWN, name="untrained", r1=0.125))
+    )
     assert "12.50" in text
     assert "+37.50" in text
     assert "untrained" in text
@@ -147,7 +155,7 @@ def test_an_evaluation_of_other_images_does_not_stand_beside() -> None:
     with pytest.raises(
         InputError, match=r"untrained ranked 3 queries in 951 rows .* this evaluation 4 in 951"
     ):
-        page(extras=Extras(title="Town", beside=findings(TOWN[:3], name="untrained")))
+        page(extras=ReportContext(title="Town", beside=findings(TOWN[:3], name="untrained")))
 
 
 def test_no_hits_and_no_misses_are_said_in_words() -> None:
@@ -157,12 +165,23 @@ def test_no_hits_and_no_misses_are_said_in_words() -> None:
 
 def test_panels_are_spread_over_the_range_and_over_locations() -> None:
     rows = [result(f"{i % 10:04d}", 1, 0.5 + 0.001 * i) for i in range(100)]
-    chosen = spread(rows, 4, sureness)
+    chosen = spread_over_locations(rows, 4, confidence_order)
     assert [row["location"] for row in chosen] == ["0009", "0006", "0003", "0000"]
-    assert chosen == spread(rows[::-1], 4, sureness)
-    assert [row["first_match_rank"] for row in spread(TOWN, 3, distance)] == [None, 3, 1]
-    assert len(spread(rows[:2], 4, sureness)) == 2
-    assert len(spread([result("0001", 1, 0.1 * i) for i in range(1, 9)], 4, sureness)) == 4
+    assert chosen == spread_over_locations(rows[::-1], 4, confidence_order)
+    assert [row["first_match_rank"] for row in spread_over_locations(TOWN, 3, error_order)] == [
+        None,
+        3,
+        1,
+    ]
+    assert len(spread_over_locations(rows[:2], 4, confidence_order)) == 2
+    assert (
+        len(
+            spread_over_locations(
+                [result("0001", 1, 0.1 * i) for i in range(1, 9)], 4, confidence_order
+            )
+        )
+        == 4
+    )
 
 
 def test_thumbnails_are_small_and_damaged_pictures_are_left_out() -> None:
@@ -265,15 +284,15 @@ def test_the_page_shows_intervals_distances_and_what_more_views_bring() -> None:
         "within_100m": 1.0,
     }
     plain = findings(TOWN)
-    full = Findings(
+    full = EvaluationResults(
         name="out", metrics=[plain.metrics[0] | SURE | geo], results=plain.results, views=CURVE
     )
-    text = report.render(full, Extras(title="Town"), lambda keys: {})
+    text = report.render_report(full, ReportContext(title="Town"), lambda keys: {})
     assert "40.0 to 60.0" in text
     assert "best answer off by 12 m (median); within 25, 50, 100 m: 50.00, 75.00, 100.00" in text
     assert "R@1 by views a query: 1 views: 1.85 %, 6 views: 11.11 %, 54 views: 100.00 %" in text
     assert "median score" in text
-    before = report.render(plain, Extras(title="Town"), lambda keys: {})
+    before = report.render_report(plain, ReportContext(title="Town"), lambda keys: {})
     assert "R@1 by views" not in before
     assert "95 % interval" not in before
 

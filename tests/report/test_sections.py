@@ -11,9 +11,9 @@ import pyarrow as pa
 
 from pipeline.report import page as report
 from pipeline.report.charts import HEIGHT, WIDTH, scatter
-from pipeline.report.inputs import Extras, Findings
+from pipeline.report.inputs import EvaluationResults, ReportContext
 from pipeline.report.tables import group_tables, part_tables
-from pipeline.report.tasks import pair_up
+from pipeline.report.tasks import pair_queries
 from pipeline.retrieval.tasks import RESULTS_SCHEMA
 from tests.report.test_page import TOWN, findings, jpeg, result
 
@@ -45,7 +45,7 @@ def merged(location: str, first: int | None) -> dict[str, Any]:
     return result(location, first) | {"query": location, "multi_query": True}
 
 
-def full(single: list[dict[str, Any]], multi: list[dict[str, Any]]) -> Findings:
+def full(single: list[dict[str, Any]], multi: list[dict[str, Any]]) -> EvaluationResults:
     plain = findings(single)
     metrics = [plain.metrics[0], plain.metrics[0] | {"multi_query": True, "queries": len(multi)}]
     return replace(
@@ -60,13 +60,15 @@ def full(single: list[dict[str, Any]], multi: list[dict[str, Any]]) -> Findings:
 
 def test_the_page_has_the_sections_that_there_is_something_for() -> None:
     multi = [merged(row["location"], 1) for row in TOWN]
-    text = report.render(
-        full(TOWN, multi), Extras(title="Town"), lambda keys: dict.fromkeys(keys, jpeg("olive"))
+    text = report.render_report(
+        full(TOWN, multi),
+        ReportContext(title="Town"),
+        lambda keys: dict.fromkeys(keys, jpeg("olive")),
     )
     anchors = set(re.findall(r'<a href="#([^"]+)">', text))
     assert {"groups", "parts", "gap", "drone-satellite-pairs"} <= anchors
     assert anchors <= set(re.findall(r' id="([^"]+)"', text))
-    plain = report.render(findings(TOWN), Extras(title="Town"), lambda keys: {})
+    plain = report.render_report(findings(TOWN), ReportContext(title="Town"), lambda keys: {})
     assert not {"groups", "parts", "gap", "map", "drone-satellite-pairs"} & set(
         re.findall(r'<section id="([^"]+)"', plain)
     )
@@ -78,8 +80,8 @@ def test_answers_say_part_by_part_how_they_agree() -> None:
         np.array(vector, np.float32) / np.float32(np.sqrt(2))
         for vector in ([1, 0, 0, 1], [1, 0, 1, 0])
     )
-    text = report.render(
-        full(TOWN, []), Extras(title="Town"), lambda keys: {},
+    text = report.render_report(
+        full(TOWN, []), ReportContext(title="Town"), lambda keys: {},
         lambda keys: {key: of_query if key.startswith("query") else of_answer for key in keys},
     )  # fmt: skip
     said = re.findall(r'aria-label="Cosine by part: ([^"]+)"', text)
@@ -95,7 +97,7 @@ def test_one_image_stands_beside_all_from_the_place_left_farthest_to_those_found
         for p, ranks in (("a", (1, 1)), ("b", (1, 7)), ("c", (3, 2)), ("d", (1, 2)))
         for first, score in zip(ranks, (0.9, 0.8), strict=True)
     ]
-    pairs = pair_up(
+    pairs = pair_queries(
         single,
         [merged("a", 2), merged("b", 1), merged("c", 4), merged("d", 1), merged("other", 1)],
         3,
@@ -108,7 +110,9 @@ def test_one_image_stands_beside_all_from_the_place_left_farthest_to_those_found
 
 def test_a_few_panels_spread_over_all_are_open_and_the_others_unfold() -> None:
     rows = [result(f"{i:04d}", 1, 0.5 + 0.01 * i) for i in range(20)]
-    text = report.render(findings(rows), Extras(title="Town"), lambda keys: {}, panels=15)
+    text = report.render_report(
+        findings(rows), ReportContext(title="Town"), lambda keys: {}, panels=15
+    )
     assert text.count('<article class="panel"') == 15
     assert "<summary>9 more hits</summary>" in text
     opened, folded = (
@@ -117,9 +121,9 @@ def test_a_few_panels_spread_over_all_are_open_and_the_others_unfold() -> None:
     )
     assert (opened, opened | folded) == ({1, 4, 7, 9, 12, 15}, set(range(1, 16)))
     assert (
-        report.render(findings(rows), Extras(title="Town"), lambda keys: {}, panels=0).count(
-            "<article"
-        )
+        report.render_report(
+            findings(rows), ReportContext(title="Town"), lambda keys: {}, panels=0
+        ).count("<article")
         == 0
     )
 

@@ -5,17 +5,17 @@ run.
 import numpy as np
 import pytest
 
-from pipeline.retrieval.bootstrap import intervals, paired, resampled_means
+from pipeline.retrieval.bootstrap import confidence_intervals, paired_difference, resampled_means
 
 
 def test_without_spread_the_interval_is_the_mean() -> None:
-    found = intervals(np.full((6, 1), 0.25), np.array(list("aabbcc")))
+    found = confidence_intervals(np.full((6, 1), 0.25), np.array(list("aabbcc")))
     assert found.tolist() == [[0.25], [0.25]]
 
 
 def test_the_spread_is_that_of_independent_draws_when_each_query_is_a_location() -> None:
     values = (np.arange(400) % 4 == 0).astype(float)[:, None]
-    low, high = intervals(values, np.arange(400).astype(str))[:, 0]
+    low, high = confidence_intervals(values, np.arange(400).astype(str))[:, 0]
     assert (high - low) / 2 == pytest.approx(1.96 * np.sqrt(0.25 * 0.75 / 400), rel=0.1)
 
 
@@ -23,8 +23,8 @@ def test_queries_of_one_location_count_as_one_observation() -> None:
     """Ten equal images of each place tell no more than one."""
     one = (np.arange(60) % 3 == 0).astype(float)[:, None]
     places = np.arange(60).astype(str)
-    assert intervals(np.repeat(one, 10, axis=0), np.repeat(places, 10)) == pytest.approx(
-        intervals(one, places)
+    assert confidence_intervals(np.repeat(one, 10, axis=0), np.repeat(places, 10)) == pytest.approx(
+        confidence_intervals(one, places)
     )
 
 
@@ -44,20 +44,20 @@ def test_the_draws_are_the_same_in_every_run_however_many_are_made_at_once(
         np.repeat(np.arange(10), 5).astype(str),
     )
     first = resampled_means(values, places, samples=100)
-    monkeypatch.setattr("pipeline.retrieval.bootstrap.WEIGHTS_AT_ONCE", 70)
+    monkeypatch.setattr("pipeline.retrieval.bootstrap.WEIGHTS_PER_BLOCK", 70)
     assert np.array_equal(resampled_means(values, places, samples=100), first)
 
 
 def test_no_queries_have_no_interval() -> None:
-    assert np.isnan(intervals(np.empty((0, 3)), np.array([], np.str_))).all()
+    assert np.isnan(confidence_intervals(np.empty((0, 3)), np.array([], np.str_))).all()
 
 
 def test_a_difference_is_sure_when_every_location_shows_it_and_not_when_half_do() -> None:
     places = np.arange(40).astype(str)
-    always = paired(np.ones(40), np.zeros(40), places)
+    always = paired_difference(np.ones(40), np.zeros(40), places)
     assert (always.mean, always.low, always.high) == (1, 1, 1)
     assert always.p == pytest.approx(2 / 2001)
-    half = paired(
+    half = paired_difference(
         (np.arange(40) % 2).astype(float), ((np.arange(40) + 1) % 2).astype(float), places
     )
     assert half.mean == 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.core.geo import EARTH_RADIUS_M, haversine_m
-from pipeline.retrieval.geo_metrics import measures, spatial_distance_metric
+from pipeline.retrieval.geo_metrics import distance_metrics, spatial_distance_metric
 
 DEGREE_M = math.pi / 180 * EARTH_RADIUS_M
 
@@ -35,7 +35,7 @@ def test_measures_are_over_the_queries_whose_place_is_known() -> None:
     queries = np.array([[0.0, 0], [0.0, 0], [0.0, 0], [np.nan, np.nan]])
     metres = np.array([0, 30, 200, 0]) / DEGREE_M
     answers = np.stack([np.stack([metres, np.zeros(4)], axis=1)] * 3, axis=1)
-    found = measures(queries, answers)
+    found = distance_metrics(queries, answers)
     assert found["geo_queries"] == 3
     assert found["distance_median_m"] == pytest.approx(30)
     assert [found[f"within_{m}m"] for m in (25, 50, 100)] == pytest.approx([1 / 3, 2 / 3, 2 / 3])
@@ -44,6 +44,6 @@ def test_measures_are_over_the_queries_whose_place_is_known() -> None:
 
 
 def test_a_gallery_that_is_tagged_in_part_yields_no_distances() -> None:
-    found = measures(np.zeros((2, 2)), np.array([[[0.0, 0]], [[np.nan, np.nan]]]))
+    found = distance_metrics(np.zeros((2, 2)), np.array([[[0.0, 0]], [[np.nan, np.nan]]]))
     assert found["geo_queries"] == 0
     assert {value for name, value in found.items() if name != "geo_queries"} == {None}

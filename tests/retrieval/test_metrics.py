@@ -60,25 +60,27 @@ def test_recall_counts_queries_without_a_match_in_the_denominator() -> None:
     [(951, 11), (51_355, 515), (701, 8), (50, 1), (150, 3), (250, 3), (1, 1), (100, 2)],
 )
 def test_the_top_one_percent_reads_the_rank_that_the_field_reads(gallery: int, k: int) -> None:
-    assert metrics.one_percent(gallery) == k
+    assert metrics.one_percent_k(gallery) == k
 
 
 def test_a_summary_holds_every_measure() -> None:
     first_Q, ap_Q = np.array([1, 6, 11, 12]), np.array([1.0, 0.5, 0.25, 0.25])
     found = metrics.summarise(first_Q, ap_Q, gallery=951)
-    assert found == metrics.Scores(r1=0.25, r5=0.25, r10=0.5, r1p=0.75, ap=0.5)
+    assert found == metrics.RetrievalMetrics(r1=0.25, r5=0.25, r10=0.5, r1p=0.75, ap=0.5)
 
 
 def test_no_queries_score_nothing() -> None:
     none = np.array([], np.int64)
-    assert metrics.summarise(none, none.astype(float), 5) == metrics.Scores(
+    assert metrics.summarise(none, none.astype(float), 5) == metrics.RetrievalMetrics(
         r1=0, r5=0, r10=0, r1p=0, ap=0
     )
 
 
 def test_chance_is_the_share_of_the_gallery_that_is_right() -> None:
-    assert metrics.chance(np.array([1, 3, 0]), gallery=8) == pytest.approx((1 / 8 + 3 / 8) / 3)
-    assert metrics.chance(np.array([], np.int64), gallery=8) == 0
+    assert metrics.chance_recall(np.array([1, 3, 0]), gallery=8) == pytest.approx(
+        (1 / 8 + 3 / 8) / 3
+    )
+    assert metrics.chance_recall(np.array([], np.int64), gallery=8) == 0
 
 
 @given(st.lists(st.integers(1, 400), min_size=1, max_size=30))

@@ -12,11 +12,11 @@ from pipeline.features.table import Floats, PartFooter, PartRows, open_table, wr
 from pipeline.retrieval.parts import (
     cosines_by_part,
     count_parts,
+    detect_parts,
     measure_parts,
-    parts_of_side,
-    side_of_parts,
+    select_parts,
 )
-from pipeline.retrieval.ranking import side_of_array
+from pipeline.retrieval.ranking import embedding_set_from_array
 from pipeline.retrieval.tasks import Task
 
 
@@ -41,8 +41,10 @@ def test_vectors_without_parts_have_one() -> None:
     assert count_parts(made(5, 2, 32) + np.float32(0.01)) == 1
     assert count_parts(np.empty((0, 8), np.float32)) == 1
     assert (
-        parts_of_side(
-            side_of_array(np.empty(0, np.str_), np.empty(0, np.str_), np.empty((0, 8), np.float32))
+        detect_parts(
+            embedding_set_from_array(
+                np.empty(0, np.str_), np.empty(0, np.str_), np.empty((0, 8), np.float32)
+            )
         )
         == 1
     )
@@ -63,7 +65,9 @@ def test_the_mean_of_the_parts_cosines_is_the_score() -> None:
 
 def test_a_side_of_some_parts_has_unit_length_again() -> None:
     names = np.array(["a", "b"], np.str_)
-    [block] = side_of_parts(side_of_array(names, names, made(2, 4, 3)), 4, (0, 2)).blocks(10)
+    [block] = select_parts(embedding_set_from_array(names, names, made(2, 4, 3)), 4, (0, 2)).blocks(
+        10
+    )
     assert np.linalg.norm(block, axis=1) == pytest.approx(np.ones(2), abs=1e-6)
     assert block[:, :3] == pytest.approx(made(2, 4, 3)[:, :3] * np.sqrt(2))
 

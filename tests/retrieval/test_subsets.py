@@ -5,30 +5,30 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.retrieval.ranking import Side, side_of_array
-from pipeline.retrieval.subsets import mean_by_location, mean_by_views, views_possible
+from pipeline.retrieval.ranking import EmbeddingSet, embedding_set_from_array
+from pipeline.retrieval.subsets import mean_by_location, mean_by_views, possible_view_counts
 
 
-def side(counts: list[int], seed: int = 0) -> Side:
+def side(counts: list[int], seed: int = 0) -> EmbeddingSet:
     """So many images of each place, shuffled; image j of place i is keyed i-j."""
     rng = np.random.default_rng(seed)
     rows = [(f"{i}", f"{i}-{j:02d}") for i, count in enumerate(counts) for j in range(count)]
     rows = [rows[at] for at in rng.permutation(len(rows))]
     vectors = rng.standard_normal((len(rows), 8)).astype(np.float32)
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    return side_of_array(
+    return embedding_set_from_array(
         np.array([key for _, key in rows]), np.array([place for place, _ in rows]), vectors
     )
 
 
-def whole(of: Side) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+def whole(of: EmbeddingSet) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
     return np.concatenate(list(of.blocks(5)))
 
 
 def test_as_many_views_as_every_location_has() -> None:
-    assert views_possible(side([54, 55])) == [1, 2, 3, 6, 9, 18, 27, 54]
-    assert views_possible(side([54, 7])) == [1, 2, 3, 6]
-    assert views_possible(side([1, 1])) == [1]
+    assert possible_view_counts(side([54, 55])) == [1, 2, 3, 6, 9, 18, 27, 54]
+    assert possible_view_counts(side([54, 7])) == [1, 2, 3, 6]
+    assert possible_view_counts(side([1, 1])) == [1]
 
 
 def test_a_group_takes_every_kth_image_in_the_order_of_the_keys() -> None:
@@ -59,7 +59,7 @@ def test_groups_do_not_depend_on_the_order_of_the_rows(
 ) -> None:
     of = side(counts, seed)
     order = np.random.default_rng(seed + 1).permutation(len(of.keys))
-    turned = side_of_array(of.keys[order], of.locations[order], whole(of)[order])
+    turned = embedding_set_from_array(of.keys[order], of.locations[order], whole(of)[order])
     one, other = mean_by_views(of, views), mean_by_views(turned, views)
     assert one.keys.tolist() == other.keys.tolist()
     assert len(one.keys) == sum(count // views for count in counts)

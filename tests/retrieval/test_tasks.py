@@ -20,24 +20,31 @@ from pipeline.features.table import (
     write_part,
 )
 from pipeline.retrieval import exact_scores, metrics
-from pipeline.retrieval.exact_scores import error_bound, on_grid
-from pipeline.retrieval.ranking import Blocks, Ranking, Side, rank, rank_spread, side_of_array
+from pipeline.retrieval.exact_scores import error_bound, round_to_grid
+from pipeline.retrieval.ranking import (
+    BlockSizes,
+    EmbeddingSet,
+    Ranking,
+    embedding_set_from_array,
+    rank,
+    rank_distributed,
+)
 from pipeline.retrieval.subsets import mean_by_location
-from pipeline.retrieval.tasks import Task, only_locations, possible_tasks, retrieve
+from pipeline.retrieval.tasks import Task, filter_locations, possible_tasks, retrieve
 
 
 def unit(vectors: Floats) -> Floats:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.float32)
 
 
-def side(vectors: Floats, locations: list[str]) -> Side:
-    return side_of_array(
+def side(vectors: Floats, locations: list[str]) -> EmbeddingSet:
+    return embedding_set_from_array(
         np.array([f"k{i}" for i in range(len(locations))]), np.array(locations), unit(vectors)
     )
 
 
 @st.composite
-def sides(draw: st.DrawFn) -> tuple[Side, Side]:
+def sides(draw: st.DrawFn) -> tuple[EmbeddingSet, EmbeddingSet]:
     """Queries and a gallery with few locations and, often, so few distinct vectors that most scores
     tie.
     """
@@ -45,7 +52,7 @@ def sides(draw: st.DrawFn) -> tuple[Side, Side]:
     distinct, dimension = draw(st.sampled_from([1, 2, 5, 1000])), draw(st.integers(1, 9))
     pool = unit(rng.standard_normal((distinct, dimension)).astype(np.float32))
 
-    def one(rows: int) -> Side:
+    def one(rows: int) -> EmbeddingSet:
         return side(
             pool[rng.integers(0, distinct, rows)], [f"L{i}" for i in rng.integers(0, 4, rows)]
         )
@@ -54,19 +61,21 @@ def sides(draw: st.DrawFn) -> tuple[Side, Side]:
 
 
 cuts = st.builds(
-    Blocks,
-    held_queries=st.integers(1, 13),
+    BlockSizes,
+    queries_in_memory=st.integers(1, 13),
     query_rows=st.integers(1, 13),
     gallery_rows=st.integers(1, 61),
 )
 
 
-def brute(queries: Side, gallery: Side, top: int) -> list[tuple[list[int], list[int], list[float]]]:
+def brute(
+    queries: EmbeddingSet, gallery: EmbeddingSet, top: int
+) -> list[tuple[list[int], list[int], list[float]]]:
     """For each query: the ranks of its true matches, its top rows and their scores, by sorting the
     whole gallery.
     """
     query_QD, gallery_GD = (
-        on_grid(next(s.blocks(10**6))).astype(np.float64) for s in (queries, gallery)
+        round_to_grid(next(s.blocks(10**6))).astype(np.float64) for s in (queries, gallery)
     )
     found = []
     for vector, location in zip(query_QD, queries.locations, strict=True):
@@ -84,10 +93,10 @@ FEW = (-1, math.inf)  # never and always the way that picks the few entries that
 @given(sides(), cuts, st.integers(1, 12), st.sampled_from(FEW))
 @settings(max_examples=150)
 def test_ranking_equals_the_brute_force_twin_however_the_work_is_cut(
-    pair: tuple[Side, Side], cut: Blocks, top: int, few: float
+    pair: tuple[EmbeddingSet, EmbeddingSet], cut: BlockSizes, top: int, few: float
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(exact_scores, "FEW", few)
+        patch.setattr(exact_scores, "MAX_SPARSE_SHARE", few)
         found = rank(*pair, top, cut)
     for q, (ranks, rows, scores) in enumerate(brute(*pair, top)):
         assert found.matches_Q[q] == len(ranks)
@@ -116,7 +125,9 @@ def test_every_bit_is_the_same_for_blocks_of_any_shape() -> None:
     for rows in (3, 7, 64, 119):
         assert same(
             rank(
-                queries, gallery, blocks=Blocks(held_queries=25, query_rows=rows, gallery_rows=rows)
+                queries,
+                gallery,
+                blocks=BlockSizes(queries_in_memory=25, query_rows=rows, gallery_rows=rows),
             ),
             whole,
         )
@@ -135,10 +146,13 @@ def test_every_bit_is_the_same_for_any_number_of_workers(ray_cluster: None) -> N
     def advance(scores: int) -> None:
         settled[0] += scores
 
-    assert same(rank_spread(queries, gallery, 5, 0, lambda scores: None), whole)
-    assert same(rank_spread(queries, gallery, 5, 2, advance), whole)
+    assert same(rank_distributed(queries, gallery, 5, 0, lambda scores: None), whole)
+    assert same(rank_distributed(queries, gallery, 5, 2, advance), whole)
     assert same(
-        rank_spread(queries, gallery, 5, 2, advance, Blocks(held_queries=4, query_rows=3)), whole
+        rank_distributed(
+            queries, gallery, 5, 2, advance, BlockSizes(queries_in_memory=4, query_rows=3)
+        ),
+        whole,
     )
     assert settled == [2 * 23 * 90]
 
@@ -150,7 +164,7 @@ def test_near_ties_are_settled_exactly_however_near(
     spread: float, each: int, few: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Vectors that differ by less than float32 products can tell: every score is in doubt."""
-    monkeypatch.setattr(exact_scores, "FEW", few)
+    monkeypatch.setattr(exact_scores, "MAX_SPARSE_SHARE", few)
     rng = np.random.default_rng(4)
     centre = rng.standard_normal(300)
     queries = side(
@@ -161,7 +175,7 @@ def test_near_ties_are_settled_exactly_however_near(
     gallery = side(
         (centre + spread * rng.standard_normal((len(names), 300))).astype(np.float32), names
     )
-    found = rank(queries, gallery, 10, Blocks(query_rows=4, gallery_rows=50))
+    found = rank(queries, gallery, 10, BlockSizes(query_rows=4, gallery_rows=50))
     for q, (ranks, rows, scores) in enumerate(brute(queries, gallery, 10)):
         assert found.first_rank_Q[q] == ranks[0]
         expected = metrics.average_precisions(np.array(ranks), np.zeros(len(ranks), np.int64), 1)[0]
@@ -175,7 +189,7 @@ def test_near_ties_are_settled_exactly_however_near(
 def test_float32_products_lie_within_the_bound_of_the_score(seed: int, dimension: int) -> None:
     rng = np.random.default_rng(seed)
     one, other = (
-        on_grid(unit(np.abs(rng.standard_normal((8, dimension))).astype(np.float32)))
+        round_to_grid(unit(np.abs(rng.standard_normal((8, dimension))).astype(np.float32)))
         for _ in range(2)
     )
     exact = (one.astype(np.float64) @ other.astype(np.float64).T).astype(np.float32)
@@ -211,7 +225,9 @@ def test_scores_are_those_of_the_plain_product() -> None:
     vectors = unit(np.random.default_rng(2).standard_normal((20, 2048)).astype(np.float32))
     names = np.array([str(i) for i in range(20)])
     found = rank(
-        side_of_array(names, names, vectors[:5]), side_of_array(names, names, vectors), top=20
+        embedding_set_from_array(names, names, vectors[:5]),
+        embedding_set_from_array(names, names, vectors),
+        top=20,
     )
     plain = vectors[:5].astype(np.float64) @ vectors.astype(np.float64).T
     assert (
@@ -227,8 +243,8 @@ def test_vectors_that_are_not_of_unit_length_are_refused(spoilt: float) -> None:
     names = np.array(list("abc"))
     with pytest.raises(InputError, match=r"row 1 .* expected unit length; normalise"):
         rank(
-            side_of_array(names, names, np.eye(3, dtype=np.float32)),
-            side_of_array(names, names, vectors),
+            embedding_set_from_array(names, names, np.eye(3, dtype=np.float32)),
+            embedding_set_from_array(names, names, vectors),
         )
 
 
@@ -243,7 +259,7 @@ def test_merged_queries_are_the_mean_at_unit_length_one_for_each_location() -> N
 
 
 def test_the_reduced_gallery_keeps_rows_of_queried_locations_in_their_order() -> None:
-    reduced = only_locations(
+    reduced = filter_locations(
         side(np.eye(5, dtype=np.float32), list("axbya")), np.array(["a", "b", "c"])
     )
     assert reduced.keys.tolist() == ["k0", "k2", "k4"]

@@ -9,26 +9,26 @@ from hypothesis import strategies as st
 
 from pipeline.features.table import Floats
 from pipeline.retrieval import view_gap
-from pipeline.retrieval.ranking import Side, side_of_array
-from pipeline.retrieval.subsets import Chosen, evenly, taken, vectors_by_key
+from pipeline.retrieval.ranking import EmbeddingSet, embedding_set_from_array
+from pipeline.retrieval.subsets import RowSample, evenly_spaced, take_rows, vectors_by_key
 
 
-def chosen(locations: str, vectors_ND: Floats) -> Chosen:
+def chosen(locations: str, vectors_ND: Floats) -> RowSample:
     places = np.array(locations.split(), np.str_)
     keys = np.array([f"{place}-{i}" for i, place in enumerate(places)], np.str_)
-    return Chosen(keys_N=keys, locations_N=places, vectors_ND=vectors_ND)
+    return RowSample(keys_N=keys, locations_N=places, vectors_ND=vectors_ND)
 
 
-def side(rows: int, dimension: int = 3) -> Side:
+def side(rows: int, dimension: int = 3) -> EmbeddingSet:
     names = np.arange(rows).astype(np.str_)
-    return side_of_array(
+    return embedding_set_from_array(
         names, names, np.arange(rows * dimension, dtype=np.float32).reshape(rows, dimension)
     )
 
 
 @given(total=st.integers(0, 300), most=st.integers(2, 40))
 def test_evenly_spaced_numbers_are_distinct_and_reach_both_ends(total: int, most: int) -> None:
-    found = evenly(total, most)
+    found = evenly_spaced(total, most)
     assert len(found) == min(total, most)
     assert (np.diff(found) > 0).all()
     assert not total or (found[0], found[-1]) == (0, total - 1)
@@ -38,7 +38,7 @@ def test_chosen_rows_come_in_the_order_asked_for_whatever_the_blocks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("pipeline.retrieval.subsets.BLOCK_ROWS", 4)
-    found = taken(side(11), np.array([9, 0, 3, 9]))
+    found = take_rows(side(11), np.array([9, 0, 3, 9]))
     assert found.keys_N.tolist() == ["9", "0", "3", "9"]
     assert found.vectors_ND[:, 0].tolist() == [27, 0, 9, 27]
     assert {
@@ -50,11 +50,11 @@ def test_chosen_rows_come_in_the_order_asked_for_whatever_the_blocks(
 def test_only_places_that_both_views_show_are_chosen_each_as_often_as_fits() -> None:
     queries = np.repeat(["a", "b", "c"], 50).astype(np.str_)
     gallery = np.array(["distractor", "c", "b", "a", "only here"], np.str_)
-    rows = view_gap.choose(queries, gallery, most=12)
+    rows = view_gap.choose_common_rows(queries, gallery, most=12)
     assert sorted(queries[rows[0]].tolist()) == ["a"] * 4 + ["b"] * 4 + ["c"] * 4
     assert gallery[rows[1]].tolist() == ["a", "b", "c"]
-    assert queries[view_gap.choose(queries, gallery, most=2)[0]].tolist() == ["a", "c"]
-    assert [len(each) for each in view_gap.choose(queries, gallery[:1])] == [0, 0]
+    assert queries[view_gap.choose_common_rows(queries, gallery, most=2)[0]].tolist() == ["a", "c"]
+    assert [len(each) for each in view_gap.choose_common_rows(queries, gallery[:1])] == [0, 0]
 
 
 def test_the_distance_of_means_is_in_units_of_a_views_spread() -> None:
@@ -72,24 +72,24 @@ def test_the_projection_shows_the_greatest_variance_both_views_weighing_alike() 
     gallery = np.array(
         [[0, 1, 0], [0, -1, 0]] * 5, np.float32
     )  # five times as many rows do not weigh more
-    found = view_gap.project(query, gallery)
+    found = view_gap.project_pca(query, gallery)
     assert found.shares == pytest.approx((0.8, 0.2))  # variances 4 and 1 of a half each
     assert np.abs(found.points_S2[:3]) == pytest.approx(
         np.array([[2, 0], [2, 0], [0, 1]]), abs=1e-12
     )
-    assert view_gap.project(query, gallery).points_S2.tolist() == found.points_S2.tolist()
+    assert view_gap.project_pca(query, gallery).points_S2.tolist() == found.points_S2.tolist()
 
 
 def test_a_network_that_gives_all_images_one_vector_has_a_picture_too() -> None:
     same = np.tile(np.array([1, 0], np.float32), (4, 1))
-    found = view_gap.describe(chosen("a a b b", same), chosen("a b c d", same))
+    found = view_gap.describe_gap(chosen("a a b b", same), chosen("a b c d", same))
     assert (found["shares"], found["distance"]) == ([0, 0], 0)
     assert {(point["x"], point["y"]) for point in found["points"]} == {(0, 0)}
 
 
 def test_cosines_of_true_pairs_stand_beside_those_of_other_places() -> None:
     eye = np.eye(4, dtype=np.float32)
-    found = view_gap.describe(chosen("a b b", eye[[0, 1, 1]]), chosen("b c a", eye[[1, 2, 3]]))
+    found = view_gap.describe_gap(chosen("a b b", eye[[0, 1, 1]]), chosen("b c a", eye[[1, 2, 3]]))
     assert found["true"] == {
         "pairs": 3,
         "mean": pytest.approx(2 / 3, abs=1e-5),
@@ -108,6 +108,6 @@ def test_cosines_of_true_pairs_stand_beside_those_of_other_places() -> None:
 
 def test_one_place_has_no_gap_to_speak_of() -> None:
     with pytest.raises(ValueError, match="show one place"):
-        view_gap.describe(
+        view_gap.describe_gap(
             chosen("a a", np.eye(2, dtype=np.float32)), chosen("a", np.eye(2, dtype=np.float32)[:1])
         )
