@@ -1,5 +1,5 @@
-"""A checkpoint and its index -> answers over HTTP: `serve.py --checkpoint FILE --index INDEX
-[--host H] [--port P]`.
+"""Answer over HTTP where photos were taken: `serve.py --checkpoint FILE --index INDEX [--host H]
+[--port P]`
 """
 
 import asyncio
@@ -16,7 +16,7 @@ from jobs.encoding.photo_encoder import PhotoEncoder
 from model.errors import CheckpointError
 from pipeline.core import cluster, storage
 from pipeline.core.cluster import plan_placement
-from pipeline.core.errors import InputError
+from pipeline.core.errors import InputError, require
 from pipeline.core.progress import console
 from pipeline.index.metadata import METADATA_FILE
 from pipeline.service.app import Service
@@ -30,37 +30,35 @@ from pipeline.service.settings import ServiceSettings
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(ServiceSettings):
-    """Which index answers, by which network, to whom."""
+    """The index, its encoder, the address and the limits of the service."""
 
     checkpoint: str
     "The checkpoint that the index's gallery was embedded with."
     index: str
-    "Folder or URI of the index; one that is built there later is taken over."
+    "Folder or URI of the index; the service switches to one that is built there later."
     shards: str | None = None
-    "What the index was made of: needed only where it was embedded in int8."
+    "The shards that the index was made of: needed only where it was embedded in int8."
     replicas: int = 1
-    "Processes that each load network and index."
+    "Processes that each load encoder and index."
     threads: int | None = None
     "CPU cores of each; by default as many as let all of them fit on the nodes that are up."
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("replicas", "threads"):
-            if (value := getattr(self, name)) is not None and value < 1:
-                raise InputError(f"--{name} is {value}, expected at least 1")
+        require(self.replicas >= 1, "replicas", self.replicas, "at least 1")
+        require(self.threads is None or self.threads >= 1, "threads", self.threads, "at least 1")
 
 
 def load_predictor(checkpoint: str, index: str, shards: str | None, threads: int) -> Predictor:
-    """What each replica calls. Raises InputError."""
+    """Load the encoder and the index; called on each replica. Raises InputError."""
     import torch
 
-    torch.set_num_threads(
-        threads
-    )  # FAISS takes OMP_NUM_THREADS, which Ray sets to the replica's cores
+    torch.set_num_threads(threads)  # FAISS takes OMP_NUM_THREADS, which Ray sets to the cores
 
-    def encoder_for(facts: dict[str, Any]) -> PhotoEncoder:
+    def encoder_for(index_metadata: dict[str, Any]) -> PhotoEncoder:
         try:
-            return PhotoEncoder(storage.read_bytes(checkpoint), checkpoint, facts, shards)
+            data = storage.read_bytes(checkpoint)
+            return PhotoEncoder(data, checkpoint, index_metadata, shards)
         except CheckpointError as error:
             raise InputError(str(error)) from None
 
@@ -81,16 +79,14 @@ def main(settings: Settings) -> None:
 
 
 async def serve(settings: Settings, token: str | None) -> None:
-    """Listen at once, so that whoever asks for its health hears that it is loading; answer once it
-    has loaded.
-    """
+    """Listen at once, so that /health can report that it is loading; answer once it has loaded."""
     placement = plan_placement(
         cluster.nodes(), settings.replicas, settings.replicas, settings.threads
     )
     shards = None if settings.shards is None else storage.absolute(settings.shards)
     checkpoint, index = storage.absolute(settings.checkpoint), storage.absolute(settings.index)
-    make = partial(load_predictor, checkpoint, index, shards, placement.cpus)
-    replicas = Replicas(f"pvda-{os.getpid()}", placement, make)
+    make_predictor = partial(load_predictor, checkpoint, index, shards, placement.cpus)
+    replicas = Replicas(f"pvda-{os.getpid()}", placement, make_predictor)
     runner = Service(settings, replicas, token, concurrency=placement.workers).runner()
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -102,38 +98,38 @@ async def serve(settings: Settings, token: str | None) -> None:
             await site.start()
         except OSError as error:
             raise InputError(
-                f"cannot listen on {settings.host} port {settings.port}: {error.strerror}; choose another --port"
+                f"cannot listen on {settings.host} port {settings.port}: {error.strerror}; choose "
+                "another --port"
             ) from None
         console.print(f"http://{settings.host}:{site.port} listens; loading")
-        working = asyncio.create_task(watch_replicas(replicas))
+        watching = asyncio.create_task(watch_replicas(replicas))
         stopping = asyncio.create_task(stop.wait())
-        await asyncio.wait([working, stopping], return_when=asyncio.FIRST_COMPLETED)
-        if working.done():
-            working.result()  # it ends by an exception only
+        await asyncio.wait([watching, stopping], return_when=asyncio.FIRST_COMPLETED)
+        if watching.done():
+            watching.result()  # it ends only by an exception
         console.print("stopping")
-        working.cancel()
+        watching.cancel()
     finally:
         await runner.cleanup()
         await asyncio.to_thread(replicas.stop)
 
 
 async def watch_replicas(replicas: Replicas) -> None:
-    """Load, then tell whenever another index answers or one was refused; replicas themselves are
-    silent.
-    """
+    """Load, then print each change of the index in use: replicas themselves print nothing."""
     known = await asyncio.to_thread(replicas.start)
     console.print(
-        f"ready: {known.rows} rows, {known.factory}, network {known.fingerprint[:12]}; Ctrl-C ends it"
+        f"ready: {known.rows} rows, {known.factory}, encoder {known.fingerprint[:12]}; Ctrl-C ends "
+        "it"
     )
     while True:
         await asyncio.sleep(POLL_INTERVAL_S)
         try:
             status = await replicas.status()
-        except (NotReady, ReplicaLost):  # another replica is on its way
+        except (NotReady, ReplicaLost):  # another replica is starting
             continue
         if status != known:
-            said = f"another index answers: {status.rows} rows, {status.factory}"
-            console.print(status.refused or said, style="yellow" if status.refused else None)
+            changed = f"another index is in use: {status.rows} rows, {status.factory}"
+            console.print(status.refused or changed, style="yellow" if status.refused else None)
             known = status
 
 

@@ -1,8 +1,7 @@
-"""Requests that arrive one by one -> batches for whoever computes: what arrives during one batch is
-the next one.
+"""Requests that arrive one by one -> batches: all that arrive during one batch form the next one.
 
-Nothing waits for company: a lone request is computed at once, and under load the batches fill by
-themselves.
+A request never waits for others: a lone one is computed at once, and under load the batches fill
+up by themselves.
 """
 
 import asyncio
@@ -17,41 +16,36 @@ Result = TypeVar("Result")
 
 
 class ReplicaLost(Exception):
-    """Whoever computed a batch is gone, and the batch with it; another will take its place."""
+    """The replica that computed a batch died, and the batch with it; another replica replaces
+    it."""
 
 
 class PoisonedItem(Exception):
-    """An item that was in the hands of two who are gone: of a batch first, then alone. It is not
-    tried again.
-    """
+    """An item lost with two replicas: first in a batch, then alone. It is not tried again."""
 
 
 class Batcher(Generic[Item, Result]):
-    """Asks `work` for the results of up to `largest` items at once, with `concurrency` batches at work
-    at a time.
+    """Calls `work` with batches of up to `max_batch` items, `concurrency` batches at a time.
 
-    `work` gives one result per item, in order. A batch that raises Gone is tried again item by item, so that one that kills
-    is told from those beside it.
+    `work` returns one result per item, in order. The items of a batch that raises ReplicaLost are
+    tried again one at a time, so that an item that crashes replicas is told apart from its
+    neighbours.
     """
 
     def __init__(
         self,
         work: Callable[[Sequence[Item]], Awaitable[Sequence[Result]]],
         *,
-        largest: int,
+        max_batch: int,
         concurrency: int = 1,
         on_batch: Callable[[int], None] = lambda size: None,
     ) -> None:
         """`on_batch` is called with the size of each batch that begins."""
-        self._work, self._largest, self._abreast, self._on_batch = (
-            work,
-            largest,
-            concurrency,
-            on_batch,
-        )
-        self._waiting: dict[asyncio.Future[Result], Item] = {}  # in the order of their coming
-        self._at_work: set[asyncio.Task[None]] = set()
-        self._seconds = 1.0  # of the last batch; until there was one, a guess
+        self._work, self._on_batch = work, on_batch
+        self._max_batch, self._concurrency = max_batch, concurrency
+        self._waiting: dict[asyncio.Future[Result], Item] = {}  # in order of arrival
+        self._running: set[asyncio.Task[None]] = set()
+        self._batch_s = 1.0  # duration of the last batch; a guess until there was one
 
     @property
     def waiting(self) -> int:
@@ -60,62 +54,61 @@ class Batcher(Generic[Item, Result]):
 
     @property
     def expected_queue_s(self) -> float:
-        """Seconds until a batch takes whoever comes now, about: none where nobody waits."""
-        return len(self._waiting) / (self._largest * self._abreast) * self._seconds
+        """Estimated seconds until a batch takes an item that arrives now; 0 for an empty queue."""
+        return len(self._waiting) / (self._max_batch * self._concurrency) * self._batch_s
 
     @property
     def retry_after_estimate_s(self) -> int:
-        """Whole seconds after which those who wait now will be answered, about; 1 to 60."""
-        return min(60, max(1, math.ceil(self.expected_queue_s + self._seconds)))
+        """Estimated whole seconds until all waiting items are answered; 1 to 60."""
+        return min(60, max(1, math.ceil(self.expected_queue_s + self._batch_s)))
 
-    async def ask(self, item: Item) -> Result:
-        """The result of one item. Cancelled, it leaves the queue.
+    async def submit(self, item: Item) -> Result:
+        """The result of one item. If cancelled, the item leaves the queue.
 
-        Raises what `work` raises, and Alone.
+        Raises what `work` raises, and PoisonedItem.
         """
         future: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
         self._waiting[future] = item
-        self._begin()
+        self._start_batches()
         try:
             return await future
         finally:
-            self._waiting.pop(future, None)  # still there where whoever asked has gone away
+            self._waiting.pop(future, None)  # still there if the caller was cancelled
 
-    def _begin(self) -> None:
-        while self._waiting and len(self._at_work) < self._abreast:
-            batch = {
-                future: self._waiting.pop(future)
-                for future in list(islice(self._waiting, self._largest))
-            }
+    def _start_batches(self) -> None:
+        while self._waiting and len(self._running) < self._concurrency:
+            futures = list(islice(self._waiting, self._max_batch))
+            batch = {future: self._waiting.pop(future) for future in futures}
             self._on_batch(len(batch))
             task = asyncio.create_task(self._run(batch))
-            self._at_work.add(task)
-            task.add_done_callback(self._ended)
+            self._running.add(task)
+            task.add_done_callback(self._after_batch)
 
-    def _ended(self, task: asyncio.Task[None]) -> None:
-        self._at_work.discard(task)
-        self._begin()
+    def _after_batch(self, task: asyncio.Task[None]) -> None:
+        self._running.discard(task)
+        self._start_batches()
 
     async def _run(self, batch: "dict[asyncio.Future[Result], Item]") -> None:
         began = time.monotonic()
         try:
-            await self._settle(batch)
+            await self._compute(batch)
         except ReplicaLost:
             for future, item in batch.items():
-                if future.done():  # whoever asked has gone away
+                if future.done():  # the caller was cancelled
                     continue
                 try:
-                    await self._settle({future: item})
+                    await self._compute({future: item})
                 except ReplicaLost as error:
                     if not future.done():
                         future.set_exception(PoisonedItem(str(error)))
         finally:
-            self._seconds = time.monotonic() - began
+            self._batch_s = time.monotonic() - began
 
-    async def _settle(self, batch: "dict[asyncio.Future[Result], Item]") -> None:
-        """Give every future its result, or the failure of the batch. Raises Gone alone."""
+    async def _compute(self, batch: "dict[asyncio.Future[Result], Item]") -> None:
+        """Set the result of every future, or the failure of the batch. Raises only ReplicaLost."""
         try:
-            settled = list(zip(batch, await self._work(list(batch.values())), strict=True))
+            results = await self._work(list(batch.values()))
+            resolved = list(zip(batch, results, strict=True))
         except ReplicaLost:
             raise
         except Exception as error:
@@ -123,6 +116,6 @@ class Batcher(Generic[Item, Result]):
                 if not future.done():
                     future.set_exception(error)
             return
-        for future, result in settled:
+        for future, result in resolved:
             if not future.done():
                 future.set_result(result)

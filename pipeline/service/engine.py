@@ -1,4 +1,4 @@
-"""Whoever computes, as the HTTP side sees it."""
+"""The interface between the HTTP side and the processes that compute."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -8,14 +8,15 @@ from pipeline.service.request import LocateRequest
 
 
 class NotReady(Exception):
-    """Nobody has loaded the network and the index yet. One sentence."""
+    """No replica has loaded the encoder and the index yet. The message is one sentence."""
 
 
 class Engine(Protocol):
-    """Whoever computes."""
+    """Computes the answers of batches of requests."""
 
-    async def answer(self, questions: Sequence[LocateRequest]) -> Sequence[Outcome]:
-        """One outcome per question, in order. Raises NotReady, and Gone where the batch is lost."""
+    async def predict(self, requests: Sequence[LocateRequest]) -> Sequence[Outcome]:
+        """One outcome per request, in order. Raises NotReady, and ReplicaLost where the batch is
+        lost."""
 
     async def status(self) -> ServiceStatus:
-        """Raises NotReady or Gone."""
+        """Raises NotReady or ReplicaLost."""

@@ -1,4 +1,4 @@
-"""What the service counts of itself, in Prometheus' text format."""
+"""Counters of the service in Prometheus' text format."""
 
 from collections.abc import Callable
 
@@ -17,42 +17,40 @@ CONTENT_TYPE = CONTENT_TYPE_LATEST
 
 
 class ServiceMetrics:
-    """Counters of one service; another in the same process has its own."""
+    """Counters of one service; another one in the same process has its own."""
 
     def __init__(self, waiting: Callable[[], int]) -> None:
-        """`waiting` says how many photos wait for a batch, when it is asked."""
-        self._registry = CollectorRegistry()
+        """`waiting` returns how many photos wait for a batch."""
+        registry = self._registry = CollectorRegistry()
         self._requests = Counter(
             "pvda_requests",
             "Requests by path and HTTP status.",
             ["path", "status"],
-            registry=self._registry,
+            registry=registry,
         )
         self._seconds = Histogram(
             "pvda_request_seconds",
-            "From a request's head to its answer.",
+            "Seconds from a request's head to its response.",
             ["path"],
             buckets=LATENCY_BUCKETS_S,
-            registry=self._registry,
+            registry=registry,
         )
         self._batches = Histogram(
             "pvda_batch_photos",
-            "Photos computed at once.",
+            "Photos in a batch.",
             buckets=BATCH_BUCKETS,
-            registry=self._registry,
+            registry=registry,
         )
-        queue = Gauge(
-            "pvda_waiting_photos", "Photos that wait for a batch.", registry=self._registry
-        )
+        queue = Gauge("pvda_waiting_photos", "Photos waiting for a batch.", registry=registry)
         queue.set_function(waiting)
 
     def request(self, path: str, status: int, seconds: float) -> None:
-        """One request was answered. `path` is one of the service's, or `other`."""
+        """Count one response. `path` is one of the service's, or `other`."""
         self._requests.labels(path, str(status)).inc()
         self._seconds.labels(path).observe(seconds)
 
     def batch(self, photos: int) -> None:
-        """A batch of so many begins."""
+        """Count one batch of this many photos."""
         self._batches.observe(photos)
 
     def text(self) -> bytes:

@@ -1,9 +1,9 @@
-"""What the service shows: the page for people, the one for programs, and the headers that keep both
-to themselves.
-"""
+"""The static pages: one for people, one that shows the OpenAPI document, and the headers of all
+responses."""
 
 import json
 from pathlib import Path
+from typing import Any
 
 from aiohttp import web
 
@@ -13,38 +13,56 @@ from pipeline.service.settings import ServiceSettings
 
 WEB_FOLDER = Path(__file__).parent / "web"
 SECURITY_HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' blob: data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
-    "Server": "pvda",  # and no versions
+    "Server": "pvda",  # without versions
 }
-"Of every answer."
+"Headers of every response."
+
 PAGE_PATHS = ("/", "/page.js", "/style.css", "/api", "/openapi.json")
 
 
 def page_routes(settings: ServiceSettings) -> list[web.RouteDef]:
-    """The routes of PATHS, in their order."""
-    shown = (
+    """The routes of PAGE_PATHS, in their order."""
+    document = openapi_document(settings)
+    pages = (
         ((WEB_FOLDER / "index.html").read_text(), "text/html"),
         ((WEB_FOLDER / "page.js").read_text(), "text/javascript"),
         ((WEB_FOLDER / "style.css").read_text(), "text/css"),
-        (api_page(settings), "text/html"),
-        (json.dumps(openapi_document(settings)), "application/json"),
+        (api_page(document, settings.port), "text/html"),
+        (json.dumps(document), "application/json"),
     )
-    return [_page(path, text, kind) for path, (text, kind) in zip(PAGE_PATHS, shown, strict=True)]
+    return [
+        _route(path, text, content_type)
+        for path, (text, content_type) in zip(PAGE_PATHS, pages, strict=True)
+    ]
 
 
-def _page(path: str, text: str, kind: str) -> web.RouteDef:
-    async def answer(request: web.Request) -> web.Response:
-        return web.Response(text=text, content_type=kind)
+def _route(path: str, text: str, content_type: str) -> web.RouteDef:
+    async def respond(request: web.Request) -> web.Response:
+        return web.Response(text=text, content_type=content_type)
 
-    return web.get(path, answer)
+    return web.get(path, respond)
 
 
-def api_page(settings: ServiceSettings) -> str:
-    """The OpenAPI document as a page for people."""
-    template = template_environment(WEB_FOLDER).get_template("api.html")
-    return template.render(api=openapi_document(settings), port=settings.port)
+def api_page(document: dict[str, Any], port: int) -> str:
+    """The OpenAPI document as a page."""
+    environment = template_environment(WEB_FOLDER)
+    environment.filters["type_name"] = type_name
+    return environment.get_template("api.html").render(api=document, port=port)
+
+
+def type_name(schema: dict[str, Any]) -> str:
+    """The type of a JSON schema in words."""
+    if "anyOf" in schema:
+        return " or ".join(type_name(choice) for choice in schema["anyOf"])
+    if "$ref" in schema:
+        return str(schema["$ref"].rpartition("/")[2])
+    if schema.get("type") == "array":
+        return f"list of {type_name(schema['items'])}"
+    return str(schema["type"])

@@ -1,8 +1,8 @@
-"""Answerers as Ray Serve's replicas, and the handle that asks them. One that dies is replaced; its
-batch raises Gone.
+"""Predictors as Ray Serve replicas, and the handle that calls them. A replica that dies is
+replaced; its batch raises ReplicaLost.
 
-HTTP does not pass through Serve: its proxy takes in a request's whole body before anyone can object
-(docs/decisions.md).
+HTTP does not pass through Serve: its proxy reads a request's whole body before any check can refuse
+it (docs/decisions.md).
 """
 
 import asyncio
@@ -27,100 +27,97 @@ from pipeline.service.predictor import Outcome, Predictor, ServiceStatus
 from pipeline.service.request import LocateRequest
 
 BATCH_TIMEOUT_S = 120.0
-"A batch that takes longer will not end: its replica is replaced."
+"Seconds after which a batch counts as stuck: its replica is replaced."
+
 MAX_ONGOING_REQUESTS = 16
-"That a replica takes at once: its batch, and whoever asks for its status meanwhile."
+"Calls that a replica accepts at a time: its batch, and the status requests meanwhile."
 
 
 class Replica:
-    """One process with the network and the index. Batches are computed one after the other, by one
-    thread.
-    """
+    """One process with the encoder and the index. One thread computes batches one after another."""
 
-    def __init__(self, make: Callable[[], Predictor]) -> None:
-        self._make = make
+    def __init__(self, make_predictor: Callable[[], Predictor]) -> None:
+        self._make_predictor = make_predictor
         self._thread = ThreadPoolExecutor(1)
-        self._began: float | None = None
-        self._answerer: Predictor | None = None
-        self._unusable = ""
+        self._batch_began: float | None = None
+        self._predictor: Predictor | None = None
+        self._load_error = ""
         self._load()
-        threading.Thread(target=self._follow, daemon=True).start()
+        threading.Thread(target=self._watch_index, daemon=True).start()
 
     def _load(self) -> None:
         try:
-            self._answerer = self._make()
-        # raised from the constructor it would come back from Serve as a page of traceback
-        except InputError as error:
-            self._unusable = str(error)
+            self._predictor = self._make_predictor()
+        except InputError as error:  # raised here, it would return from Serve as a long traceback
+            self._load_error = str(error)
 
-    def _follow(self) -> None:
-        """Take over new indexes for ever; before, where network or index were unusable, try until
-        they are mended.
-        """
-        while self._answerer is None:
+    def _watch_index(self) -> None:
+        """Switch to new indexes forever; before that, while encoder or index cannot be used, retry
+        until they are repaired."""
+        while self._predictor is None:
             time.sleep(RETRY_S)
             self._load()
-        self._answerer.live.follow(threading.Event())
+        self._predictor.live.watch(threading.Event())
 
-    async def answer(self, questions: Sequence[LocateRequest]) -> list[Outcome]:
-        return await asyncio.get_running_loop().run_in_executor(
-            self._thread, self._answer, questions
-        )
+    async def predict(self, requests: Sequence[LocateRequest]) -> list[Outcome]:
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._thread, self._predict, requests)
 
-    def _answer(self, questions: Sequence[LocateRequest]) -> list[Outcome]:
-        self._began = time.monotonic()
+    def _predict(self, requests: Sequence[LocateRequest]) -> list[Outcome]:
+        self._batch_began = time.monotonic()
         try:
-            return self._ready().answer(questions)
+            return self._loaded().predict(requests)
         finally:
-            self._began = None
+            self._batch_began = None
 
     async def status(self) -> ServiceStatus:
-        return self._ready().status()
+        return self._loaded().status()
 
-    def _ready(self) -> Predictor:
-        if self._answerer is None:
-            raise NotReady(self._unusable)
-        return self._answerer
+    def _loaded(self) -> Predictor:
+        if self._predictor is None:
+            raise NotReady(self._load_error)
+        return self._predictor
 
     def check_health(self) -> None:
-        """Called by Serve every few seconds; a replica that raises here a few times is replaced."""
-        began = self._began
+        """Serve calls this every second, and replaces a replica that raises a few times."""
+        began = self._batch_began
         if began is not None and time.monotonic() > began + BATCH_TIMEOUT_S:
             raise TimeoutError(f"a batch has taken {BATCH_TIMEOUT_S:.0f} s")
 
 
 class Replicas:
-    """The replicas of one service, from the process that asks them."""
+    """The replicas of one service, seen from the process that calls them; an Engine."""
 
-    def __init__(self, name: str, placement: Placement, make: Callable[[], Predictor]) -> None:
-        """Nothing is started yet. `name` is no other application's on this cluster; `make` is
-        called on each replica.
-        """
-        self._name, self._placement, self._make = name, placement, make
+    def __init__(
+        self, name: str, placement: Placement, make_predictor: Callable[[], Predictor]
+    ) -> None:
+        """Starts nothing yet. `name` must be unique among the applications of this cluster;
+        `make_predictor` is called on each replica."""
+        self._name, self._placement, self._make_predictor = name, placement, make_predictor
         self._handle: Any = None
         self._started = False
 
     def start(self) -> ServiceStatus:
         """Start all replicas and wait until they have loaded.
 
-        Raises InputError when the network or the index cannot be used.
+        Raises InputError when the encoder or the index cannot be used.
         """
         cluster.connect()
-        logging.getLogger("ray.serve").setLevel(
-            logging.ERROR
-        )  # it warns at length of what is told here in a sentence
+        # Serve warns at length about load errors that this method raises as one sentence.
+        logging.getLogger("ray.serve").setLevel(logging.ERROR)
+        placement = self._placement
         deployment: serve.Deployment = serve.deployment(
-            num_replicas=self._placement.workers,
+            num_replicas=placement.workers,
             max_ongoing_requests=MAX_ONGOING_REQUESTS,
-            ray_actor_options={"num_cpus": self._placement.cpus, "num_gpus": self._placement.gpus},
-            # who asks while a replica is dead waits for so long besides the loading
-            health_check_period_s=1,
+            ray_actor_options={"num_cpus": placement.cpus, "num_gpus": placement.gpus},
+            health_check_period_s=1,  # a dead replica's callers wait this long, and for the loading
             graceful_shutdown_wait_loop_s=0.2,
             graceful_shutdown_timeout_s=5,
         )(Replica)
         self._started = True
         serve.start(proxy_location="Disabled")
-        handle = serve.run(deployment.bind(self._make), name=self._name, route_prefix=None)
+        application = deployment.bind(self._make_predictor)
+        handle = serve.run(application, name=self._name, route_prefix=None)
         try:
             status: ServiceStatus = handle.status.remote().result(timeout_s=60)
         except NotReady as error:
@@ -128,28 +125,28 @@ class Replicas:
         self._handle = handle
         return status
 
-    async def answer(self, questions: Sequence[LocateRequest]) -> list[Outcome]:
-        """Raises NotReady, and Gone where the replica that was asked has died."""
-        answered: list[Outcome] = await self._ask("answer", list(questions))
-        return answered
+    async def predict(self, requests: Sequence[LocateRequest]) -> list[Outcome]:
+        """Raises NotReady, and ReplicaLost where the replica has died."""
+        outcomes: list[Outcome] = await self._call("predict", list(requests))
+        return outcomes
 
     async def status(self) -> ServiceStatus:
-        """Raises NotReady, and Gone likewise."""
-        found: ServiceStatus = await self._ask("status")
-        return found
+        """Raises NotReady, and ReplicaLost where the replica has died."""
+        status: ServiceStatus = await self._call("status")
+        return status
 
-    async def _ask(self, method: str, *arguments: Any) -> Any:
+    async def _call(self, method: str, *arguments: Any) -> Any:
         if self._handle is None:
-            raise NotReady("the network and the index are being loaded")
+            raise NotReady("the encoder and the index are being loaded")
         try:
             return await getattr(self._handle, method).remote(*arguments)
         except ray.exceptions.RayActorError as error:
             raise ReplicaLost(str(error).split("\n")[0]) from None
         except DeploymentUnavailableError:
-            raise NotReady("no replica can load the network and the index") from None
+            raise NotReady("no replica can load the encoder and the index") from None
 
     def stop(self) -> None:
-        """End this service's replicas, and Serve itself where nobody else's application is left."""
+        """End this service's replicas, and Serve itself where no other application is left."""
         if not self._started:
             return
         serve.delete(self._name)

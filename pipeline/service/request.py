@@ -1,7 +1,7 @@
-"""What a request asks: a photo and where to look; or why it is refused, in one sentence, before
-anything is decoded.
+"""An upload and its fields -> a validated request, or an HTTP error of one sentence.
 
-In: an upload's bytes and its fields as text. Out: a Question, or a Refusal with its HTTP status.
+In: an upload's bytes and its fields as text. Out: a LocateRequest; RequestError with its HTTP
+status where it is not valid. Nothing is decoded yet.
 """
 
 import math
@@ -15,21 +15,23 @@ from pipeline.images.inspect import inspect
 
 JPEG = b"\xff\xd8\xff"
 SIGNATURES = ((JPEG, b""), (b"\x89PNG\r\n\x1a\n", b""), (b"RIFF", b"WEBP"))
-"""How a file begins, and what stands in bytes 8 to 12. Formats whose size is known without
-decoding; Pillow knows some 40 more, and the decoder of each would be a stranger's to try."""
+"""First bytes of a file, and its bytes 8 to 12. Only formats whose size is known without decoding:
+Pillow knows some 40 more, and each of their decoders would be exposed to strangers."""
+
 SCAN_MARKER, MAX_SCANS = b"\xff\xda", 100
-"""Where a scan of a JPEG begins, and how many are believed: progressive files have about ten.
-Thousands of empty ones in a few kilobytes would each cost a pass over all pixels. A preview within
-a header may hold the same two bytes by chance."""
+"""Marker of a scan of a JPEG, and the number of scans that is accepted: progressive files have
+about ten. Thousands of empty ones in a few kilobytes would each cost a pass over all pixels. A
+preview within a header may contain the same two bytes by chance."""
+
 DEFAULT_TOP, MAX_TOP = 5, 50
-"Candidates in an answer: by default, and at most."
+"Candidates in an answer."
+
 FIELDS = ("lat", "lon", "radius_m", "top")
 
 
 class RequestError(Exception):
-    """A request that is not answered; `sentence` says what was found, what was expected and what to
-    do.
-    """
+    """A request that is refused; `sentence` says what was found, what was expected and what to
+    do."""
 
     def __init__(self, status: int, sentence: str, retry_after_s: int | None = None) -> None:
         super().__init__(sentence)
@@ -38,37 +40,38 @@ class RequestError(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class LocateRequest:
-    """Where was this photo taken?"""
+    """A photo to locate, and where to search."""
 
     photo: bytes
-    "A JPEG, PNG or WebP file, whole."
+    "A complete JPEG, PNG or WebP file."
     near: Circle | None = None
-    "Only places within this circle are candidates."
+    "Only gallery images within this circle are candidates."
     top: int = DEFAULT_TOP
     "Candidates in the answer."
 
 
 def parse_request(photo: bytes, fields: Mapping[str, str], max_pixels: int) -> LocateRequest:
-    """An upload judged by its structure: no pixel is decoded but those of a CMYK JPEG, whose size
+    """Validate an upload by its structure: no pixel is decoded, except for CMYK JPEGs, whose size
     is known by then.
 
-    Raises Refusal.
+    Raises RequestError.
+
     """
-    asked = LocateRequest(photo=photo, near=_near(fields), top=_top(fields))
+    request = LocateRequest(photo=photo, near=_near(fields), top=_top(fields))
     _check_photo(photo, max_pixels)
-    return asked
+    return request
 
 
 def _near(fields: Mapping[str, str]) -> Circle | None:
-    given = {
-        name: fields[name] for name in ("lat", "lon", "radius_m") if fields.get(name, "").strip()
-    }
+    names = ("lat", "lon", "radius_m")
+    given = {name: fields[name] for name in names if fields.get(name, "").strip()}
     if not given:
         return None
     if len(given) < 3:
         raise RequestError(
             400,
-            f"found only {' and '.join(given)}, expected all of lat, lon and radius_m or none; give the others too",
+            f"found only {' and '.join(given)}, expected all of lat, lon and radius_m or none; "
+            "give the others too",
         )
     try:
         return Circle(**{name: _number(name, text) for name, text in given.items()})
@@ -90,7 +93,8 @@ def _top(fields: Mapping[str, str]) -> int:
     text = fields.get("top", "").strip()
     if not text:
         return DEFAULT_TOP
-    if not (text.isascii() and text.isdigit() and len(text) < 4 and 1 <= int(text) <= MAX_TOP):
+    short_number = text.isascii() and text.isdigit() and len(text) < 4
+    if not (short_number and 1 <= int(text) <= MAX_TOP):
         raise RequestError(
             400, f"top is {text[:40]!r}, expected a whole number from 1 to {MAX_TOP}"
         )
@@ -102,10 +106,11 @@ def _check_photo(photo: bytes, max_pixels: int) -> None:
         raise RequestError(
             400, "the photo is empty, expected the bytes of a JPEG, PNG or WebP file"
         )
-    if not any(photo.startswith(begin) and photo.startswith(then, 8) for begin, then in SIGNATURES):
+    if not any(photo.startswith(first) and photo.startswith(then, 8) for first, then in SIGNATURES):
         raise RequestError(
             415,
-            f"the photo begins with {photo[:8]!r}, expected a JPEG, PNG or WebP file; save it as one of these",
+            f"the photo begins with {photo[:8]!r}, expected a JPEG, PNG or WebP file; save it as "
+            "one of these",
         )
     if photo.startswith(JPEG) and (scans := photo.count(SCAN_MARKER)) > MAX_SCANS:
         raise RequestError(
@@ -119,9 +124,8 @@ def _check_photo(photo: bytes, max_pixels: int) -> None:
 
 
 def undecodable_photo(reason: str, found: str) -> RequestError:
-    """What is said of a photo that cannot be decoded."""
-    status = 413 if reason == "too many pixels" else 422
+    """The error for a photo that cannot be decoded."""
     return RequestError(
-        status,
-        f"the photo cannot be used: {reason}, {found}; send it whole, or a smaller copy of it",
+        413 if reason == "too many pixels" else 422,
+        f"the photo cannot be used: {reason}, {found}; send it complete, or a smaller copy of it",
     )

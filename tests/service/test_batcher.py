@@ -33,13 +33,13 @@ def run(main: Coroutine[Any, Any, None]) -> None:
 
 
 @given(count=st.integers(1, 40), largest=st.integers(1, 9), concurrency=st.integers(1, 3))
-def test_everyone_gets_their_own_answer_in_batches_in_order_of_arrival(
+def test_batcher_returns_own_results_in_arrival_order(
     count: int, largest: int, concurrency: int
 ) -> None:
     async def main() -> None:
         double, sizes = Doubling(), list[int]()
-        batcher = Batcher(double, largest=largest, concurrency=concurrency, on_batch=sizes.append)
-        found = await asyncio.gather(*(batcher.ask(number) for number in range(count)))
+        batcher = Batcher(double, max_batch=largest, concurrency=concurrency, on_batch=sizes.append)
+        found = await asyncio.gather(*(batcher.submit(number) for number in range(count)))
         assert found == [2 * number for number in range(count)]
         assert [number for batch in double.batches for number in batch] == list(range(count))
         assert max(sizes) <= largest
@@ -49,11 +49,11 @@ def test_everyone_gets_their_own_answer_in_batches_in_order_of_arrival(
     run(main())
 
 
-def test_a_lone_item_is_computed_at_once_and_what_arrives_meanwhile_is_one_batch() -> None:
+def test_batcher_lone_item_does_not_wait() -> None:
     async def main() -> None:
         double = Doubling(gated=True)
-        batcher = Batcher(double, largest=8)
-        asked = [asyncio.create_task(batcher.ask(number)) for number in range(6)]
+        batcher = Batcher(double, max_batch=8)
+        asked = [asyncio.create_task(batcher.submit(number)) for number in range(6)]
         await asyncio.sleep(0.01)
         assert double.batches == [[0]]
         assert batcher.waiting == 5
@@ -64,11 +64,11 @@ def test_a_lone_item_is_computed_at_once_and_what_arrives_meanwhile_is_one_batch
     run(main())
 
 
-def test_whoever_goes_away_leaves_the_queue() -> None:
+def test_batcher_cancelled_item_leaves_queue() -> None:
     async def main() -> None:
         double = Doubling(gated=True)
-        batcher = Batcher(double, largest=8)
-        asked = [asyncio.create_task(batcher.ask(number)) for number in range(4)]
+        batcher = Batcher(double, max_batch=8)
+        asked = [asyncio.create_task(batcher.submit(number)) for number in range(4)]
         await asyncio.sleep(0.01)
         asked[0].cancel()  # at work
         asked[2].cancel()  # waiting
@@ -82,23 +82,23 @@ def test_whoever_goes_away_leaves_the_queue() -> None:
     run(main())
 
 
-def test_a_failed_batch_tells_everyone_in_it_and_nobody_else() -> None:
+def test_batcher_error_stays_within_its_batch() -> None:
     async def main() -> None:
         async def work(items: Sequence[int]) -> list[int]:
             if 1 in items:
                 raise ZeroDivisionError
             return list(items)
 
-        batcher = Batcher(work, largest=2)
+        batcher = Batcher(work, max_batch=2)
         found = await asyncio.gather(
-            *(batcher.ask(number) for number in (0, 1, 2, 3)), return_exceptions=True
+            *(batcher.submit(number) for number in (0, 1, 2, 3)), return_exceptions=True
         )
         assert [isinstance(one, ZeroDivisionError) for one in found] == [False, True, True, False]
 
     run(main())
 
 
-def test_of_a_batch_that_is_lost_only_the_one_that_kills_has_no_answer() -> None:
+def test_batcher_lost_batch_is_retried_item_by_item() -> None:
     async def main() -> None:
         async def work(items: Sequence[int]) -> list[int]:
             await asyncio.sleep(0)
@@ -106,28 +106,28 @@ def test_of_a_batch_that_is_lost_only_the_one_that_kills_has_no_answer() -> None
                 raise ReplicaLost("the worker has died")
             return [2 * item for item in items]
 
-        batcher = Batcher(work, largest=8)
+        batcher = Batcher(work, max_batch=8)
         found = await asyncio.gather(
-            *(batcher.ask(number) for number in (1, 2, 13, 4)), return_exceptions=True
+            *(batcher.submit(number) for number in (1, 2, 13, 4)), return_exceptions=True
         )
         assert [found[0], found[1], found[3]] == [2, 4, 8]
         assert isinstance(found[2], PoisonedItem)
-        assert await batcher.ask(5) == 10
+        assert await batcher.submit(5) == 10
 
     run(main())
 
 
-def test_the_seconds_to_wait_grow_with_the_queue_and_stay_between_1_and_60() -> None:
+def test_batcher_retry_after_grows_with_queue() -> None:
     async def main() -> None:
         double = Doubling(gated=True)
-        batcher = Batcher(double, largest=2)
+        batcher = Batcher(double, max_batch=2)
         assert batcher.retry_after_estimate_s == 1
-        asked = [asyncio.create_task(batcher.ask(number)) for number in range(9)]
+        asked = [asyncio.create_task(batcher.submit(number)) for number in range(9)]
         await asyncio.sleep(0.01)
         assert (
             batcher.retry_after_estimate_s == 5
         )  # four batches of a guessed second each wait behind the one at work
-        asked += [asyncio.create_task(batcher.ask(number)) for number in range(300)]
+        asked += [asyncio.create_task(batcher.submit(number)) for number in range(300)]
         await asyncio.sleep(0.01)
         assert batcher.retry_after_estimate_s == 60
         double.gate.set()
@@ -136,12 +136,12 @@ def test_the_seconds_to_wait_grow_with_the_queue_and_stay_between_1_and_60() -> 
     run(main())
 
 
-def test_too_few_results_are_an_error_and_no_ones_wait_for_ever() -> None:
+def test_batcher_too_few_results_raise() -> None:
     async def main() -> None:
         async def work(items: Sequence[int]) -> list[int]:
             return []
 
         with pytest.raises(ValueError, match="shorter"):
-            await Batcher(work, largest=2).ask(1)
+            await Batcher(work, max_batch=2).submit(1)
 
     run(main())

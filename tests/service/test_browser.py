@@ -15,8 +15,8 @@ from aiohttp import web
 from pipeline.service.app import Service
 from pipeline.service.settings import ServiceSettings
 from tests.report.test_browser import ARGUMENTS, CHROMIUM, sync_api
-from tests.service.test_app import TOKEN, Engine
-from tests.service.test_request import photo
+from tests.service.http_client import TOKEN, FakeEngine
+from tests.service.photos import photo
 
 pytestmark = pytest.mark.skipif(
     CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"
@@ -26,7 +26,8 @@ DROP = """([name, kind, data]) => {
     const dropped = new DataTransfer();
     dropped.items.add(new File([bytes], name, { type: kind }));
     const how = { bubbles: true, cancelable: true };
-    document.querySelector('#drop').dispatchEvent(new DragEvent('drop', { dataTransfer: dropped, ...how }));
+    const event = new DragEvent('drop', { dataTransfer: dropped, ...how });
+    document.querySelector('#drop').dispatchEvent(event);
 }"""
 PASTE = DROP.replace(
     "DragEvent('drop', { dataTransfer:", "ClipboardEvent('paste', { clipboardData:"
@@ -38,7 +39,7 @@ class Served:
 
     def __init__(self, token: str | None = None) -> None:
         self._loop = asyncio.new_event_loop()
-        self.engine = Engine()
+        self.engine = FakeEngine()
         self._runner = Service(ServiceSettings(max_megabytes=1), self.engine, token).runner()
         self._thread = threading.Thread(target=self._loop.run_forever)
         self._thread.start()
@@ -95,7 +96,7 @@ def give(
     page.evaluate(how, [name, kind, base64.b64encode(data).decode()])
 
 
-def test_a_photo_dropped_is_answered_with_position_uncertainty_confidence_candidates_and_a_map(
+def test_page_dropped_photo_shows_answer_and_map(
     page: Any,
 ) -> None:
     give(page, DROP, photo())
@@ -113,7 +114,7 @@ def test_a_photo_dropped_is_answered_with_position_uncertainty_confidence_candid
     assert "3 images in the gallery" in page.inner_text("#index")
 
 
-def test_the_map_is_to_scale(page: Any) -> None:
+def test_page_map_is_to_scale(page: Any) -> None:
     """Candidates stand 0.001 degrees of latitude apart, 111.2 m; the rule says how long 100 m or so
     are.
     """
@@ -126,9 +127,7 @@ def test_the_map_is_to_scale(page: Any) -> None:
     assert apart == pytest.approx([111.195 * (x[1] - x[0]) / rule] * 4, rel=1e-3)
 
 
-def test_what_is_no_photo_is_told_in_a_sentence_and_the_next_one_is_answered(
-    browser: Any, served: Served
-) -> None:
+def test_page_shows_error_sentence(browser: Any, served: Served) -> None:
     page = browser.new_page()  # Chromium notes each refused request on the console
     page.goto(served.address)
     for data, kind, word in (
@@ -146,9 +145,7 @@ def test_what_is_no_photo_is_told_in_a_sentence_and_the_next_one_is_answered(
     page.close()
 
 
-def test_a_rough_position_and_a_number_of_candidates_go_along_by_keyboard_alone(
-    page: Any, served: Served
-) -> None:
+def test_page_fields_by_keyboard(page: Any, served: Served) -> None:
     page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.id") == "photo"
     page.set_input_files("#photo", {"name": "a.jpg", "mimeType": "image/jpeg", "buffer": photo()})
@@ -160,7 +157,7 @@ def test_a_rough_position_and_a_number_of_candidates_go_along_by_keyboard_alone(
         page.keyboard.type(text)
     page.keyboard.press("Enter")
     page.wait_for_function("() => document.querySelectorAll('#candidates tr').length === 3")
-    question = served.engine.asked[-1][0]
+    question = served.engine.batches[-1][0]
     assert question.near is not None
     assert (question.near.lat, question.near.lon, question.near.radius_m, question.top) == (
         47.5,
@@ -174,7 +171,7 @@ def test_a_rough_position_and_a_number_of_candidates_go_along_by_keyboard_alone(
 @pytest.mark.parametrize(
     ("width", "scheme"), [(360, "light"), (768, "dark"), (1280, "light"), (1280, "dark")]
 )
-def test_both_pages_fit_and_can_be_read(
+def test_pages_fit_every_width_and_scheme(
     browser: Any, served: Served, width: int, scheme: str
 ) -> None:
     page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
@@ -186,11 +183,11 @@ def test_both_pages_fit_and_can_be_read(
     assert dark == (scheme == "dark")
     page.goto(f"{served.address}api")
     assert page.evaluate("document.documentElement.scrollWidth") <= width
-    assert page.locator("section.call").count() == 8
+    assert page.locator("section.call").count() == 3 + 6  # paths, schemas
     page.close()
 
 
-def test_where_a_token_is_asked_for_the_page_asks_for_it(browser: Any) -> None:
+def test_page_asks_for_required_token(browser: Any) -> None:
     service = Served(TOKEN)
     page = browser.new_page()
     page.goto(service.address)

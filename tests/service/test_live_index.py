@@ -27,7 +27,7 @@ from pipeline.service.live_index import LiveIndex
 from pipeline.service.predictor import Outcome, Predictor, ServiceStatus
 from pipeline.service.request import LocateRequest
 from pipeline.service.settings import ServiceSettings
-from tests.service.test_request import photo
+from tests.service.photos import photo
 
 DIMENSION = 8
 
@@ -96,15 +96,13 @@ def path(tmp_path: Path) -> Path:
     return make_index(tmp_path / "index", 3)
 
 
-def test_a_new_index_is_taken_over_and_a_search_under_way_keeps_the_old_one(
-    path: Path, tmp_path: Path
-) -> None:
+def test_live_index_switches_to_new_index(path: Path, tmp_path: Path) -> None:
     live = LiveIndex(str(path))
     held = live.current
-    live.look()
+    live.poll()
     assert live.current is held
     replace(path, make_index(tmp_path / "new", 5))
-    live.look()
+    live.poll()
     assert (len(live.current.index), live.refused) == (5, None)
     assert held.index.search(np.eye(1, DIMENSION, 2, dtype=np.float32), 1)[0][0].key == "gallery-2"
 
@@ -125,33 +123,31 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("harm", BROKEN.values(), ids=BROKEN)
-def test_a_broken_index_is_refused_with_a_reason_and_the_old_one_goes_on(
-    path: Path, harm: Any
-) -> None:
+def test_live_index_broken_one_is_refused(path: Path, harm: Any) -> None:
     whole = path.with_name("whole")
     shutil.copytree(path, whole)
     live = LiveIndex(str(path))
     held = live.current
     harm(path)
-    live.look()
+    live.poll()
     assert live.current is held
     assert live.refused is not None
     assert "\n" not in live.refused
     shutil.rmtree(path)
     shutil.copytree(whole, path)
-    live.look()
+    live.poll()
     assert live.refused is None
 
 
-def test_another_networks_index_is_refused(path: Path, tmp_path: Path) -> None:
+def test_live_index_of_another_encoder_is_refused(path: Path, tmp_path: Path) -> None:
     live = LiveIndex(str(path))
     replace(path, make_index(tmp_path / "new", 5, fingerprint="e" * 64))
-    live.look()
+    live.poll()
     assert len(live.current.index) == 3
-    assert "made by network eeeeeeeeeeee" in str(live.refused)
+    assert "made by encoder eeeeeeeeeeee" in str(live.refused)
 
 
-def test_a_refused_index_is_not_opened_at_each_look_but_again_after_a_while(
+def test_live_index_refused_one_is_retried_later(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A copy whose index.json came first: it is whole later, without index.json having changed
@@ -161,19 +157,19 @@ def test_a_refused_index_is_not_opened_at_each_look_but_again_after_a_while(
     new = make_index(tmp_path / "new", 5)
     hidden = (path / "index.faiss").rename(tmp_path / "hidden")
     (new / "index.json").replace(path / "index.json")
-    live.look()
+    live.poll()
     assert live.refused
     hidden.rename(path / "index.faiss")
     replace(path, new)
-    live.look()
+    live.poll()
     assert len(live.current.index) == 3
     monkeypatch.setattr(live_index, "RETRY_S", 0.0)
-    live.look()
+    live.poll()
     assert len(live.current.index) == 5
     assert not live.refused
 
 
-def test_an_index_written_once_more_while_it_is_opened_is_left_for_the_next_look(
+def test_live_index_changed_while_opened_waits_for_next_poll(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     live = LiveIndex(str(path))
@@ -188,48 +184,48 @@ def test_an_index_written_once_more_while_it_is_opened_is_left_for_the_next_look
         return found
 
     monkeypatch.setattr(live_index, "open_verified", slow)
-    live.look()
+    live.poll()
     assert len(live.current.index) == 3
-    live.look()
+    live.poll()
     assert len(live.current.index) == 5
 
 
-def test_without_an_index_nothing_starts(tmp_path: Path) -> None:
+def test_live_index_missing_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no index at"):
         LiveIndex(str(tmp_path / "none"))
 
 
-def test_one_pass_of_the_network_answers_a_batch_in_order_whatever_each_asks(path: Path) -> None:
-    answerer = Predictor(str(path), WidthEncoder)
-    questions = [
+def test_predictor_batch_is_one_forward_pass(path: Path) -> None:
+    predictor = Predictor(str(path), WidthEncoder)
+    requests = [
         ask(2),
         LocateRequest(photo=photo(size=(15, 15))),
         ask(0, top=1),
         ask(1),
         ask(2, top=1),
     ]
-    found = answerer.answer(questions)
+    found = predictor.predict(requests)
     assert isinstance(found[1], Rejection)
     answers = [one for one in found if isinstance(one, Answer)]
     assert [one.location for one in answers] == ["place2", "place0", "place1", "place2"]
     assert [len(one.candidates) for one in answers] == [3, 1, 3, 1]
-    assert answerer._encoder.batches == [5]  # type: ignore[attr-defined]
+    assert predictor._encoder.batches == [5]  # type: ignore[attr-defined]
 
 
-def test_requests_go_on_being_answered_while_the_index_is_replaced_again_and_again(
+def test_service_answers_while_index_is_replaced(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two galleries by turns under a stream of requests; none fails, and the last one asked is the
     last one built.
     """
-    answerer = Predictor(str(path), WidthEncoder)
+    predictor = Predictor(str(path), WidthEncoder)
 
     class InThisProcess:
-        async def answer(self, questions: Sequence[LocateRequest]) -> list[Outcome]:
-            return await asyncio.to_thread(answerer.answer, questions)
+        async def predict(self, requests: Sequence[LocateRequest]) -> list[Outcome]:
+            return await asyncio.to_thread(predictor.predict, requests)
 
         async def status(self) -> ServiceStatus:
-            return answerer.status()
+            return predictor.status()
 
     monkeypatch.setattr(live_index, "POLL_INTERVAL_S", 0.02)
     stop = threading.Event()
@@ -257,11 +253,11 @@ def test_requests_go_on_being_answered_while_the_index_is_replaced_again_and_aga
         for rows in (5, 4, 6):
             replace(path, make_index(tmp_path / f"new{rows}", rows))
             deadline = time.monotonic() + 5
-            while answerer.status().rows != rows:
+            while predictor.status().rows != rows:
                 assert time.monotonic() < deadline
                 time.sleep(0.01)
 
-    follower = threading.Thread(target=answerer.live.follow, args=(stop,))
+    follower = threading.Thread(target=predictor.live.watch, args=(stop,))
     follower.start()
     try:
         statuses = asyncio.run(asyncio.wait_for(main(), 30))

@@ -2,38 +2,13 @@
 decoding them.
 """
 
-import io
-import struct
-import zlib
-
 import pytest
-from PIL import Image
 
 from pipeline.core.geo import Circle
 from pipeline.service.request import MAX_SCANS, RequestError, parse_request
+from tests.service.photos import bomb, photo
 
 MEGAPIXELS = 1_000_000
-
-
-def photo(form: str = "JPEG", mode: str = "RGB", size: tuple[int, int] = (40, 30)) -> bytes:
-    stream = io.BytesIO()
-    Image.new(mode, size).save(stream, form)
-    return stream.getvalue()
-
-
-def chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
-def bomb(side: int) -> bytes:
-    """A PNG of `side` x `side` black pixels, deflated to a thousandth."""
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0))
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + header
-        + chunk(b"IDAT", zlib.compress(bytes(side * (3 * side + 1))))
-        + chunk(b"IEND", b"")
-    )
 
 
 def refused(photo: bytes, **fields: str) -> RequestError:
@@ -43,12 +18,12 @@ def refused(photo: bytes, **fields: str) -> RequestError:
 
 
 @pytest.mark.parametrize("form", ["JPEG", "PNG", "WEBP"])
-def test_a_photo_alone_is_a_question(form: str) -> None:
+def test_request_photo_alone(form: str) -> None:
     asked = parse_request(photo(form), {}, MEGAPIXELS)
     assert (asked.near, asked.top) == (None, 5)
 
 
-def test_a_rough_position_is_a_circle() -> None:
+def test_request_rough_position() -> None:
     asked = parse_request(
         photo(), {"lat": "47.5", "lon": "-8", "radius_m": "2e3", "top": "3"}, MEGAPIXELS
     )
@@ -59,7 +34,7 @@ def test_a_rough_position_is_a_circle() -> None:
 @pytest.mark.parametrize(
     "lat", ["NaN", "inf", "-Infinity", "1e999", "north", "47,5", "91", "1" * 400]
 )
-def test_a_latitude_that_is_none_is_refused_in_a_sentence(lat: str) -> None:
+def test_request_invalid_latitude_is_refused(lat: str) -> None:
     refusal = refused(photo(), lat=lat, lon="8", radius_m="100")
     assert refusal.status == 400
     assert "expected" in refusal.sentence
@@ -67,16 +42,16 @@ def test_a_latitude_that_is_none_is_refused_in_a_sentence(lat: str) -> None:
 
 
 @pytest.mark.parametrize(("lon", "radius"), [("181", "5"), ("8", "0"), ("8", "-1"), ("8", "nan")])
-def test_a_circle_that_is_none_is_refused(lon: str, radius: str) -> None:
+def test_request_invalid_circle_is_refused(lon: str, radius: str) -> None:
     assert refused(photo(), lat="1", lon=lon, radius_m=radius).status == 400
 
 
-def test_half_a_rough_position_is_refused() -> None:
+def test_request_incomplete_position_is_refused() -> None:
     assert "found only lat and lon" in refused(photo(), lat="1", lon="2").sentence
 
 
 @pytest.mark.parametrize("top", ["0", "51", "-1", "2.5", "all", "9" * 50, "٣"])
-def test_a_number_of_candidates_that_is_none_is_refused(top: str) -> None:
+def test_request_invalid_top_is_refused(top: str) -> None:
     assert refused(photo(), top=top).status == 400
 
 
@@ -97,15 +72,13 @@ def test_a_number_of_candidates_that_is_none_is_refused(top: str) -> None:
         (bomb(1100), 413, "1100 x 1100"),
     ],
 )  # fmt: skip
-def test_what_is_no_usable_photo_is_refused_in_a_sentence(
-    data: bytes, status: int, word: str
-) -> None:
+def test_request_unusable_photo_is_refused(data: bytes, status: int, word: str) -> None:
     refusal = refused(data)
     assert refusal.status == status
     assert word in refusal.sentence
 
 
-def test_a_cmyk_photo_of_too_many_pixels_is_refused_before_it_is_decoded(
+def test_request_large_cmyk_photo_is_not_decoded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def no_decoding(data: bytes) -> None:
@@ -115,7 +88,7 @@ def test_a_cmyk_photo_of_too_many_pixels_is_refused_before_it_is_decoded(
     assert refused(photo(mode="CMYK", size=(1001, 1000))).status == 413
 
 
-def test_a_jpeg_of_a_hundred_scans_too_many_is_refused() -> None:
+def test_request_jpeg_of_many_scans_is_refused() -> None:
     data = photo()
     scan = b"\xff\xda\x00\x0c"
     assert parse_request(data[:-2] + scan * (MAX_SCANS - 1) + data[-2:], {}, MEGAPIXELS)

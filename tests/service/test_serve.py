@@ -127,7 +127,7 @@ def serve_actors() -> list[str]:
     return [name for name in named if name.startswith("SERVE")]
 
 
-def test_a_photo_is_answered_a_killed_replica_replaced_and_the_end_is_clean(
+def test_serve_answers_replaces_replica_and_ends_cleanly(
     road: tuple[Path, Path], ray_address: str
 ) -> None:
     checkpoint, index = road
@@ -150,9 +150,7 @@ def test_a_photo_is_answered_a_killed_replica_replaced_and_the_end_is_clean(
     assert not serve_actors()
 
 
-def test_a_network_that_did_not_make_the_index_ends_it_with_a_sentence(
-    road: tuple[Path, Path], ray_cluster: None
-) -> None:
+def test_serve_other_encoder_is_refused(road: tuple[Path, Path], ray_cluster: None) -> None:
     checkpoint, index = road
     said = json_files.read_checksummed(str(index / "index.json"))
     json_files.write_checksummed(str(index / "index.json"), said | {"fingerprint": "e" * 64})
@@ -161,7 +159,7 @@ def test_a_network_that_did_not_make_the_index_ends_it_with_a_sentence(
     assert not serve_actors()
 
 
-def test_what_is_not_there_is_told_before_anything_starts(tmp_path: Path) -> None:
+def test_serve_missing_input_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no checkpoint at"):
         main(Settings(checkpoint=str(tmp_path / "none.pt"), index=str(tmp_path)))
     with pytest.raises(InputError, match="no index at"):
@@ -170,9 +168,7 @@ def test_what_is_not_there_is_told_before_anything_starts(tmp_path: Path) -> Non
         Settings(checkpoint="last.pt", index="index", replicas=0)
 
 
-def test_a_port_that_is_taken_is_told_before_anything_is_loaded(
-    road: tuple[Path, Path], ray_cluster: None
-) -> None:
+def test_serve_port_in_use_is_refused(road: tuple[Path, Path], ray_cluster: None) -> None:
     checkpoint, index = road
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -182,9 +178,7 @@ def test_a_port_that_is_taken_is_told_before_anything_is_loaded(
             main(Settings(checkpoint=str(checkpoint), index=str(index), port=port))
 
 
-def test_a_replica_that_cannot_load_says_why_and_loads_once_it_can(
-    road: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_replica_retries_loading(road: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     checkpoint, index = road
     monkeypatch.setattr(replicas, "RETRY_S", 0.02)
     hidden = index.rename(index.with_name("hidden"))
@@ -194,15 +188,15 @@ def test_a_replica_that_cannot_load_says_why_and_loads_once_it_can(
     replica.check_health()  # another process would not find an index either
     hidden.rename(index)
     deadline = time.monotonic() + 10
-    while replica._answerer is None and time.monotonic() < deadline:
+    while replica._predictor is None and time.monotonic() < deadline:
         time.sleep(0.01)
     assert asyncio.run(replica.status()).rows == 3
 
 
-def test_a_replica_whose_batch_does_not_end_is_ill(
+def test_replica_stuck_batch_fails_health_check(
     road: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     replica = Replica(partial(load_predictor, str(road[0]), str(road[1]), None, 1))
-    replica._began = time.monotonic() - replicas.BATCH_TIMEOUT_S - 1
+    replica._batch_began = time.monotonic() - replicas.BATCH_TIMEOUT_S - 1
     with pytest.raises(TimeoutError, match="120 s"):
         replica.check_health()
