@@ -152,3 +152,20 @@ class Rejection:
         if len(found) > MAX_FOUND_LENGTH:  # a damaged file may hold a megabyte instead of a number
             found = f"{found[: MAX_FOUND_LENGTH - 3]}..."
         object.__setattr__(self, "found", found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkippedFile:
+    """A file that was passed over because it is no image that was asked for: a companion of images,
+    an image of another height. It is counted by its reason, and is no rejected image.
+    """
+
+    path: str
+    reason: str
+    "Short and countable."
+    count: int = 1
+    "How many files or tiles of one kind this stands for."
+
+
+Scanned = ImageRecord | Rejection | SkippedFile
+"What a source yields for each thing that it comes upon."

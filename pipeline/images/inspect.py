@@ -21,6 +21,13 @@ from pipeline.images.decode import (
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 "Of files that are taken for images, in lower case; upper case is valid too."
+UNDECODED_SUFFIXES = (
+    ".heic", ".heif", ".hif", ".avif", ".jxl", ".jp2", ".j2k", ".jpx", ".gif", ".psd", ".exr",
+    ".dng", ".raw", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".orf", ".rw2", ".raf", ".pef", ".3fr",
+)  # fmt: skip
+"Of images in formats that are not decoded here, in lower case."
+RAW_SUFFIXES = UNDECODED_SUFFIXES[UNDECODED_SUFFIXES.index(".dng") :]
+"Of raw images, which many cameras write beside a JPEG of the same photo."
 MAX_PIXELS = 178_956_970
 """Where Pillow sees a decompression bomb: twice what 24 bits a pixel make of a quarter of a GiB.
 Larger images decode refuses."""
@@ -38,6 +45,11 @@ PNG_METADATA_KEYWORDS = (b"Raw profile type exif\0", b"XML:com.adobe.xmp\0")
 def is_image_name(name: str) -> bool:
     """Whether a file is taken for an image, by its name."""
     return name.lower().endswith(IMAGE_SUFFIXES)
+
+
+def is_undecoded_image_name(name: str) -> bool:
+    """Whether a file is an image of a format that is not decoded here, by its name."""
+    return name.lower().endswith(UNDECODED_SUFFIXES)
 
 
 def inspect(data: bytes, most_pixels: int = MAX_PIXELS) -> tuple[int, int]:

@@ -1,29 +1,34 @@
-"""What every source is: a layout of imagery on some storage, told as records, and how their bytes
-are read.
+"""The interface of every source: a layout of imagery on some storage, read as records.
 
-In: a folder or file. Out: ImageRecords, and a Rejection for each thing that cannot be one. Nothing
-is judged by its pixels here; packing does that.
+In: a folder or file. Out: an ImageRecord per image, a Rejection per image that cannot be used, and
+a SkippedFile for every other file. A source judges names and tables; packing judges pixels.
 """
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pipeline.core import storage
-from pipeline.core.records import ImageRecord, Rejection
+from pipeline.core.progress import console
+from pipeline.core.records import ImageRecord, Rejection, Scanned, SkippedFile
+from pipeline.images.inspect import is_undecoded_image_name
+
+MAX_REASONS = 6
+"Reasons that the summary of a scan names, the most common first."
 
 
 @dataclass(frozen=True, kw_only=True)
 class Source(ABC):
-    """A layout. Its fields are its settings: flags of the command line, and part of what the
-    manifest says of a set.
+    """A layout. Its fields are its settings: flags of the command line, and part of the manifest's
+    record of how a set was packed.
     """
 
     @abstractmethod
-    def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
+    def scan(self, root: str) -> Iterator[Scanned]:
         """All images at `root`, in an order that depends on their names alone.
 
-        Raises InputError when `root` is no such layout.
+        Raises InputError when `root` does not have this layout.
         """
 
     def read(self, record: ImageRecord) -> bytes:
@@ -35,11 +40,52 @@ class Source(ABC):
         return storage.read_bytes(record.path)
 
     def ending(self, record: ImageRecord) -> str:
-        """What stands behind the key's dot in a shard: jpg, png, tif, webp."""
+        """The suffix of the image in a shard, behind the key's dot: jpg, png, tif, webp."""
         ending = record.path.rsplit(".", 1)[-1].lower()
         return {"jpeg": "jpg", "tiff": "tif"}.get(ending, ending)
 
 
-def not_an_image(path: str) -> Rejection:
-    """A file among the images whose name says that it is none."""
-    return Rejection(path=path, reason="not an image's name", found=path.rsplit("/", 1)[-1])
+def scan_images(source: Source, root: str) -> Iterator[ImageRecord | Rejection]:
+    """The images that a source finds. At the end the terminal shows how many there were, how many
+    of them with a position, and what was passed over and refused, by reason.
+    """
+    images = positions = 0
+    refused: Counter[str] = Counter()
+    skipped: Counter[str] = Counter()
+    for found in source.scan(root):
+        if isinstance(found, SkippedFile):
+            skipped[found.reason] += found.count
+            continue
+        if isinstance(found, Rejection):
+            refused[found.reason] += 1
+        else:
+            images += 1
+            positions += found.geotag is not None
+        yield found
+    line = f"{root}: {images:,} images found, {positions:,} with a position"
+    for name, counts in (("passed over", skipped), ("refused", refused)):
+        if counts:
+            line += f"; {counts.total():,} {name} ({by_reason(counts)})"
+    console.print(line, markup=False)
+
+
+def by_reason(counts: Counter[str]) -> str:
+    """`companion file .kml: 4, another zoom: 2`, the most common first."""
+    named = [f"{reason}: {count:,}" for reason, count in counts.most_common(MAX_REASONS)]
+    others = counts.total() - sum(count for _, count in counts.most_common(MAX_REASONS))
+    return ", ".join(named + ([f"others: {others:,}"] if others else []))
+
+
+def not_an_image(path: str) -> Rejection | SkippedFile:
+    """A file among images whose name is not one of an image that is read: refused where it is an
+    image of another format, else passed over as a companion of images.
+    """
+    name = path.rsplit("/", 1)[-1]
+    ending = f".{name.rpartition('.')[2].lower()}" if "." in name[1:] else ""
+    if is_undecoded_image_name(name):
+        found = f"{name}: {ending[1:].upper()} is not decoded; convert it to JPEG, PNG or TIFF"
+        return Rejection(path=path, reason=f"format not decoded ({ending})", found=found)
+    # A long or odd ending is a name with a dot in it, and no kind of file.
+    plain = len(ending) <= 6 and ending[1:].isalnum()
+    kind = f"companion file {ending}" if plain else "file that is no image by its name"
+    return SkippedFile(path=path, reason=kind)

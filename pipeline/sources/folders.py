@@ -1,7 +1,7 @@
-"""Folders that hold one folder of images per location -> what is in them.
+"""Folders that hold one folder of images per location -> their images.
 
-In: a folder on some storage. Out: its images with the location that each lies in, and a Rejection
-for whatever lies elsewhere or is no image by its name.
+In: a folder on some storage. Out: its images, each with its location; a Rejection for each file
+elsewhere in the layout, and a SkippedFile for each file that is no image by its name.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -9,14 +9,22 @@ from dataclasses import dataclass
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View
+from pipeline.core.records import (
+    GeoTag,
+    ImageRecord,
+    Rejection,
+    Scanned,
+    SkippedFile,
+    Split,
+    View,
+)
 from pipeline.images.inspect import is_image_name
 from pipeline.sources.base import not_an_image
 
 
 @dataclass(frozen=True, kw_only=True)
 class SplitFolder:
-    """Where one split's images of one view are: `<phase>/<folder>`."""
+    """The folder of one split's images of one view: `<phase>/<folder>`."""
 
     phase: str
     folder: str
@@ -38,7 +46,7 @@ class LocatedImage:
 def split_folders(
     views: Iterable[View], train: str = "train", test: str = "test"
 ) -> list[SplitFolder]:
-    """Folders as University-1652 names them and others after it: `train/drone`, `test/query_drone`,
+    """Folders as University-1652 and its successors name them: `train/drone`, `test/query_drone`,
     `test/gallery_drone`.
     """
     phases = (
@@ -53,49 +61,59 @@ def split_folders(
     ]
 
 
-def images_by_location(folder: str) -> Iterator[LocatedImage | Rejection]:
-    """All images at `<folder>/<location>/<image>`, ordered by path; an absent folder has none."""
+def images_by_location(folder: str) -> Iterator[LocatedImage | Rejection | SkippedFile]:
+    """All images at `<folder>/<location>/<image>`, ordered by path; none where there is no
+    folder.
+    """
     if not storage.is_folder(folder):
         return
     for path, size in storage.walk(folder).items():
         location, _, name = path.rpartition("/")
-        whole = storage.join(folder, path)
-        if not location or "/" in location:
-            yield wrong_folder(whole, f"{path} is not <location>/<image>")
-        elif not is_image_name(name):
-            yield not_an_image(whole)
+        full_path = storage.join(folder, path)
+        if not is_image_name(name):
+            yield not_an_image(full_path)
+        elif not location or "/" in location:
+            yield wrong_folder(full_path, f"{path} is not <location>/<image>")
         else:
-            yield LocatedImage(path=whole, name=name, location=location, bytes=size)
+            yield LocatedImage(path=full_path, name=name, location=location, bytes=size)
 
 
 def images_by_split(
     root: str, views: Iterable[View], tag: Callable[[SplitFolder, LocatedImage], GeoTag | None]
-) -> Iterator[ImageRecord | Rejection]:
+) -> Iterator[Scanned]:
     """All images of a data set whose folders are named as University-1652's, with the geotag that
-    `tag` knows of each.
+    `tag` returns for each. Other folders beside them are passed over.
     """
-    for folder in split_folders(views):
+    folders = split_folders(views)
+    wanted = {f"{folder.phase}/{folder.folder}" for folder in folders}
+    for phase in dict.fromkeys(folder.phase for folder in folders):
+        for name in _folder_names(storage.join(root, phase)):
+            if f"{phase}/{name}" not in wanted:
+                yield SkippedFile(path=storage.join(root, phase, name), reason=f"folder {name}")
+    for folder in folders:
         for item in images_by_location(storage.join(root, folder.phase, folder.folder)):
-            if isinstance(item, Rejection):
+            if not isinstance(item, LocatedImage):
                 yield item
                 continue
             yield ImageRecord(
-                path=item.path, split=folder.split, view=folder.view, location=item.location,
-                geotag=tag(folder, item), bytes=item.bytes,
-            )  # fmt: skip
+                path=item.path,
+                split=folder.split,
+                view=folder.view,
+                location=item.location,
+                geotag=tag(folder, item),
+                bytes=item.bytes,
+            )
 
 
 def wrong_folder(path: str, found: str) -> Rejection:
-    """A file that lies where the layout has none."""
+    """An image in a folder where the layout has none."""
     return Rejection(path=path, reason="wrong folder", found=found)
 
 
-def require_images(
-    found: Iterable[ImageRecord | Rejection], root: str, layout: str
-) -> Iterator[ImageRecord | Rejection]:
-    """What a scan found, passed on. `layout` says in words what was expected at `root`.
+def require_images(found: Iterable[Scanned], root: str, layout: str) -> Iterator[Scanned]:
+    """The results of a scan, passed on. `layout` says in words what was expected at `root`.
 
-    Raises InputError when `root` is no folder, and at the end when not one image was found.
+    Raises InputError when `root` is not a folder, and at the end when there was no image.
     """
     if not storage.is_folder(root):
         raise InputError(f"no folder {root}; expected {layout}; check --root")
@@ -105,3 +123,10 @@ def require_images(
         yield item
     if not some:
         raise InputError(f"no images below {root}; expected {layout}; check --root")
+
+
+def _folder_names(folder: str) -> list[str]:
+    if not storage.is_folder(folder):
+        return []
+    names = storage.list_names(folder)
+    return [name for name in names if storage.is_folder(storage.join(folder, name))]

@@ -1,7 +1,7 @@
 """A folder of photos as they come off a UAV's card -> ImageRecords with the geotags that the camera
 wrote.
 
-In: any folders below a root. Out: a record per image name, in the order of their paths. Only the
+In: any folders below a root. Out: a record per photo, in the order of their paths. Only the
 beginning of a JPEG is read.
 """
 
@@ -14,41 +14,30 @@ from typing import Literal
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch_map
-from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View
+from pipeline.core.records import (
+    GeoTag,
+    ImageRecord,
+    Rejection,
+    Scanned,
+    SkippedFile,
+    Split,
+    View,
+)
 from pipeline.images.camera_tags import CameraTags, read_tags
 from pipeline.images.image_blocks import UnreadableTag, find_metadata
-from pipeline.images.inspect import is_image_name
+from pipeline.images.inspect import RAW_SUFFIXES, is_image_name
 from pipeline.sources.base import Source, not_an_image
+from pipeline.sources.maps.georeference import ELLIPSOID
 
 HEAD_BYTES = 256 << 10
-"""Bytes that are read of a file: the first two or three segments of 64 kB hold EXIF and XMP in all
+"""Read of each file first: the first two or three segments of 64 kB hold EXIF and XMP in all
 cameras seen."""
 THREADS, PREFETCH = 16, 256
-"""Files whose beginnings are read at once, as scanning waits for disks and networks; and how far
-ahead of the consumer."""
-COMPANIONS = (
-    ".dng",
-    ".mp4",
-    ".mov",
-    ".srt",
-    ".lrf",
-    ".mrk",
-    ".nav",
-    ".obs",
-    ".bin",
-    ".txt",
-    ".csv",
-    ".json",
-    ".xml",
-    ".kml",
-    ".thm",
-)
-"""Endings of what cameras write beside photos: raw copies, films, flight logs. Left out without a
-word."""
-EARTH_RADIUS_M = 6_371_008.8  # mean radius, IUGG
-MAX_PITCH_DEG = (
-    -20.0
-)  # above this the axis arrives 2.7 heights away and more, where a degree of pitch moves it by far
+"""Files whose beginnings are read at once, as scanning waits for disks and networks; and how many
+are read before the consumer asks for them."""
+MAX_PITCH_DEG = -20.0
+"""Above this pitch the optical axis meets the ground 2.7 heights away or further, where a degree of
+pitch moves that point a long way."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,9 +45,9 @@ class Photos(Source):
     """UAV photos in folders, geotags from EXIF and XMP."""
 
     view: View = View.DRONE
-    "What the photos show their places from."
+    "Of the photos."
     split: Split = Split.QUERY
-    "What the photos are: queries, gallery or training images."
+    "The part of the data set that the photos become: queries, gallery or training images."
     location: Literal["folder", "file"] = "folder"
     """What one location is. folder: all photos of a folder show one place, named by the folder's
     path below the root (a photo directly at the root: by its file name). file: each photo is a
@@ -72,40 +61,54 @@ class Photos(Source):
     known and the camera looks 20 degrees or more below the horizon. Otherwise it is the camera's
     own; the place shown lies height / tan(-pitch) ahead."""
 
-    def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
+    def scan(self, root: str) -> Iterator[Scanned]:
         if not storage.is_folder(root):
             raise InputError(f"no folder {root}; expected a folder of photos; check --root")
         files = storage.walk(root)
         if not any(map(is_image_name, files)):
-            others = Counter(path.rpartition(".")[2] for path in files).most_common(3)
-            said = ", ".join(f"{count} .{ending}" for ending, count in others) or "nothing at all"
+            endings = Counter(path.rpartition(".")[2] for path in files).most_common(3)
+            found = ", ".join(f"{count} .{ending}" for ending, count in endings)
             raise InputError(
-                f"no images below {root}, but {said}; expected photos in any folders; check --root"
+                f"no images below {root}, but {found or 'nothing at all'}; expected photos in any "
+                "folders; check --root"
             )
-        photos = [
-            (path, size) for path, size in files.items() if not path.lower().endswith(COMPANIONS)
-        ]
-        yield from prefetch_map(lambda photo: self._judge(root, *photo), photos, THREADS, PREFETCH)
+        stems = {_stem(path) for path in files if is_image_name(path)}
+        yield from prefetch_map(
+            lambda photo: self._read(root, *photo, stems), list(files.items()), THREADS, PREFETCH
+        )
 
-    def _judge(self, root: str, path: str, size: int) -> ImageRecord | Rejection:
-        whole = storage.join(root, path)
+    def _read(self, root: str, path: str, size: int, stems: set[str]) -> Scanned:
+        """A file's record. `stems`: the paths of all photos without their endings."""
+        full_path = storage.join(root, path)
         if not is_image_name(path):
-            return not_an_image(whole)
+            if path.lower().endswith(RAW_SUFFIXES) and _stem(path) in stems:
+                return SkippedFile(path=full_path, reason="raw copy of a photo")
+            return not_an_image(full_path)
         try:
-            tags = CameraTags() if self.geotags == "ignored" else read_photo(whole, size)
+            ignored = self.geotags == "ignored"
+            tags = CameraTags() if ignored else read_photo(full_path, size)
         except UnreadableTag as error:
-            return Rejection(path=whole, reason="unreadable tag", found=str(error))
+            return Rejection(path=full_path, reason="unreadable tag", found=str(error))
         except OSError as error:
-            return Rejection(path=whole, reason="unreadable file", found=str(error))
+            return Rejection(path=full_path, reason="unreadable file", found=str(error))
         if self.geotags == "required" and tags.position is None:
             found = "; ".join(tags.ignored) or "neither EXIF nor XMP holds one"
-            return Rejection(path=whole, reason="no position", found=found)
+            return Rejection(path=full_path, reason="no position", found=found)
         folder, _, name = path.rpartition("/")
+        by_folder = self.location == "folder"
         return ImageRecord(
-            path=whole, split=self.split, view=self.view, bytes=size, taken_at=tags.taken_at,
-            location=(folder or name) if self.location == "folder" else path.rpartition(".")[0],
+            path=full_path,
+            split=self.split,
+            view=self.view,
+            location=(folder or name) if by_folder else path.rpartition(".")[0],
             geotag=geotag_of_photo(tags, self.project),
-        )  # fmt: skip
+            taken_at=tags.taken_at,
+            bytes=size,
+        )
+
+
+def _stem(path: str) -> str:
+    return path.rpartition(".")[0].lower()
 
 
 def read_photo(path: str, size: int) -> CameraTags:
@@ -115,27 +118,26 @@ def read_photo(path: str, size: int) -> CameraTags:
     Raises UnreadableTag, OSError.
     """
     if not size:
-        return CameraTags()  # packing refuses it; object stores refuse a range of nothing
-    blocks = find_metadata(storage.read_head(path, HEAD_BYTES), complete=size <= HEAD_BYTES)
-    if blocks.truncated and size > HEAD_BYTES:
-        blocks = find_metadata(storage.read_bytes(path), complete=True)
+        return CameraTags()  # packing refuses the file; object stores refuse an empty range
+    blocks = find_metadata(storage.read_head(path, HEAD_BYTES), whole=size <= HEAD_BYTES)
+    if blocks.cut and size > HEAD_BYTES:
+        blocks = find_metadata(storage.read_bytes(path), whole=True)
     return read_tags(blocks)
 
 
 def geotag_of_photo(tags: CameraTags, project: bool) -> GeoTag | None:
     """The geotag of a photo; None without a position.
 
-    Its height is the one above take-off; an altitude above the sea is none above the ground, and is
-    left out.
+    Its height is the one above take-off; an altitude above the sea is not a height above the
+    ground, and is ignored.
     """
     if tags.position is None:
         return None
     lat, lon = tags.position
     height, heading, pitch = tags.height_m, tags.heading_deg, tags.pitch_deg
-    if project and height is not None and height > 0 and heading is not None and pitch is not None:
-        lat, lon = (
-            aim_point(lat, lon, height, heading, pitch) if pitch <= MAX_PITCH_DEG else (lat, lon)
-        )
+    if project and height is not None and heading is not None and pitch is not None:
+        if height > 0 and pitch <= MAX_PITCH_DEG:
+            lat, lon = aim_point(lat, lon, height, heading, pitch)
     return GeoTag(lat=lat, lon=lon, altitude_m=height, heading_deg=heading, pitch_deg=pitch)
 
 
@@ -143,18 +145,11 @@ def aim_point(
     lat: float, lon: float, height_m: float, heading_deg: float, pitch_deg: float
 ) -> tuple[float, float]:
     """Latitude and longitude at which the optical axis meets the ground: height / tan(-pitch)
-    metres along the heading.
+    metres along the heading, on a geodesic of WGS84.
 
     Angles in degrees, pitch from -90 (straight down) to below 0. The ground is flat and as high as
-    where the height is measured from; the way along it is a great circle on a sphere, which is
-    within 0.6% of the distance.
+    where the height is measured from.
     """
-    way = height_m / math.tan(math.radians(-pitch_deg)) / EARTH_RADIUS_M
-    bearing, north = math.radians(heading_deg), math.radians(lat)
-    sine = math.sin(north) * math.cos(way) + math.cos(north) * math.sin(way) * math.cos(bearing)
-    east = math.atan2(
-        math.sin(bearing) * math.sin(way) * math.cos(north), math.cos(way) - math.sin(north) * sine
-    )
-    return math.degrees(math.asin(max(-1.0, min(1.0, sine)))), (
-        lon + math.degrees(east) + 180
-    ) % 360 - 180
+    distance_m = height_m / math.tan(math.radians(-pitch_deg))
+    aim_lon, aim_lat, _ = ELLIPSOID.fwd(lon, lat, heading_deg, distance_m)
+    return float(aim_lat), float(aim_lon)

@@ -1,5 +1,4 @@
-"""A table of images -> ImageRecords: for imagery that lies as it lies, and whose facts somebody has
-already.
+"""A table of images -> ImageRecords: images in any folders whose metadata is in one file.
 
 In: a CSV, Parquet or GeoJSON file. Out: a record per row, in the table's order; a Rejection with
 the row's number for each row that cannot be one.
@@ -7,6 +6,7 @@ the row's number for each row that cannot be one.
 
 import math
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import date, datetime
@@ -21,6 +21,32 @@ from pipeline.images.inspect import is_image_name
 from pipeline.sources.base import Source
 from pipeline.sources.maps.geojson_shapes import Shape, order_footprint, wrap_longitude
 from pipeline.sources.table_rows import BROKEN_COLUMN, SHAPE_COLUMN, Row, read_table_rows
+from pipeline.sources.text_tables import distance_m
+
+MISSING = frozenset(
+    (
+        "",
+        "nan",
+        "-nan",
+        "na",
+        "n/a",
+        "<na>",
+        "#n/a",
+        "#n/a n/a",
+        "null",
+        "#null!",
+        "none",
+        "nil",
+        "nat",
+    )
+)
+"Words for a missing value in R, SQL, Python and spreadsheets, in lower case; pandas reads them so."
+WHOLE_FLOAT = re.compile(r"(-?\d+)\.0+", re.ASCII)
+"""A whole number that became a float, as pandas writes a column of numbers in which one is
+missing."""
+POINT_TOLERANCE_M, POLYGON_TOLERANCE_M = 100.0, 10_000.0
+"""Distances that a row's `lat` and `lon` may have from its geometry. A polygon is the ground shown,
+and `lat` and `lon` may be the camera's own position beside it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,21 +61,23 @@ class Table(Source):
     def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
         folder = root.rpartition("/")[0] if "/" in root else "."
         empty = True
-        for row_number, row in read_table_rows(root):
+        for number, row in read_table_rows(root):
             empty = False
             path = _cell_text(row, "path")
-            whole = path if path.startswith("/") or "://" in path else storage.join(folder, path)
+            absolute = path.startswith("/") or "://" in path
+            full_path = path if absolute else storage.join(folder, path)
             try:
-                yield self._record(row, path, whole)
+                yield self._record(row, path, full_path)
             except BadRow as bad:
-                said = whole if path else root
                 yield Rejection(
-                    path=said, reason=bad.reason, found=f"row {row_number}: {bad.found}"
+                    path=full_path if path else root,
+                    reason=bad.reason,
+                    found=f"row {number}: {bad.found}",
                 )
         if empty:
             raise InputError(f"{root} has no rows; expected one per image")
 
-    def _record(self, row: Row, path: str, whole: str) -> ImageRecord:
+    def _record(self, row: Row, path: str, full_path: str) -> ImageRecord:
         """Raises BadRow."""
         if BROKEN_COLUMN in row:
             raise BadRow(*row[BROKEN_COLUMN])
@@ -58,27 +86,28 @@ class Table(Source):
         name = path.rpartition("/")[2]
         if not is_image_name(name):
             raise BadRow("not an image's name", name)
-        view, split = (
-            _cell_text(row, "view").lower() or self.view,
-            _cell_text(row, "split").lower() or self.split,
-        )
+        view = _cell_text(row, "view").lower() or self.view
+        split = _cell_text(row, "split").lower() or self.split
         if view not in set(View):
             raise BadRow("unknown view", f"{view}, not one of {', '.join(View)}")
         if split not in set(Split):
             raise BadRow("unknown split", f"{split}, not one of {', '.join(Split)}")
+        location = _cell_text(row, "location")
+        if integer := WHOLE_FLOAT.fullmatch(location):
+            location = integer[1]
         return ImageRecord(
-            path=whole,
+            path=full_path,
             view=View(view),
             split=Split(split),
-            location=_cell_text(row, "location") or name.rpartition(".")[0],
+            location=location or name.rpartition(".")[0],
             geotag=geotag_of_row(row),
             taken_at=_taken_at(row),
-            bytes=_file_size(whole),
+            bytes=_file_size(full_path),
         )
 
 
 class BadRow(ValueError):
-    """A row that is no image. `reason` is short and countable."""
+    """A row that is not an image. `reason` is short and countable."""
 
     def __init__(self, reason: str, found: str) -> None:
         super().__init__(f"{reason}: {found}")
@@ -88,58 +117,90 @@ class BadRow(ValueError):
 def geotag_of_row(row: Row) -> GeoTag | None:
     """The geotag of a row; None where it has no position, or exactly 0, 0.
 
-    Of a polygon the position is its centroid, and with four corners they are the footprint of an
-    image whose top looks in the direction of the row's heading, north where it has none. Raises
-    BadRow.
+    The position of a polygon is its centroid; four corners are the footprint of an image whose top
+    points in the direction of the row's heading, north where there is none. A geometry and a `lat`
+    and `lon` that contradict it are refused. Raises BadRow.
     """
     shape: Shape | None = row.get(SHAPE_COLUMN)
-    if shape is None:
-        said = f"lat {row.get('lat')}, lon {row.get('lon')}"
-        place = (_cell_number(row, "lat"), _cell_number(row, "lon"))
-    else:
-        said, place = shape.found, shape.middle or (None, None)
-    lat, lon = place
     altitude, heading, pitch = (
         _cell_number(row, name) for name in ("altitude_m", "heading_deg", "pitch_deg")
     )
     if pitch is not None and abs(pitch) > 90:
         raise BadRow("unreadable tag", f"pitch_deg {pitch}, not from -90 to 90")
-    if shape is None and lat is None and lon is None:
+    position = _position(row, "position") if shape is None else _middle(shape)
+    if position is None:
+        return None
+    if shape is not None:
+        _check_agreement(row, shape, position)
+    return GeoTag(
+        lat=position[0],
+        lon=position[1],
+        altitude_m=altitude,
+        heading_deg=None if heading is None else heading % 360,
+        pitch_deg=pitch,
+        footprint=order_footprint(shape.corners, heading or 0.0)
+        if shape is not None and shape.corners
+        else None,
+    )
+
+
+def _position(row: Row, name: str) -> tuple[float, float] | None:
+    """The position of the columns `lat` and `lon`. Raises BadRow."""
+    lat, lon = _cell_number(row, "lat"), _cell_number(row, "lon")
+    if lat is None and lon is None:
         return None
     if lat is None or lon is None:
-        raise BadRow("unreadable tag", said)
+        raise BadRow("unreadable tag", f"lat {row.get('lat')}, lon {row.get('lon')}")
+    return _validated(lat, lon, name)
+
+
+def _middle(shape: Shape) -> tuple[float, float] | None:
+    """Raises BadRow."""
+    if shape.middle is None:
+        raise BadRow("unreadable tag", shape.found)
+    for lat, lon in shape.corners:
+        _validated(lat, wrap_longitude(lon), "corner of a polygon")
+    return _validated(*shape.middle, shape.found)
+
+
+def _validated(lat: float, lon: float, name: str) -> tuple[float, float] | None:
+    """Raises BadRow."""
     try:
-        found = validate_position(lat, lon, "position" if shape is None else shape.found)
-        corners = shape.corners if shape is not None else ()
-        for corner in corners:
-            validate_position(corner[0], wrap_longitude(corner[1]), "corner of a polygon")
+        return validate_position(lat, lon, name)
     except UnreadableTag as error:
         raise BadRow("unreadable tag", str(error)) from None
-    return (
-        None
-        if found is None
-        else GeoTag(
-            lat=found[0],
-            lon=found[1],
-            altitude_m=altitude,
-            heading_deg=None if heading is None else heading % 360,
-            pitch_deg=pitch,
-            footprint=order_footprint(corners, heading or 0.0) if corners else None,
-        )
+
+
+def _check_agreement(row: Row, shape: Shape, position: tuple[float, float]) -> None:
+    """Raises BadRow where a row's `lat` and `lon` contradict its geometry. Columns that cannot be
+    read contradict nothing.
+    """
+    try:
+        columns = _position(row, "position")
+    except BadRow:
+        return
+    tolerance = POLYGON_TOLERANCE_M if shape.span else POINT_TOLERANCE_M
+    if columns is None or (apart := distance_m(columns, position)) <= tolerance:
+        return
+    raise BadRow(
+        "contradicting positions",
+        f"{shape.found} and lat {columns[0]:g}, lon {columns[1]:g} are {apart:,.0f} m apart",
     )
 
 
 def _cell_text(row: Row, name: str) -> str:
+    """The text of a cell; empty where it holds a word for a missing value."""
     value = row.get(name)
-    return (
-        "" if value is None or value != value else str(value).strip()
-    )  # NaN: how pandas writes nothing
+    if value is None or value != value:  # NaN, which pandas writes for a missing value
+        return ""
+    text = str(value).strip()
+    return "" if text.lower() in MISSING else text
 
 
 def _cell_number(row: Row, name: str) -> float | None:
-    """None where the cell is empty, null or NaN. Raises BadRow."""
+    """None where the cell is empty. Raises BadRow."""
     text = _cell_text(row, name)
-    if not text or text.lower() == "nan":
+    if not text:
         return None
     value = parse_number(text)
     if value is None or not math.isfinite(value):
@@ -159,7 +220,7 @@ def _taken_at(row: Row) -> str | None:
 
 
 def _file_size(path: str) -> int | None:
-    """Bytes of a file on this machine; None elsewhere, where asking takes a request each. Raises
+    """Bytes of a file on this machine; None of a remote one, as each would cost a request. Raises
     BadRow.
     """
     if "://" in path and not path.startswith("file://"):

@@ -1,15 +1,15 @@
-"""A CSV, Parquet or GeoJSON file -> numbered rows with our column names, values as they stand
-there.
+"""A CSV, Parquet or GeoJSON file -> numbered rows under our column names, values as the file has
+them.
 
-In: a file on any storage. Out: (row number from 1, {column: value}) in the file's order. Cells are
-not judged here, only the file and its columns are.
+In: a file on any storage. Out: (row number from 1, {column: value}) in the file's order. The file
+and its columns are validated here, cells are not.
 """
 
 import csv
 import io
 import json
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import IO, Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -32,24 +32,25 @@ COLUMNS = (
     "taken_at",
 )
 ALIASES = {"latitude": "lat", "longitude": "lon", "lng": "lon"}
-NUMBERS = ("lat", "lon", "altitude_m", "heading_deg", "pitch_deg")
+NUMBER_COLUMNS = ("lat", "lon", "altitude_m", "heading_deg", "pitch_deg")
 SHAPE_COLUMN = "shape"
 "Under this name a GeoJSON row holds its geometry, a Shape."
 BROKEN_COLUMN = "broken"
-"Under this name a row that cannot be one holds a countable reason, and what was found."
+"Under this name an unusable row holds a countable reason, and what was found."
 MAX_CELL_LENGTH = 4096
 "Characters: the longest path that a file system opens."
 DELIMITERS = ",;\t"
 BATCH_ROWS = 10_000  # rows of Parquet at once
+BYTE_ORDER_MARKS = {b"\xff\xfe": "UTF-16", b"\xfe\xff": "UTF-16", b"\x00\x00\xfe\xff": "UTF-32"}
 
 Row = dict[str, Any]
 
 
 def read_table_rows(path: str) -> Iterator[tuple[int, Row]]:
-    """The rows of a table. Row 1 is the first below a CSV's header.
+    """The rows of a table. Row 1 is the first below a CSV's header; blank rows are not counted.
 
-    Columns besides ours are left out; names are matched without regard to case. Raises InputError
-    where the file is no table of images.
+    Other columns are ignored; names match in upper and lower case. Raises InputError where the file
+    is not a table of images.
     """
     readers = {
         "csv": _csv_rows,
@@ -74,15 +75,13 @@ def read_table_rows(path: str) -> Iterator[tuple[int, Row]]:
 
 
 def _check_cell_lengths(row: Row) -> Row:
-    """The row without cells longer than any value of ours: what is held and told of a hostile one
-    stays small.
+    """The row without cells longer than any valid value, so that memory and messages stay small for
+    a hostile file.
     """
     for name, value in row.items():
         if isinstance(value, str | bytes) and len(value) > MAX_CELL_LENGTH:
-            return row | {
-                name: value[:MAX_CELL_LENGTH],
-                BROKEN_COLUMN: ("cell too long", f"{name} of {len(value)} characters"),
-            }
+            broken = ("cell too long", f"{name} of {len(value)} characters")
+            return row | {name: value[:MAX_CELL_LENGTH], BROKEN_COLUMN: broken}
     return row
 
 
@@ -97,62 +96,82 @@ def _map_columns(path: str, found: Iterable[str]) -> dict[str, str]:
             continue
         if column in ours.values():
             raise InputError(
-                f"{path} has two columns for {column}: {', '.join(names)}; expected one; take one away"
+                f"{path} has two columns for {column}: {', '.join(names)}; expected one; "
+                "take one away"
             )
         ours[name] = column
     half = {"lat", "lon"} & set(ours.values())
-    missing = [
-        name
-        for name in (REQUIRED_COLUMN, *({"lat", "lon"} if len(half) == 1 else ()))
-        if name not in ours.values()
-    ]
+    wanted = (REQUIRED_COLUMN, *({"lat", "lon"} if len(half) == 1 else ()))
+    missing = [name for name in wanted if name not in ours.values()]
     if missing:
         raise InputError(
-            f"{path} has no column {missing[0]} but {', '.join(names) or 'none'}; expected {REQUIRED_COLUMN} and any of "
-            f"{', '.join(COLUMNS[1:])}; add it or rename one"
+            f"{path} has no column {missing[0]} but {', '.join(names) or 'none'}; expected "
+            f"{REQUIRED_COLUMN} and any of {', '.join(COLUMNS[1:])}; add it or rename one"
         )
     return ours
 
 
 def _csv_rows(path: str) -> Iterator[Row]:
-    """Every cell as text: a location called 0001 stays so."""
+    """Every cell as text: a location called 0001 stays so. Rows of separators alone are blank."""
     with (
         storage.open_read(path) as stream,
         io.TextIOWrapper(stream, "utf-8-sig", newline="") as text,
     ):
         try:
-            header = text.readline()
-            delimiter = max(
-                DELIMITERS, key=header.count
-            )  # the first of them in a table of one column
-            lines = csv.reader(text, delimiter=delimiter)
+            header, delimiter = _read_header(text)
             names = next(csv.reader([header], delimiter=delimiter), [])
+            while names and not names[-1].strip():  # separators behind the last column
+                names.pop()
             ours = _map_columns(path, names)
-            for cells in lines:
-                if not cells:
-                    continue  # an empty line
-                row: Row = {
-                    ours[name]: cell
-                    for name, cell in zip(names, cells, strict=False)
-                    if name in ours
-                }
-                if len(cells) != len(names):  # an unquoted comma in a name shifts all that follows
-                    row[BROKEN_COLUMN] = (
-                        "wrong number of cells",
-                        f"{len(cells)} cells below {len(names)} columns",
-                    )
-                if delimiter != ",":  # a spreadsheet of half of the world: 50,1
-                    row |= {name: row[name].replace(",", ".") for name in NUMBERS if name in row}
-                yield row
+            for cells in csv.reader(text, delimiter=delimiter):
+                if any(cell.strip() for cell in cells):
+                    yield _csv_row(names, ours, cells, delimiter)
         except UnicodeDecodeError as error:
-            raise InputError(
-                f"{path} is not UTF-8 (byte {error.object[error.start]:#04x}); expected UTF-8 with or without BOM; save it "
-                "again as UTF-8, or `iconv -f latin1 -t utf8` it"
-            ) from None
+            raise _not_utf8(path, error) from None
         except csv.Error as error:
             raise InputError(
                 f"{path} cannot be read as CSV ({error}); expected a header and a row per image"
             ) from None
+
+
+def _read_header(text: IO[str]) -> tuple[str, str]:
+    """The line with the columns' names, and the delimiter. Excel writes a line `sep=;` before."""
+    header = text.readline()
+    note = header.strip().strip('"')
+    if note.lower().startswith("sep=") and len(note) == 5:
+        return text.readline(), note[-1]
+    if header.startswith("sep=\t"):
+        return text.readline(), "\t"
+    return header, max(DELIMITERS, key=header.count)  # the first of them in a table of one column
+
+
+def _csv_row(names: list[str], ours: dict[str, str], cells: list[str], delimiter: str) -> Row:
+    while len(cells) > len(names) and not cells[-1].strip():
+        cells = cells[:-1]
+    row: Row = {ours[name]: cell for name, cell in zip(names, cells, strict=False) if name in ours}
+    if len(cells) != len(names):  # an unquoted comma in a name shifts all that follows
+        found = f"{len(cells)} cells below {len(names)} columns"
+        row[BROKEN_COLUMN] = ("wrong number of cells", found)
+    if delimiter != ",":  # spreadsheets of many countries write 50,1
+        row |= {name: row[name].replace(",", ".") for name in NUMBER_COLUMNS if name in row}
+    return row
+
+
+def _not_utf8(path: str, error: UnicodeDecodeError) -> InputError:
+    """The error with the encoding that the file's first bytes show."""
+    with storage.open_read(path) as stream:
+        start = stream.read(4)
+    marked = next((name for mark, name in BYTE_ORDER_MARKS.items() if start.startswith(mark)), None)
+    if marked or b"\0" in start:
+        name = marked or "UTF-16"
+        return InputError(
+            f"{path} is not UTF-8, it is {name}; expected UTF-8 with or without BOM; save it again "
+            f"as UTF-8, or `iconv -f {name.replace('-', '').lower()} -t utf8` it"
+        )
+    return InputError(
+        f"{path} is not UTF-8 (byte {error.object[error.start]:#04x}); expected UTF-8 with or "
+        "without BOM; save it again as UTF-8, or `iconv -f latin1 -t utf8` it"
+    )
 
 
 def _parquet_rows(path: str) -> Iterator[Row]:
@@ -164,10 +183,11 @@ def _parquet_rows(path: str) -> Iterator[Row]:
                 if not _is_plain(schema.field(name).type):
                     kind = str(schema.field(name).type)[:80]
                     raise InputError(
-                        f"{path} has a column {name} of {kind}, expected text, numbers or times; write it as these"
+                        f"{path} has a column {name} of {kind}, expected text, numbers or times; "
+                        "write it as these"
                     )
-            # As dictionaries: a text that stands there once, and is named by ten thousand rows, is
-            # held once.
+            # As dictionaries: a text that the file stores once, for ten thousand rows, is in memory
+            # once.
             table = pq.ParquetFile(stream, read_dictionary=list(ours))
             for batch in table.iter_batches(BATCH_ROWS, columns=list(ours)):
                 columns = {ours[name]: _values(batch.column(name)) for name in batch.schema.names}
@@ -175,10 +195,11 @@ def _parquet_rows(path: str) -> Iterator[Row]:
                     yield dict(zip(columns, cells, strict=True))
         except InputError:
             raise
-        # pyarrow's, of any kind: damage, a date of no calendar, a time zone that nobody knows.
+        # pyarrow's, of any kind: damage, a date outside of the calendar, an unknown time zone.
         except Exception as error:
             raise InputError(
-                f"{path} cannot be read as Parquet ({error}); expected a Parquet file; write it again"
+                f"{path} cannot be read as Parquet ({error}); expected a Parquet file; "
+                "write it again"
             ) from None
 
 
@@ -187,60 +208,57 @@ def _values(column: Any) -> list[Any]:
     if not pa.types.is_dictionary(column.type):
         values: list[Any] = column.to_pylist()
         return values
-    named = column.dictionary.to_pylist()
-    return [None if place is None else named[place] for place in column.indices.to_pylist()]
+    entries = column.dictionary.to_pylist()
+    return [None if at is None else entries[at] for at in column.indices.to_pylist()]
 
 
 def _is_plain(kind: Any) -> bool:
-    of = pa.types
-    if of.is_dictionary(kind):
+    types = pa.types
+    if types.is_dictionary(kind):
         return _is_plain(kind.value_type)
     tests = (
-        of.is_string,
-        of.is_large_string,
-        of.is_integer,
-        of.is_floating,
-        of.is_boolean,
-        of.is_decimal,
-        of.is_null,
-        of.is_date,
-        of.is_timestamp,
+        types.is_string,
+        types.is_large_string,
+        types.is_integer,
+        types.is_floating,
+        types.is_boolean,
+        types.is_decimal,
+        types.is_null,
+        types.is_date,
+        types.is_timestamp,
     )
     return any(test(kind) for test in tests)
 
 
 def _geojson_rows(path: str) -> Iterator[Row]:
-    """Features' properties and, under SHAPE, what their geometries say; a geometry goes before
-    properties lat and lon.
-    """
+    """Features' properties and, under SHAPE_COLUMN, their geometries."""
     try:
-        said = json.loads(storage.read_bytes(path).decode("utf-8-sig"))
+        collection = json.loads(storage.read_bytes(path).decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"{path} cannot be read as JSON ({error}); expected GeoJSON in UTF-8; write it again"
         ) from None
-    features = (
-        said.get("features")
-        if isinstance(said, dict) and said.get("type") == "FeatureCollection"
-        else None
-    )
+    features = None
+    if isinstance(collection, dict) and collection.get("type") == "FeatureCollection":
+        features = collection.get("features")
     if not isinstance(features, list):
         raise InputError(
             f"{path} holds no FeatureCollection; expected GeoJSON with a feature per image"
         )
-    system = str(said.get("crs") or "CRS84")
+    system = str(collection.get("crs") or "CRS84")
     if "CRS84" not in system and "4326" not in system:
         raise InputError(
-            f"{path} has coordinates in {system}; expected longitude and latitude, WGS84; reproject it"
+            f"{path} has coordinates in {system}; expected longitude and latitude, WGS84; "
+            "reproject it"
         )
     features = [feature if isinstance(feature, dict) else {} for feature in features]
-    told = [
+    properties = [
         given if isinstance(given := feature.get("properties"), dict) else {}
         for feature in features
     ]
-    names = dict.fromkeys(name for properties in told for name in properties)
+    names = dict.fromkeys(name for given in properties for name in given)
     ours = _map_columns(path, names) if features else {}
-    for feature, properties in zip(features, told, strict=True):
-        row = {ours[name]: value for name, value in properties.items() if name in ours}
+    for feature, given in zip(features, properties, strict=True):
+        row = {ours[name]: value for name, value in given.items() if name in ours}
         shape = parse_geometry(feature.get("geometry"))
         yield row | ({} if shape is None else {SHAPE_COLUMN: shape})

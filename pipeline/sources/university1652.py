@@ -1,20 +1,21 @@
-"""University-1652 as its authors lay it out on disk -> ImageRecords. The simulator writes the same
-layout.
+"""University-1652 as its authors distribute it -> ImageRecords. The simulator writes this layout.
 
-`train/{satellite,drone,street,google}/<location>/` and `test/{query,gallery}_{satellite,drone,street}/<location>/`.
-Geotags come apart from the images: the authors give out one `<location>.kml` per building, which `kml` takes, and where
-`locations.csv` and `poses.csv` lie at the root, as the simulator writes them, they are taken from there.
+`train/{satellite,drone,street,google}/<location>/` and
+`test/{query,gallery}_{satellite,drone,street}/<location>/`. Geotags lie beside the images: the
+authors publish one `<location>.kml` per building, which the flag `kml` names, and the simulator
+writes `locations.csv` and `poses.csv` at the root, which are read without a flag.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pipeline.core import storage
-from pipeline.core.records import GeoTag, ImageRecord, Rejection, View
+from pipeline.core.records import GeoTag, Rejection, Scanned, View
 from pipeline.sources.base import Source
 from pipeline.sources.folders import LocatedImage, SplitFolder, images_by_split, require_images
 from pipeline.sources.kml import read_kmls
 from pipeline.sources.text_tables import (
+    TagTable,
     Unreadable,
     parse_number,
     parse_position,
@@ -22,7 +23,7 @@ from pipeline.sources.text_tables import (
     unreadable_tag_row,
 )
 
-LAYOUT = (
+_LAYOUT = (
     "University-1652's root, which holds train/{satellite,drone}/<location>/ and "
     "test/{query,gallery}_{satellite,drone}/<location>/"
 )
@@ -34,62 +35,55 @@ class University1652(Source):
     """University-1652, official layout."""
 
     views: tuple[View, ...] = (View.DRONE, View.SATELLITE)
-    """Views that are taken. PVDA is trained and tested on these two; street and google are there
-    for who asks for them."""
+    """Views to pack. PVDA is trained and tested on these two; street and google are optional."""
     kml: str = ""
-    """Folder with the buildings' KML files, `<location>.kml`, as its authors give them out; empty:
-    no geotags from there."""
+    """Folder with the buildings' KML files, `<location>.kml`, as the authors distribute them;
+    empty: no geotags from there."""
 
-    def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
-        return require_images(self._scan(root), root, LAYOUT)
+    def scan(self, root: str) -> Iterator[Scanned]:
+        return require_images(self._scan(root), root, _LAYOUT)
 
-    def _scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
-        tags, rejected = read_geotags(root)
-        yield from rejected
+    def _scan(self, root: str) -> Iterator[Scanned]:
+        tags = TagTable()
+        yield from read_pose_tables(root, tags)
         if self.kml:
-            places, rejected = read_kmls(self.kml)
-            yield from rejected
-            tags |= places
+            yield from read_kmls(self.kml, tags)
 
         def tag(folder: SplitFolder, image: LocatedImage) -> GeoTag | None:
-            own = tags.get(f"{folder.phase}/{folder.folder}/{image.location}/{image.name}")
-            return own or tags.get(image.location)
+            path = f"{folder.phase}/{folder.folder}/{image.location}/{image.name}"
+            return tags.find(path, image.location)
 
         yield from images_by_split(root, [view for view in View if view in self.views], tag)
 
 
-def read_geotags(root: str) -> tuple[dict[str, GeoTag], list[Rejection]]:
-    """Geotags by location, and with the camera's pose by path, from the two tables at the root,
-    where they are.
+def read_pose_tables(root: str, tags: TagTable) -> list[Rejection]:
+    """Adds geotags from the two tables at the root, where they exist: by location, and with the
+    camera's pose by path. Returns the lines that could not be read.
 
-    Raises InputError when one of them is no such table.
+    Raises InputError when one of them has other columns.
     """
-    tags: dict[str, GeoTag] = {}
     rejected = []
-    for table, columns in (
-        ("locations.csv", ("location", "lat", "lon")),
-        ("poses.csv", ("path", "location", *POSE)),
-    ):
-        path = storage.join(root, table)
-        if not storage.exists(path):
-            continue
-        for line, row in read_rows(path, columns):
+    path = storage.join(root, "locations.csv")
+    if storage.exists(path):
+        for line, row in read_rows(path, ("location", "lat", "lon")):
             try:
-                if "path" not in columns:
-                    lat, lon = parse_position(row["lat"], row["lon"])
-                    tags[row["location"]] = GeoTag(lat=lat, lon=lon)
-                elif row["location"] in tags:
-                    altitude, heading, pitch = (parse_number(row[name]) for name in POSE)
-                    where = tags[row["location"]]
-                    tags[row["path"]] = GeoTag(
-                        lat=where.lat,
-                        lon=where.lon,
-                        altitude_m=altitude,
-                        heading_deg=heading,
-                        pitch_deg=pitch,
-                    )
-                else:
-                    raise Unreadable(f"location {row['location']!r} has no line in locations.csv")
+                lat, lon = parse_position(row["lat"], row["lon"])
+                tags.add(row["location"], GeoTag(lat=lat, lon=lon))
             except Unreadable as error:
                 rejected.append(unreadable_tag_row(path, line, ",".join(row.values()), error))
-    return tags, rejected
+    path = storage.join(root, "poses.csv")
+    if storage.exists(path):
+        for line, row in read_rows(path, ("path", "location", *POSE)):
+            try:
+                if row["location"] not in tags:
+                    raise Unreadable(f"location {row['location']!r} has no line in locations.csv")
+                altitude, heading, pitch = (parse_number(row[name]) for name in POSE)
+                tag = tags.find(row["location"])
+                if tag is not None:
+                    tag = replace(
+                        tag, altitude_m=altitude, heading_deg=heading, pitch_deg=pitch
+                    )
+                    tags.add(row["path"], tag)
+            except Unreadable as error:
+                rejected.append(unreadable_tag_row(path, line, ",".join(row.values()), error))
+    return rejected

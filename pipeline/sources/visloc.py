@@ -1,8 +1,9 @@
-"""UAV-VisLoc as its authors lay it out on disk -> ImageRecords: photos of each flight, and tiles
-cut from its satellite map.
+"""UAV-VisLoc as its authors distribute it -> ImageRecords: photos of each flight, and tiles cut
+from its satellite map.
 
-`<NN>/drone/*.JPG`, `<NN>/<NN>.csv` (num, filename, date, lat, lon, height, Omega, Kappa, Phi1, Phi2; one flight has none of the
-angles), `<NN>/satellite<NN>.tif`, and `satellite_coordinates_range.csv` with the maps' corners.
+`<NN>/drone/*.JPG`, `<NN>/<NN>.csv` (num, filename, date, lat, lon, height, Omega, Kappa, Phi1,
+Phi2; one flight has none of the angles), `<NN>/satellite<NN>.tif`, and
+`satellite_coordinates_range.csv` with the maps' corners.
 
 A tile's location is its own name; a photo's location is the tile of its flight whose centre is
 nearest to the ground that the photo shows. A photo without a readable position, or off its flight's
@@ -16,14 +17,23 @@ from datetime import datetime
 import numpy as np
 
 from pipeline.core import storage
-from pipeline.core.errors import InputError
-from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View
+from pipeline.core.errors import InputError, require
+from pipeline.core.records import (
+    GeoTag,
+    ImageRecord,
+    Rejection,
+    Scanned,
+    SkippedFile,
+    Split,
+    View,
+)
 from pipeline.images.inspect import is_image_name
 from pipeline.sources.base import Source, not_an_image
 from pipeline.sources.folders import require_images, wrong_folder
 from pipeline.sources.maps.mosaic import Encoding, encode_window
 from pipeline.sources.maps.tiles import parse_window
 from pipeline.sources.text_tables import (
+    TagTable,
     Unreadable,
     parse_optional_number,
     parse_position,
@@ -32,7 +42,10 @@ from pipeline.sources.text_tables import (
 )
 from pipeline.sources.visloc_maps import Corners, read_corners, read_maps
 
-LAYOUT = "UAV-VisLoc's root, which holds satellite_coordinates_range.csv and <NN>/{drone/,satellite<NN>.tif,<NN>.csv}"
+_LAYOUT = (
+    "UAV-VisLoc's root, which holds satellite_coordinates_range.csv and "
+    "<NN>/{drone/,satellite<NN>.tif,<NN>.csv}"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,17 +58,15 @@ class VisLoc(Source):
     overlap: float = 0.0
     "Share of a tile's side that its neighbour shows too, from 0 to below 1."
     encoding: Encoding = "jpg"
-    "How tiles are written: jpg (quality 95) or png (exact, about five times as large)."
+    "Of tiles: jpg (quality 95) or png (exact, about five times as large)."
     train_flights: tuple[str, ...] = ()
-    """Flights for training, such as 01 03: their photos, and the tiles that are locations of
-    theirs. The data set has no division of its own. Of all other flights the photos are queries and
-    all tiles are the gallery."""
+    """Flights for training, such as 01 03: their photos, and the tiles that are their locations.
+    The data set has no division of its own. Of all other flights the photos are queries and all
+    tiles are the gallery."""
 
     def __post_init__(self) -> None:
-        if self.tile_pixels < 1:
-            raise InputError(f"--tile-pixels is {self.tile_pixels}, expected at least 1")
-        if not 0 <= self.overlap < 1:
-            raise InputError(f"--overlap is {self.overlap}, expected a fraction from 0 to below 1")
+        require(self.tile_pixels >= 1, "tile_pixels", self.tile_pixels, "at least 1")
+        require(0 <= self.overlap < 1, "overlap", self.overlap, "a fraction from 0 to below 1")
 
     def read(self, record: ImageRecord) -> bytes:
         if not record.part:
@@ -65,10 +76,10 @@ class VisLoc(Source):
     def ending(self, record: ImageRecord) -> str:
         return self.encoding if record.part else super().ending(record)
 
-    def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
-        return require_images(self._scan(root), root, LAYOUT)
+    def scan(self, root: str) -> Iterator[Scanned]:
+        return require_images(self._scan(root), root, _LAYOUT)
 
-    def _scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
+    def _scan(self, root: str) -> Iterator[Scanned]:
         corners, rejected = read_corners(root)
         yield from rejected
         flights = [
@@ -84,9 +95,7 @@ class VisLoc(Source):
         for flight in flights:
             yield from self._flight(storage.join(root, flight), flight, corners)
 
-    def _flight(
-        self, folder: str, flight: str, corners: dict[str, Corners]
-    ) -> Iterator[ImageRecord | Rejection]:
+    def _flight(self, folder: str, flight: str, corners: dict[str, Corners]) -> Iterator[Scanned]:
         train = flight in self.train_flights
         maps, rejected = read_maps(folder, corners)
         yield from rejected
@@ -103,22 +112,20 @@ class VisLoc(Source):
             for name, window, tag in found.tiles(self.tile_pixels, self.overlap)
         ]
         nearest = _NearestTile([tile.geotag for tile in tiles if tile.geotag])
-        taken, rejected = read_photos(storage.join(folder, f"{flight}.csv"))
+        tags, dates, rejected = read_flight_table(storage.join(folder, f"{flight}.csv"))
         yield from rejected
         used = set()
         for item in _photos(storage.join(folder, "drone")):
-            if isinstance(item, Rejection):
+            if not isinstance(item, tuple):
                 yield item
                 continue
             path, size = item
-            tag, date = taken.get(path.rsplit("/", 1)[-1].lower(), (None, None))
+            name = path.rsplit("/", 1)[-1].lower()
+            tag = tags.find(name)
             if tag is None:
-                yield Rejection(
-                    path=path,
-                    reason="no position",
-                    found=f"no readable line of {flight}.csv names it",
-                )
-            elif not any(found.corners.holds(tag.lat, tag.lon) for found in maps):
+                found = f"no readable line of {flight}.csv names it"
+                yield Rejection(path=path, reason="no position", found=found)
+            elif not any(found.corners.contains(tag.lat, tag.lon) for found in maps):
                 yield Rejection(path=path, reason="off the map", found=f"{tag.lat}, {tag.lon}")
             else:
                 tile = tiles[nearest(tag)]
@@ -129,76 +136,73 @@ class VisLoc(Source):
                     view=View.DRONE,
                     location=tile.location,
                     geotag=tag,
-                    taken_at=date,
+                    taken_at=dates[name],
                     bytes=size,
                 )
-        yield from (tile for tile in tiles if not train or tile.location in used)
+        kept = [tile for tile in tiles if not train or tile.location in used]
+        yield from kept
+        if len(kept) < len(tiles):
+            reason, count = "tile that no photo for training shows", len(tiles) - len(kept)
+            yield SkippedFile(path=folder, reason=reason, count=count)
 
 
 class _NearestTile:
-    """Number of the place that is nearest to another, of equals the first; a flight is small enough
-    for a flat earth.
+    """Finds the position nearest to another one, the first of equals; a flight is small enough for
+    a plane.
     """
 
-    def __init__(self, places: list[GeoTag]) -> None:
-        self.lats = np.array([place.lat for place in places])
-        self.lons = np.array([place.lon for place in places])
+    def __init__(self, tags: list[GeoTag]) -> None:
+        self.lats = np.array([tag.lat for tag in tags])
+        self.lons = np.array([tag.lon for tag in tags])
 
     def __call__(self, tag: GeoTag) -> int:
         east = (self.lons - tag.lon) * np.cos(np.radians(tag.lat))
         return int(np.argmin((self.lats - tag.lat) ** 2 + east**2))
 
 
-def _photos(folder: str) -> Iterator[tuple[str, int] | Rejection]:
+def _photos(folder: str) -> Iterator[tuple[str, int] | Rejection | SkippedFile]:
     for path, size in storage.walk(folder).items():
-        whole = storage.join(folder, path)
-        if "/" in path:
-            yield wrong_folder(whole, f"{path} is not drone/<image>")
-        elif not is_image_name(path):
-            yield not_an_image(whole)
+        full_path = storage.join(folder, path)
+        if not is_image_name(path):
+            yield not_an_image(full_path)
+        elif "/" in path:
+            yield wrong_folder(full_path, f"{path} is not drone/<image>")
         else:
-            yield whole, size
+            yield full_path, size
 
 
-def read_photos(path: str) -> tuple[dict[str, tuple[GeoTag, str | None]], list[Rejection]]:
-    """Geotag and date by the photo's file name in lower case; of two lines for one name the first
-    counts.
+def read_flight_table(path: str) -> tuple[TagTable, dict[str, str | None], list[Rejection]]:
+    """Geotags and dates by the photo's file name in lower case, and the lines that could not be
+    read or that contradict an earlier line.
 
-    Raises InputError when the table is missing or is none.
+    Raises InputError when the table is missing or is not one.
     """
     if not storage.exists(path):
         raise InputError(
-            f"no {path}; expected the flight's table of positions; put it there or take the flight away"
+            f"no {path}; expected the flight's table of positions; put it there or take the flight "
+            "away"
         )
-    photos: dict[str, tuple[GeoTag, str | None]] = {}
-    rejected = []
+    tags, dates, rejected = TagTable(), dict[str, str | None](), []
     for line, row in read_rows(path, ("filename", "lat", "lon")):
         try:
             lat, lon = parse_position(row["lat"], row["lon"])
             height = parse_optional_number(row.get("height", ""))
             # Of the two yaw angles the authors call the first the more reliable one.
             heading = parse_optional_number(row.get("Phi1", ""))
-            tag = GeoTag(
-                lat=lat,
-                lon=lon,
-                altitude_m=height,
-                heading_deg=None if heading is None else heading % 360,
-            )
-            photos.setdefault(
-                row["filename"].strip().lower(), (tag, _parse_date(row.get("date", "")))
-            )
+            heading = None if heading is None else heading % 360
+            date = _parse_date(row.get("date", ""))
+            name = row["filename"].strip().lower()
+            dates.setdefault(name, date)
+            tags.add(name, GeoTag(lat=lat, lon=lon, altitude_m=height, heading_deg=heading))
         except Unreadable as error:
             rejected.append(unreadable_tag_row(path, line, ",".join(row.values()), error))
-    return photos, rejected
+    return tags, dates, rejected
 
 
 def _parse_date(text: str) -> str | None:
     """ISO 8601, None for an empty cell. Raises Unreadable."""
     try:
-        return (
-            datetime.fromisoformat(text.strip().replace("/", "-")).isoformat()
-            if text.strip()
-            else None
-        )
+        date = text.strip().replace("/", "-")
+        return datetime.fromisoformat(date).isoformat() if date else None
     except ValueError:
         raise Unreadable(f"date {text!r} is not ISO 8601") from None

@@ -1,8 +1,9 @@
-"""UAV-VisLoc's satellite maps -> where they lie on the earth, and the tiles that are cut from them.
+"""UAV-VisLoc's satellite maps -> their positions, and the tiles that are cut from them.
 
-In: `satellite_coordinates_range.csv`, which gives the upper left and lower right corner of each map, and the maps,
-`<NN>/satellite<NN>.tif`. One of them is too large for one file and comes as `satellite<NN>_<row>-<column>.tif`, which share the
-corners of the whole. Out: maps, tiles, and a Rejection for whatever cannot be placed. Headers are read, no pixels.
+In: `satellite_coordinates_range.csv`, which gives the upper left and lower right corner of each
+map, and the maps, `<NN>/satellite<NN>.tif`. One of them is too large for one file and comes as
+`satellite<NN>_<row>-<column>.tif`, which share the corners of the entire map. Out: maps, tiles, and
+a Rejection for each map that cannot be placed. Headers are read, no pixels.
 """
 
 import re
@@ -19,12 +20,12 @@ from pipeline.sources.text_tables import Unreadable, parse_position, read_rows, 
 RANGE_TABLES = ("satellite_coordinates_range.csv", "satellite_ coordinates_range.csv")
 "The second, with a blank, is how the authors' archive spells it."
 CORNER_COLUMNS = ("LT_lat_map", "LT_lon_map", "RB_lat_map", "RB_lon_map")
-MAP_PART_PATTERN = re.compile(r"(?P<whole>.+)_(?P<row>\d+)-(?P<column>\d+)")
+MAP_PART_PATTERN = re.compile(r"(?P<map>.+)_(?P<row>\d+)-(?P<column>\d+)")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Corners:
-    """A rectangle of the earth, degrees."""
+    """A rectangle on the Earth, degrees."""
 
     top: float
     left: float
@@ -37,15 +38,15 @@ class Corners:
 
     def inside(self, y: float, x: float, y_end: float, x_end: float) -> "Corners":
         """The rectangle between two fractions of the height and of the width."""
-        tall, wide = self.bottom - self.top, self.right - self.left
+        height, width = self.bottom - self.top, self.right - self.left
         return Corners(
-            top=self.top + y * tall,
-            bottom=self.top + y_end * tall,
-            left=self.left + x * wide,
-            right=self.left + x_end * wide,
+            top=self.top + y * height,
+            bottom=self.top + y_end * height,
+            left=self.left + x * width,
+            right=self.left + x_end * width,
         )
 
-    def holds(self, lat: float, lon: float) -> bool:
+    def contains(self, lat: float, lon: float) -> bool:
         return self.bottom <= lat <= self.top and self.left <= lon <= self.right
 
     def tag(self) -> GeoTag:
@@ -63,7 +64,7 @@ class Corners:
 
 @dataclass(frozen=True, kw_only=True)
 class SatelliteMap:
-    """One file of a map, placed."""
+    """One file of a map with its position."""
 
     path: str
     name: str
@@ -76,9 +77,10 @@ class SatelliteMap:
         """Name, such as 01-0003-0012 for row 3 and column 12, window and geotag of each tile."""
         for tile in plan_tiles((self.width, self.height), (pixels, pixels), overlap):
             window = tile.window
-            ends = (window.y + window.height) / self.height, (window.x + window.width) / self.width
-            where = self.corners.inside(window.y / self.height, window.x / self.width, *ends)
-            yield f"{self.name}-{tile.row:04d}-{tile.column:04d}", window, where.tag()
+            begin = window.y / self.height, window.x / self.width
+            end = (window.y + window.height) / self.height, (window.x + window.width) / self.width
+            name = f"{self.name}-{tile.row:04d}-{tile.column:04d}"
+            yield name, window, self.corners.inside(*begin, *end).tag()
 
 
 def map_name(name: str) -> str:
@@ -87,28 +89,31 @@ def map_name(name: str) -> str:
 
 
 def read_corners(root: str) -> tuple[dict[str, Corners], list[Rejection]]:
-    """Corners by the map's name.
+    """Corners by the map's name; of a map with two lines that differ, none.
 
     Raises InputError when there is no such table.
     """
-    path = next(
-        (path for table in RANGE_TABLES if storage.exists(path := storage.join(root, table))), None
-    )
+    tables = (storage.join(root, table) for table in RANGE_TABLES)
+    path = next(filter(storage.exists, tables), None)
     if path is None:
         raise InputError(
-            f"no {RANGE_TABLES[0]} in {root}; expected UAV-VisLoc's root, which holds it; check --root"
+            f"no {RANGE_TABLES[0]} in {root}; expected UAV-VisLoc's root, which holds it; "
+            "check --root"
         )
-    corners, rejected = {}, []
+    corners: dict[str, Corners] = {}
+    rejected, contradicted = [], set()
     for line, row in read_rows(path, ("mapname", *CORNER_COLUMNS)):
         try:
             top, left = parse_position(row["LT_lat_map"], row["LT_lon_map"])
             bottom, right = parse_position(row["RB_lat_map"], row["RB_lon_map"])
-            corners[map_name(row["mapname"])] = Corners(
-                top=top, left=left, bottom=bottom, right=right
-            )
+            found = Corners(top=top, left=left, bottom=bottom, right=right)
+            name = map_name(row["mapname"])
+            if corners.setdefault(name, found) != found:
+                contradicted.add(name)
+                raise Unreadable(f"map {name} has other corners on an earlier line")
         except Unreadable as error:
             rejected.append(unreadable_tag_row(path, line, ",".join(row.values()), error))
-    return corners, rejected
+    return {name: found for name, found in corners.items() if name not in contradicted}, rejected
 
 
 def read_maps(
@@ -123,12 +128,9 @@ def read_maps(
             continue
         path, name = storage.join(folder, file), map_name(file)
         part = MAP_PART_PATTERN.fullmatch(name)
-        if name not in corners and not (part and part["whole"] in corners):
-            rejected.append(
-                Rejection(
-                    path=path, reason="map without corners", found=f"no readable line names {file}"
-                )
-            )
+        if name not in corners and not (part and part["map"] in corners):
+            found = f"no readable line names {file}"
+            rejected.append(Rejection(path=path, reason="map without corners", found=found))
             continue
         try:
             width, height = open_mosaic(path).shape[::-1]
@@ -143,10 +145,10 @@ def read_maps(
             )
         elif part:
             cell = int(part["row"]), int(part["column"])
-            parts.setdefault(part["whole"], {})[cell] = (path, width, height)
-    for whole, cells in parts.items():
+            parts.setdefault(part["map"], {})[cell] = (path, width, height)
+    for name, cells in parts.items():
         try:
-            maps += _place_parts(whole, cells, corners[whole])
+            maps += _place_parts(name, cells, corners[name])
         except Unreadable as error:
             rejected += [
                 Rejection(path=path, reason="incomplete map", found=str(error))
@@ -156,13 +158,13 @@ def read_maps(
 
 
 def _place_parts(
-    whole: str, cells: dict[tuple[int, int], tuple[str, int, int]], corners: Corners
+    name: str, cells: dict[tuple[int, int], tuple[str, int, int]], corners: Corners
 ) -> Iterator[SatelliteMap]:
-    """Parts by row and column, from 1, each at its place in the whole. Raises Unreadable where they
-    do not fill it.
+    """Parts by row and column, from 1, each with its share of the map's corners. Raises Unreadable
+    where they do not fill the map.
     """
     rows, columns = max(row for row, _ in cells), max(column for _, column in cells)
-    # Counted first: a name may number as many parts as it likes.
+    # Counted first: a file's name may claim any number of parts.
     if len(cells) != rows * columns or not all(row and column for row, column in cells):
         raise Unreadable(
             f"{len(cells)} parts in {rows} rows and {columns} columns, expected one for each"
@@ -177,6 +179,10 @@ def _place_parts(
     for row, column in sorted(cells):
         path, width, height = cells[row, column]
         y, x = sum(heights[: row - 1]), sum(widths[: column - 1])
-        where = corners.inside(y / tall, x / wide, (y + height) / tall, (x + width) / wide)
-        name = f"{whole}_{row:02d}-{column:02d}"
-        yield SatelliteMap(path=path, name=name, width=width, height=height, corners=where)
+        yield SatelliteMap(
+            path=path,
+            name=f"{name}_{row:02d}-{column:02d}",
+            width=width,
+            height=height,
+            corners=corners.inside(y / tall, x / wide, (y + height) / tall, (x + width) / wide),
+        )

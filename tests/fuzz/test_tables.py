@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from pipeline.core.errors import InputError
 from pipeline.core.records import ImageRecord, Rejection
-from pipeline.sources.denseuav import parse_line, read_geotags
+from pipeline.sources.denseuav import parse_line, read_gps_tables
 from pipeline.sources.gta_uav import GtaUav
 from pipeline.sources.maps import mbtiles
 from pipeline.sources.table import Table
@@ -234,7 +234,7 @@ def test_a_long_line_of_denseuav_is_read_in_time(line: str) -> None:
 def test_tables_of_denseuav_and_university1652(folder: Path, data: bytes) -> None:
     (folder / "Dense_GPS_train.txt").write_bytes(data)
     with bounded(InputError):
-        read_geotags(str(folder))
+        read_gps_tables(str(folder))
     for name, head in (
         ("locations.csv", b"location,lat,lon\n"),
         ("poses.csv", b"path,location,altitude_m,heading_deg,pitch_deg\n"),

@@ -1,35 +1,38 @@
-"""MBTiles: a pyramid of tiles in one SQLite file. In: its path. Out: which tiles it holds, and
-their bytes.
+"""MBTiles: a pyramid of tiles in one SQLite file. In: its path. Out: its metadata, its tiles, their
+bytes.
 
-Every call opens the file for itself, read-only: that takes a tenth of a millisecond, and threads
-and processes share nothing.
+Rows are as the file counts them; `tile_metadata.choose_rows` finds out from which end. Numbers may
+be stored as integers, floats or text: SQLite keeps what a writer gave it. Every call opens the file
+again, read-only: that takes a tenth of a millisecond, and threads and processes share nothing.
 """
 
+import re
 import sqlite3
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from typing import Any
 from urllib.parse import quote
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import Rejection
-from pipeline.sources.maps.web_mercator import MAX_ZOOM, flip_row
 
 VECTOR_FORMATS = ("pbf", "mvt")
-MAGIC_BYTES = 12  # bytes from which `kind_of` knows an image
-FROM_TILE = "FROM tiles WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
+MAGIC_BYTES = 12  # bytes from which `image_format` recognises an image
+FROM_TILE = "FROM tiles WHERE zoom_level IN (?, ?) AND tile_column IN (?, ?) AND tile_row IN (?, ?)"
+"Each number is bound as an integer, which a float equals too, and as text."
 MAX_VALUE_BYTES = 1 << 26
-"Bytes of any value: what SQLite would make of `zeroblob(1e9)` in a view is no tile."
+"Of any value: a view may compute `zeroblob(1e9)` as a tile."
 QUERY_TIMEOUT_S = 600.0
-"""Seconds without a row until a query is given up: `tiles` may be a view, and a view may have no
-end."""
+"Seconds without a row until a query is given up: `tiles` may be a view, which may have no end."
 STEPS_PER_CHECK = 1_000_000
-"Of SQLite's machine between two looks at the clock (and at Ctrl-C): some milliseconds."
+"Steps of SQLite's machine, some milliseconds, between two checks of the clock (and of Ctrl-C)."
 ALLOWED_ACTIONS = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION)
-"""What a query of ours, and the views behind it, may do. Recursion is not among it: it may go on
-for ever."""
+"""Actions of our queries, and of the views behind them. Recursion is not allowed: it may never
+end."""
+WHOLE_NUMBER = re.compile(r"\s*(-?\d{1,18})(\.0*)?\s*", re.ASCII)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,77 +40,99 @@ class StoredTile:
     """One row of the table."""
 
     x: int
-    y: int
-    "Row from the north, as XYZ counts, whatever the file does."
+    row: int
+    "As the file counts."
     kind: str
-    "Its ending by its first bytes; empty where they are no image's."
+    "Its ending by its first bytes; empty where they are not those of an image."
     start: bytes
     "Those first bytes."
 
 
-def list_zooms(path: str) -> list[int]:
-    """Zooms that the file holds, ascending.
+def read_metadata(path: str) -> dict[str, str]:
+    """The file's metadata by name.
 
-    Raises InputError when it is no MBTiles file of images on this machine.
+    Raises InputError when the file is not an MBTiles file of images on this machine.
     """
     if not storage.is_local(path):
         raise InputError(
             f"{path} is not on this machine; SQLite reads local files alone: copy it to a disk here"
         )
     with _connect(path) as database:
-        form = _metadata(database).get("format", "")
-        if form in VECTOR_FORMATS:
-            raise InputError(
-                f"{path} holds vector tiles ({form}), which show no pixels; expected png, jpg or webp tiles"
-            )
-        found = [
-            zoom
-            for (zoom,) in database.execute(
-                "SELECT DISTINCT zoom_level FROM tiles ORDER BY zoom_level"
-            )
-        ]
-        return [zoom for zoom in found if isinstance(zoom, int) and 0 <= zoom <= MAX_ZOOM]
+        # The specification requires the table, and some writers omit it.
+        if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'metadata'").fetchone():
+            return {}
+        rows = database.execute("SELECT name, value FROM metadata")
+        metadata = {str(name): str(value) for name, value in rows if value is not None}
+    kind = metadata.get("format", "")
+    if kind in VECTOR_FORMATS:
+        raise InputError(
+            f"{path} holds vector tiles ({kind}), which show no pixels; expected png, jpg or webp "
+            "tiles"
+        )
+    return metadata
+
+
+def count_zooms(path: str) -> dict[Any, int]:
+    """Tiles by zoom, as it is stored: a number that is no whole number is not a zoom."""
+    with _connect(path) as database:
+        counts: dict[Any, int] = {}
+        rows = database.execute("SELECT zoom_level, count(*) FROM tiles GROUP BY zoom_level")
+        for zoom, count in rows:
+            number = whole_number(zoom)
+            key = zoom if number is None else number
+            counts[key] = counts.get(key, 0) + count
+    return counts
+
+
+def count_tiles_within(path: str, zoom: int, area: tuple[int, int, int, int] | None) -> int:
+    """How many tiles of a zoom there are, or lie in columns and rows from first to last."""
+    query = "SELECT count(*) FROM tiles WHERE zoom_level IN (?, ?)"
+    values: list[Any] = [zoom, str(zoom)]
+    if area is not None:
+        for column in ("tile_column", "tile_row"):
+            query += f" AND CAST({column} AS INTEGER) BETWEEN ? AND ?"
+        values += area
+    with _connect(path) as database:
+        count: int = database.execute(query, values).fetchone()[0]
+    return count
 
 
 def list_tiles(path: str, zoom: int) -> Iterator[StoredTile | Rejection]:
-    """Every tile of one zoom, by column and row; a Rejection for one whose column or row is no
+    """Every tile of one zoom, by column and row; a Rejection for one whose column or row is not a
     whole number.
 
     Raises InputError when it finds vector tiles, or the file is damaged.
     """
-    query = f"SELECT tile_column, tile_row, substr(tile_data, 1, {MAGIC_BYTES}) FROM tiles WHERE zoom_level = ? ORDER BY 1, 2"
+    query = (
+        f"SELECT tile_column, tile_row, substr(tile_data, 1, {MAGIC_BYTES}) FROM tiles "
+        "WHERE zoom_level IN (?, ?) ORDER BY 1, 2"
+    )
     with _connect(path) as database:
-        from_north = _metadata(database).get("scheme") == "xyz"
-        for x, row, start in database.execute(query, (zoom,)):
+        for x, row, start in database.execute(query, (zoom, str(zoom))):
             database.waits_since = time.monotonic()
-            if not (isinstance(x, int) and isinstance(row, int)):
-                yield Rejection(
-                    path=f"{path}#{zoom}",
-                    reason="outside of the map",
-                    found=f"column {x!r}, row {row!r}",
-                )
+            column_number, row_number = whole_number(x), whole_number(row)
+            if column_number is None or row_number is None:
+                found = f"column {x!r}, row {row!r}"
+                yield Rejection(path=f"{path}#{zoom}", reason="outside of the map", found=found)
                 continue
             start = start if isinstance(start, bytes) else b""
             if start[:2] == b"\x1f\x8b":  # only vector tiles are packed with gzip
                 raise InputError(
-                    f"{path} holds vector tiles (gzip), which show no pixels; expected png, jpg or webp tiles"
+                    f"{path} holds vector tiles (gzip), which show no pixels; expected png, jpg or "
+                    "webp tiles"
                 )
-            yield StoredTile(
-                x=x,
-                y=row if from_north else flip_row(zoom, row),
-                kind=image_format(start),
-                start=start,
-            )
+            kind = image_format(start)
+            yield StoredTile(x=column_number, row=row_number, kind=kind, start=start)
 
 
-def read_tile(path: str, zoom: int, x: int, y: int) -> bytes:
-    """A tile's own bytes; `y` from the north. Raises OSError when it is not there."""
-    return _read_value(path, "tile_data", zoom, x, y)
+def read_tile(path: str, zoom: int, x: int, row: int) -> bytes:
+    """A tile's own bytes. Raises OSError when there is no such tile."""
+    return _read_value(path, "tile_data", zoom, x, row)
 
 
-def read_tile_format(path: str, zoom: int, x: int, y: int) -> str:
-    """A tile's ending by its first bytes; `y` from the north. Raises OSError when it is not there."""
-    return image_format(_read_value(path, f"substr(tile_data, 1, {MAGIC_BYTES})", zoom, x, y))
+def read_tile_format(path: str, zoom: int, x: int, row: int) -> str:
+    """A tile's ending by its first bytes. Raises OSError when there is no such tile."""
+    return image_format(_read_value(path, f"substr(tile_data, 1, {MAGIC_BYTES})", zoom, x, row))
 
 
 def image_format(start: bytes) -> str:
@@ -119,22 +144,30 @@ def image_format(start: bytes) -> str:
     return "webp" if start[:4] == b"RIFF" and start[8:12] == b"WEBP" else ""
 
 
-def _read_value(path: str, what: str, zoom: int, x: int, y: int) -> bytes:
+def whole_number(value: Any) -> int | None:
+    """A whole number stored as an integer, a float or text; None for anything else."""
+    if isinstance(value, int):
+        return value
+    if isinstance(value, float):
+        return int(value) if value.is_integer() else None
+    match = WHOLE_NUMBER.fullmatch(value) if isinstance(value, str) else None
+    return None if match is None else int(match[1])
+
+
+def _read_value(path: str, what: str, zoom: int, x: int, row: int) -> bytes:
     try:
         with _connect(path) as database:
-            from_north = _metadata(database).get("scheme") == "xyz"
-            row = database.execute(
-                f"SELECT {what} {FROM_TILE}", (zoom, x, y if from_north else flip_row(zoom, y))
-            ).fetchone()
-    except InputError as error:  # it could be read when it was scanned
+            numbers = (zoom, str(zoom), x, str(x), row, str(row))
+            found = database.execute(f"SELECT {what} {FROM_TILE}", numbers).fetchone()
+    except InputError as error:  # the file was readable when it was scanned
         raise OSError(str(error)) from None
-    if row is None or not isinstance(row[0], bytes):
-        raise OSError(f"no tile {zoom}/{x}/{y} in {path}")
-    return row[0]
+    if found is None or not isinstance(found[0], bytes):
+        raise OSError(f"no tile {zoom}/{x}/{row} (zoom, column, row) in {path}")
+    return found[0]
 
 
 class _BoundedConnection(sqlite3.Connection):
-    """Of a file that anybody may have written: it reads, in bounded time and memory."""
+    """Reads a file of unknown origin in bounded time and memory."""
 
     waits_since: float
     "When the last row came."
@@ -154,26 +187,16 @@ class _BoundedConnection(sqlite3.Connection):
 
 @contextmanager
 def _connect(path: str) -> Iterator[_BoundedConnection]:
-    """A connection that cannot write. Raises InputError when the file is no MBTiles, whenever that
-    shows.
+    """A connection that cannot write. Raises InputError when the file is not MBTiles, at whatever
+    query that shows.
     """
     inner = storage.resolve(path)[1]
+    uri = f"file:{quote(inner)}?mode=ro"
     try:
-        with closing(
-            sqlite3.connect(f"file:{quote(inner)}?mode=ro", uri=True, factory=_BoundedConnection)
-        ) as database:
+        with closing(sqlite3.connect(uri, uri=True, factory=_BoundedConnection)) as database:
             database.bound()
             yield database
     except sqlite3.Error as error:
         raise InputError(
-            f"{path} cannot be read as MBTiles ({error}); mend it or take another file"
+            f"{path} cannot be read as MBTiles ({error}); repair it or take another file"
         ) from None
-
-
-def _metadata(database: sqlite3.Connection) -> dict[str, str]:
-    """The table of that name; empty where there is none, which the specification forbids and some
-    writers do.
-    """
-    if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'metadata'").fetchone():
-        return {}
-    return dict(database.execute("SELECT name, value FROM metadata"))
