@@ -35,7 +35,7 @@ from pipeline.shards.repair import find_damaged, repair
 from pipeline.shards.settings import PackingSettings
 from pipeline.shards.writer import UNREADABLE, write_shard
 from pipeline.sources import name_of
-from pipeline.sources.base import Source
+from pipeline.sources.base import Source, scan_images
 
 
 class TooManyRejected(Incomplete):
@@ -157,7 +157,7 @@ def scan(source: Source, root: str) -> ScanResult:
     """All that a source finds; what has a name that cannot be written down is refused here."""
     records: list[ImageRecord] = []
     rejected: list[Rejection] = []
-    for found in source.scan(root):
+    for found in scan_images(source, root):
         name = found.path if isinstance(found, Rejection) else f"{found.name}{found.location}"
         if not is_utf8(name):
             told = escape_non_utf8(found.path)

@@ -119,9 +119,9 @@ def read_photo(path: str, size: int) -> CameraTags:
     """
     if not size:
         return CameraTags()  # packing refuses the file; object stores refuse an empty range
-    blocks = find_metadata(storage.read_head(path, HEAD_BYTES), whole=size <= HEAD_BYTES)
-    if blocks.cut and size > HEAD_BYTES:
-        blocks = find_metadata(storage.read_bytes(path), whole=True)
+    blocks = find_metadata(storage.read_head(path, HEAD_BYTES), complete=size <= HEAD_BYTES)
+    if blocks.truncated and size > HEAD_BYTES:
+        blocks = find_metadata(storage.read_bytes(path), complete=True)
     return read_tags(blocks)
 
 
@@ -135,9 +135,15 @@ def geotag_of_photo(tags: CameraTags, project: bool) -> GeoTag | None:
         return None
     lat, lon = tags.position
     height, heading, pitch = tags.height_m, tags.heading_deg, tags.pitch_deg
-    if project and height is not None and heading is not None and pitch is not None:
-        if height > 0 and pitch <= MAX_PITCH_DEG:
-            lat, lon = aim_point(lat, lon, height, heading, pitch)
+    if (
+        project
+        and height is not None
+        and heading is not None
+        and pitch is not None
+        and height > 0
+        and pitch <= MAX_PITCH_DEG
+    ):
+        lat, lon = aim_point(lat, lon, height, heading, pitch)
     return GeoTag(lat=lat, lon=lon, altitude_m=height, heading_deg=heading, pitch_deg=pitch)
 
 

@@ -120,12 +120,16 @@ def _csv_rows(path: str) -> Iterator[Row]:
         try:
             header, delimiter = _read_header(text)
             names = next(csv.reader([header], delimiter=delimiter), [])
-            while names and not names[-1].strip():  # separators behind the last column
-                names.pop()
-            ours = _map_columns(path, names)
+            kept = _without_blank_end(names, len(names))
+            ours = _map_columns(path, kept)
+            surplus = None
             for cells in csv.reader(text, delimiter=delimiter):
-                if any(cell.strip() for cell in cells):
-                    yield _csv_row(names, ours, cells, delimiter)
+                if not any(cell.strip() for cell in cells):
+                    continue
+                if surplus is None:  # of the header, or of rows where the first one has it
+                    surplus = max(len(names), len(cells)) - len(kept)
+                cells = _without_blank_end(cells, min(surplus, len(cells) - len(kept)))
+                yield _csv_row(kept, ours, cells, delimiter)
         except UnicodeDecodeError as error:
             raise _not_utf8(path, error) from None
         except csv.Error as error:
@@ -145,9 +149,17 @@ def _read_header(text: IO[str]) -> tuple[str, str]:
     return header, max(DELIMITERS, key=header.count)  # the first of them in a table of one column
 
 
+def _without_blank_end(cells: list[str], most: int) -> list[str]:
+    """Cells without at most so many blank ones at the end, which separators behind the last column
+    make.
+    """
+    end = len(cells)
+    while end > 0 and len(cells) - end < most and not cells[end - 1].strip():
+        end -= 1
+    return cells[:end]
+
+
 def _csv_row(names: list[str], ours: dict[str, str], cells: list[str], delimiter: str) -> Row:
-    while len(cells) > len(names) and not cells[-1].strip():
-        cells = cells[:-1]
     row: Row = {ours[name]: cell for name, cell in zip(names, cells, strict=False) if name in ours}
     if len(cells) != len(names):  # an unquoted comma in a name shifts all that follows
         found = f"{len(cells)} cells below {len(names)} columns"

@@ -80,9 +80,7 @@ def read_pose_tables(root: str, tags: TagTable) -> list[Rejection]:
                 altitude, heading, pitch = (parse_number(row[name]) for name in POSE)
                 tag = tags.find(row["location"])
                 if tag is not None:
-                    tag = replace(
-                        tag, altitude_m=altitude, heading_deg=heading, pitch_deg=pitch
-                    )
+                    tag = replace(tag, altitude_m=altitude, heading_deg=heading, pitch_deg=pitch)
                     tags.add(row["path"], tag)
             except Unreadable as error:
                 rejected.append(unreadable_tag_row(path, line, ",".join(row.values()), error))

@@ -160,7 +160,7 @@ def test_odd_files_are_refused_and_hidden_ones_left_out(tmp_path: Path) -> None:
     touch(root / "drone/meta_data/500_0001_0000000001.txt")
     _, refused = scanned(root)
     assert [(Path(r.path).name, r.reason) for r in refused] == [
-        ("Thumbs.db", "not an image's name"), ("4_0_0_0.png", "wrong folder")
+        ("4_0_0_0.png", "wrong folder")
     ]  # fmt: skip
 
 

@@ -14,10 +14,12 @@ from PIL import Image, TiffImagePlugin
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.core.records import ImageRecord, Rejection, Split, View
+from pipeline.core.records import ImageRecord, Rejection, Scanned, SkippedFile, Split, View
 from pipeline.images.decode import decode
 from pipeline.sources import SOURCES, name_of
-from pipeline.sources.photos import EARTH_RADIUS_M, HEAD_BYTES, Photos, aim_point
+from pipeline.sources.base import scan_images
+from pipeline.sources.maps.georeference import ELLIPSOID
+from pipeline.sources.photos import HEAD_BYTES, Photos, aim_point
 
 HERE = {1: "S", 2: (33.0, 30.0, 0.0), 3: "W", 4: (70.0, 45.0, 0.0)}
 "33.5 south, 70.75 west"
@@ -37,7 +39,7 @@ def photo(path: Path, gps: dict[int, Any] | None = None, **options: Any) -> None
     Image.new("RGB", (16, 12), "green").save(path, kind, exif=exif, **options)
 
 
-def scan(root: Path, **changes: Any) -> dict[str, ImageRecord | Rejection]:
+def scan(root: Path, **changes: Any) -> dict[str, Scanned]:
     found = {
         found.path.removeprefix(f"{root}/"): found for found in Photos(**changes).scan(str(root))
     }
@@ -106,25 +108,48 @@ def test_settings_say_what_the_photos_are(tmp_path: Path) -> None:
     assert record.key.startswith("gallery-satellite-")
 
 
-def test_what_cameras_write_beside_photos_is_left_out_and_other_files_are_refused(
-    tmp_path: Path,
-) -> None:
+def test_companions_are_skipped_and_undecoded_images_refused(tmp_path: Path) -> None:
     photo(tmp_path / "DJI_0001.JPG")
-    for name in (
-        "DJI_0001.DNG",
-        "DJI_0002.MP4",
-        "DJI_0002.SRT",
-        "flight.kml",
-        "Timestamp.MRK",
-        "notes.docx",
-        "README",
-    ):
+    companions = {
+        "DJI_0001.DNG": "raw copy of a photo",
+        "DJI_0001.MP4": "companion file .mp4",
+        "DJI_0002.SRT": "companion file .srt",
+        "flight.kml": "companion file .kml",
+        "Thumbs.db": "companion file .db",
+        "DJI_0003.insp": "companion file .insp",
+        "README": "file that is no image by its name",
+        "report of v1.final version": "file that is no image by its name",
+    }
+    refused = {
+        "DJI_0002.DNG": "format not decoded (.dng)",
+        "IMG_0001.HEIC": "format not decoded (.heic)",
+    }
+    for name in (*companions, *refused):
         (tmp_path / name).write_bytes(b"x")
     found = scan(tmp_path)
-    assert list(found) == ["DJI_0001.JPG", "README", "notes.docx"]
-    assert {found.reason for found in found.values() if isinstance(found, Rejection)} == {
-        "not an image's name"
-    }
+    skipped = {path: one.reason for path, one in found.items() if isinstance(one, SkippedFile)}
+    assert skipped == companions
+    rejected = {path: one.reason for path, one in found.items() if isinstance(one, Rejection)}
+    assert rejected == refused
+    heic = found["IMG_0001.HEIC"]
+    assert isinstance(heic, Rejection)
+    assert heic.found == "IMG_0001.HEIC: HEIC is not decoded; convert it to JPEG, PNG or TIFF"
+
+
+def test_the_summary_counts_positions_and_reasons(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photo(tmp_path / "1.jpg", HERE)
+    photo(tmp_path / "2.jpg")
+    photo(tmp_path / "3.jpg", HERE | {2: (95.0, 0.0, 0.0)})
+    for name in ("1.srt", "2.srt", "a.kml", "4.heic"):
+        (tmp_path / name).write_bytes(b"x")
+    found = list(scan_images(Photos(), str(tmp_path)))
+    assert len(found) == 4, "skipped files are counted, and no images"
+    assert capsys.readouterr().err == (
+        f"{tmp_path}: 2 images found, 1 with a position; 3 passed over (companion file .srt: 2, "
+        "companion file .kml: 1); 2 refused (unreadable tag: 1, format not decoded (.heic): 1)\n"
+    )
 
 
 def test_a_position_that_cannot_be_right_is_refused_and_a_missing_one_is_not(
@@ -266,15 +291,15 @@ def test_a_camera_held_upright_is_turned_by_decoding(tmp_path: Path) -> None:
 
 
 def test_the_axis_of_a_camera_at_45_degrees_arrives_one_height_ahead(tmp_path: Path) -> None:
-    """100 m east on the parallel of 33.5 south: 100 / (6371008.8 cos 33.5) radians = 0.0010785
-    degrees.
+    """100 m east on the parallel of 33.5 south: 100 / (6 384 650 cos 33.5) radians = 0.0010762
+    degrees, with the radius of curvature a / sqrt(1 - e^2 sin^2 33.5) [WGS84].
     """
     photo(tmp_path / "1.jpg", HERE, xmp=FLOWN)
     [record] = records(tmp_path, project=True).values()
     tag = record.geotag
     assert tag is not None
     assert tag.lat == pytest.approx(-33.5, abs=1e-7)
-    assert tag.lon == pytest.approx(-70.75 + 0.0010785, abs=1e-7)
+    assert tag.lon == pytest.approx(-70.75 + 0.0010762, abs=1e-7)
     assert (tag.altitude_m, tag.heading_deg, tag.pitch_deg) == (100, 90, -45)
 
 
@@ -291,6 +316,11 @@ def test_what_is_not_known_or_too_shallow_is_not_projected(
     assert (record.geotag.lat, record.geotag.lon) == (-33.5, -70.75)
 
 
+MERIDIAN_M, EQUATOR_M = 110_574.276, 111_319.491
+"""Metres of a degree of latitude and of longitude at the equator: pi / 180 times a (1 - e^2) and
+times a, with a = 6 378 137 m and e^2 = 0.00669438 [WGS84]."""
+
+
 @pytest.mark.parametrize(
     ("heading", "pitch", "north_m", "east_m"),
     [
@@ -301,12 +331,12 @@ def test_what_is_not_known_or_too_shallow_is_not_projected(
         (77, -90, 0, 0),
     ],
 )
-def test_the_axis_arrives_height_over_tangent_ahead(
+def test_the_axis_meets_the_ground_at_height_over_tangent(
     heading: float, pitch: float, north_m: float, east_m: float
 ) -> None:
     lat, lon = aim_point(0.0, 10.0, 100.0, heading, pitch)
-    metre = 180 / math.pi / EARTH_RADIUS_M
-    assert (lat, lon) == pytest.approx((north_m * metre, 10 + east_m * metre), abs=1e-9)
+    expected = (north_m / MERIDIAN_M, 10 + east_m / EQUATOR_M)
+    assert (lat, lon) == pytest.approx(expected, abs=1e-9)
 
 
 @given(
@@ -316,20 +346,11 @@ def test_the_axis_arrives_height_over_tangent_ahead(
     st.floats(0, 360),
     st.floats(-90, -20),
 )
-def test_the_axis_arrives_on_the_globe_at_the_right_distance(
+def test_the_axis_meets_the_ground_at_the_right_distance(
     lat: float, lon: float, height: float, heading: float, pitch: float
 ) -> None:
-    there = aim_point(lat, lon, height, heading, pitch)
-    assert abs(there[0]) <= 90
-    assert -180 <= there[1] <= 180
-
-    def vector(place: tuple[float, float]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        north, east = map(math.radians, place)
-        return np.array(
-            [math.cos(north) * math.cos(east), math.cos(north) * math.sin(east), math.sin(north)]
-        )
-
-    chord = float(np.linalg.norm(vector((lat, lon)) - vector(there)))
-    assert 2 * EARTH_RADIUS_M * math.asin(chord / 2) == pytest.approx(
-        height / math.tan(math.radians(-pitch)), abs=0.2, rel=1e-3
-    )
+    aim_lat, aim_lon = aim_point(lat, lon, height, heading, pitch)
+    assert abs(aim_lat) <= 90
+    assert -180 <= aim_lon <= 180
+    metres = ELLIPSOID.inv(lon, lat, aim_lon, aim_lat)[2]
+    assert metres == pytest.approx(height / math.tan(math.radians(-pitch)), abs=1e-3)

@@ -241,7 +241,7 @@ def test_geojson_has_longitude_first_and_its_properties_carry_the_rest(tmp_path:
         tmp_path / "t.geojson",
         (
             {"type": "Point", "coordinates": [8.25, 47.5, 400]},
-            {"path": "1.jpg", "heading_deg": 10, "lat": 1, "lon": 2},
+            {"path": "1.jpg", "heading_deg": 10, "lat": 47.5, "lon": 8.2501},
         ),
         (None, {"path": "2.jpg", "lat": 1, "lon": 2}),
         (None, {"path": "3.jpg", "location": 12, "view": "satellite"}),

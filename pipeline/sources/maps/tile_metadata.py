@@ -101,9 +101,9 @@ def choose_rows(
     """Whether rows count from the north or from the south, `north` or `south`.
 
     In this order: `asked`, a flag; the bounds, where tiles lie in them in one order alone; the
-    order that the metadata states; the `usual` order. `count` returns how many tiles of
-    `zoom` lie in bounds in a row order. Raises InputError where no tile lies in the bounds in either order, and
-    where files contradict each other and no bounds decide.
+    order that the metadata states; the `usual` order. `count` returns how many tiles of `zoom` lie
+    in bounds in a row order. Raises InputError where no tile lies in the bounds in either order,
+    and where files contradict each other and no bounds decide.
     """
     stated = {one.rows: one.source for one in metadata if one.rows != "auto"}
     boxes = [(bounds, one.source) for one in metadata for bounds in one.bounds]
@@ -127,8 +127,8 @@ def choose_rows(
         if len(stated) > 1:
             files = " and ".join(f"{source} (from the {rows})" for rows, source in stated.items())
             raise InputError(
-                f"{name}: {files} contradict each other in the order of rows, and no bounds decide; "
-                "say --rows north or --rows south"
+                f"{name}: {files} contradict each other in the order of rows, and no bounds "
+                "decide; say --rows north or --rows south"
             )
         return expected
     inside, outside, bounds, source = best
