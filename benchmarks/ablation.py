@@ -94,7 +94,7 @@ def run(
         joint_bn=recipe.joint_bn,
     )
     if backbone is not None:
-        load_backbone(training.learner.encoder.backbone, backbone, "the backbone from towns")
+        load_backbone(training.model.encoder.backbone, backbone, "the backbone from towns")
     for epoch in range(recipe.schedule.epochs):
         sums: dict[str, float] = {}
         for step, (drone, satellite) in enumerate(stream.epoch(epoch)):
@@ -176,7 +176,7 @@ def pretrained_backbone(out: Path, towns: int, epochs: int) -> dict[str, Tensor]
             print("towns", epoch + 1, sums, flush=True)
 
         trained = run(replace(smoke(epochs), adversary=False), shards, None, after_epoch)
-        torch.save(trained.learner.encoder.backbone.state_dict(), path)
+        torch.save(trained.model.encoder.backbone.state_dict(), path)
     weights: dict[str, Tensor] = torch.load(path, weights_only=True)
     return weights
 

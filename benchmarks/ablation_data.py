@@ -72,7 +72,7 @@ class TestSet:
 
     def measure(self, training: Training) -> dict[str, float]:
         """R@1 and AP both ways, and the distance of the two views' mean unit embeddings."""
-        encoder = training.learner.encoder.eval()
+        encoder = training.model.encoder.eval()
         vectors = {
             key: torch.cat([embed(encoder, part) for part in torch.split(images, 128)]).numpy()
             for key, images in self.images.items()
@@ -98,7 +98,7 @@ class TestSet:
 
     def gap(self, training: Training) -> dict[str, float]:
         """Accuracy of a new linear probe between the views of unseen places, on pooled maps."""
-        encoder = training.learner.encoder.eval()
+        encoder = training.model.encoder.eval()
         pooled = []
         with torch.no_grad():
             for view in (View.DRONE, View.SATELLITE):

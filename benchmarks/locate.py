@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from jobs.calibrate import Settings as CalibrationSettings
-from jobs.calibrate import calibrate_index
 from jobs.encoding.encoder import make_encoder_spec
-from jobs.train import Settings as TrainSettings
-from jobs.train import train
+from jobs.stages.calibrate import calibrate_index
+from jobs.stages.settings import CalibrateSettings
+from jobs.training.driver import train
 from jobs.training.recipes import smoke
+from jobs.training.settings import TrainSettings
 from pipeline.core import cluster, storage
 from pipeline.core.arrays import Doubles
 from pipeline.core.geo import haversine_m
@@ -85,7 +85,7 @@ def prepare(args: argparse.Namespace) -> None:
         spec = make_encoder_spec(storage.read_bytes(checkpoint), checkpoint, embedding)
         embed_gallery(embedding, spec)
     build_index(IndexSettings(table=table, out=index, split=Split.GALLERY, view=View.SATELLITE))
-    calibrate_index(CalibrationSettings(checkpoint=checkpoint, shards=shards, index=index))
+    calibrate_index(CalibrateSettings(checkpoint=checkpoint, shards=shards, index=index))
 
 
 def query_photos(table: str) -> LabelledImages:
@@ -253,7 +253,7 @@ def main() -> None:
     prepare(args)
     index = Index(str(args.out / "index"))
     calibration = calibrate_index(
-        CalibrationSettings(
+        CalibrateSettings(
             checkpoint=str(args.out / "run" / "last.pt"),
             shards=str(args.out / "shards"),
             index=index.path,

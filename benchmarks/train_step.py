@@ -17,9 +17,10 @@ import numpy as np
 import torch
 from synthetic import jpegs
 
-from jobs.training.loop import BatchTensors, Worker, WorkerContext
+from jobs.training.loop import BatchTensors, load_batches
 from jobs.training.recipes import Recipe, paper, smoke
 from jobs.training.settings import RunConfig
+from jobs.training.state import TrainingState, WorkerContext
 from model.losses import adversarial_terms, location_terms
 from model.schedule import ScheduleState
 from pipeline.core import json_files, storage
@@ -62,9 +63,9 @@ def synchronised_time(device: torch.device) -> float:
     return time.perf_counter()
 
 
-def streamed(worker: Worker, epoch: int, steps: int) -> tuple[float, float]:
+def streamed(worker: TrainingState, epoch: int, steps: int) -> tuple[float, float]:
     """(Seconds of a step on streamed batches, the part of them spent waiting for the batch)."""
-    batches = worker.batches(epoch)
+    batches = load_batches(worker, epoch)
     step(worker, next(batches))  # starts the stream
     waited, begin = 0.0, synchronised_time(worker.training.device)
     for _ in range(steps):
@@ -75,7 +76,7 @@ def streamed(worker: Worker, epoch: int, steps: int) -> tuple[float, float]:
     return (synchronised_time(worker.training.device) - begin) / steps, waited / steps
 
 
-def resident(worker: Worker, batch: BatchTensors, steps: int) -> float:
+def resident(worker: TrainingState, batch: BatchTensors, steps: int) -> float:
     """Seconds of a step on a batch that is already on the device."""
     begin = synchronised_time(worker.training.device)
     for _ in range(steps):
@@ -83,12 +84,12 @@ def resident(worker: Worker, batch: BatchTensors, steps: int) -> float:
     return (synchronised_time(worker.training.device) - begin) / steps
 
 
-def step(worker: Worker, batch: BatchTensors) -> None:
+def step(worker: TrainingState, batch: BatchTensors) -> None:
     images, labels, _ = batch
     worker.training.step(images[0], labels[0], images[1], labels[1], NOW)
 
 
-def parts(worker: Worker, batch: BatchTensors, steps: int) -> dict[str, float]:
+def parts(worker: TrainingState, batch: BatchTensors, steps: int) -> dict[str, float]:
     """Seconds of each part of a step, run one after the other with a wait after each."""
     training, spent = worker.training, defaultdict[str, float](float)
 
@@ -106,7 +107,7 @@ def parts(worker: Worker, batch: BatchTensors, steps: int) -> dict[str, float]:
     assert discriminator is not None
     for _ in range(steps):
         with part("encoder"), autocast():
-            maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = training.learner(*images)
+            maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = training.model(*images)
             located = location_terms(logits1_BPL, labels[0], logits2_BPL, labels[1]).sum()
             both_BCHW = torch.cat([maps1_BCHW, maps2_BCHW])
         with part("D step"):
@@ -132,8 +133,8 @@ def measure(
     with tempfile.TemporaryDirectory() as folder:
         shards = write_shards(folder, side, images)
         run = RunConfig(shards=shards, out=folder, recipe=recipe, compile=compiled)
-        worker = Worker(run, WorkerContext(device=device), lambda told: print(told["note"]))
-        batch = next(iter(worker.batches(0)))
+        worker = TrainingState(run, WorkerContext(device=device), lambda told: print(told["note"]))
+        batch = next(iter(load_batches(worker, 0)))
         resident(worker, batch, 3)  # warm
         seconds = [
             (*streamed(worker, epoch, steps), resident(worker, batch, steps))

@@ -1,50 +1,32 @@
-"""Feature table -> FAISS index: `build_index.py --table TABLE --out INDEX`.
+"""Build a FAISS index of a feature table: `build_index.py --table TABLE --out INDEX`
 
-And of a finished index: `--extend --table TABLE --out INDEX` adds the table's new parts, `--remove
-LOCATION ... --out INDEX` makes locations answer no more, `--verify --out INDEX` looks at every
-byte. `--verify` while building: of the table.
+A finished index is changed by `--extend --table TABLE --out INDEX`, which adds the table's new
+parts, and by `--remove LOCATION ... --out INDEX`; `--verify --out INDEX` checks every byte of it.
+`--verify` with a table checks the table while building.
 """
 
-import sys
-
-import tyro
-
 from jobs.command_line.cli import run
-from pipeline.index.build import build_index
-from pipeline.index.settings import IndexSettings
-from pipeline.index.update import extend_index, remove_locations, verify_index
+from jobs.stages.settings import BuildIndexSettings
 
 
-def main(settings: IndexSettings) -> None:
-    """Build a searchable index of a feature table, within a memory budget.
-
-    Of a finished index: `--extend --table TABLE --out INDEX` adds the table's new parts, `--remove
-    LOCATION ... --out INDEX` makes locations answer no more, `--verify --out INDEX` looks at every
-    byte.
+def main(settings: BuildIndexSettings) -> None:
+    """Build a searchable index of a feature table, within a memory budget; or extend, reduce or
+    verify a finished one.
     """
+    if settings.extend or settings.remove or not settings.table:
+        from pipeline.index.update import extend_index, remove_locations, verify_index
+
+        if settings.extend:
+            extend_index(settings.table, settings.out, settings.workers)
+        elif settings.remove:
+            remove_locations(settings.out, settings.remove)
+        else:
+            verify_index(settings.out)
+        return
+    from pipeline.index.build import build_index
+
     build_index(settings)
 
 
-def extend(
-    table: str, out: str, extend: tyro.conf.FlagCreatePairsOff[bool] = False, workers: int = 0
-) -> None:
-    """Add those parts of a table to a finished index that it does not hold yet."""
-    extend_index(table, out, workers)
-
-
-def remove(out: str, remove: tuple[str, ...]) -> None:
-    """Make locations of a finished index answer no more."""
-    remove_locations(out, remove)
-
-
-def verify(out: str, verify: tyro.conf.FlagCreatePairsOff[bool] = False) -> None:
-    """Look at every byte of a finished index."""
-    verify_index(out)
-
-
 if __name__ == "__main__":
-    words = {word.partition("=")[0] for word in sys.argv}
-    run(
-        extend if "--extend" in words else remove if "--remove" in words
-        else verify if "--verify" in words and "--table" not in words else main
-    )  # fmt: skip
+    run(main)

@@ -1,4 +1,4 @@
-"""Finished evaluations side by side: figures, differences to the first one, and how sure they are.
+"""Compare finished evaluations: figures, differences to the first one, and intervals
 
 Prints Markdown tables; with --out it also writes comparison.md, comparison.tex and comparison.json.
 """
@@ -8,10 +8,6 @@ from typing import Annotated
 import tyro
 
 from jobs.command_line.cli import run
-from pipeline.core import storage
-from pipeline.core.progress import console, results
-from pipeline.evaluation.compare import compare, latex, markdown
-from pipeline.report.inputs import read_evaluation
 
 
 def main(
@@ -26,13 +22,9 @@ def main(
         out: Folder for comparison.md, comparison.tex and comparison.json; a path or a URI.
         published: Add the figures that papers published for University-1652's official test.
     """
-    rows = compare([read_evaluation(folder) for folder in runs])
-    results.print(markdown(rows, published), soft_wrap=True)
-    if out is not None:
-        storage.write_bytes(storage.join(out, "comparison.md"), markdown(rows, published).encode())
-        storage.write_bytes(storage.join(out, "comparison.tex"), latex(rows, published).encode())
-        storage.write_json(storage.join(out, "comparison.json"), rows)
-        console.print(f"{out}: comparison.md, comparison.tex, comparison.json")
+    from jobs.stages.comparison import compare_runs
+
+    compare_runs(runs, out, published)
 
 
 if __name__ == "__main__":

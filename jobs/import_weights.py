@@ -1,170 +1,19 @@
-"""Foreign weights -> a checkpoint of ours: `import_weights.py (--torchvision FILE | --lpn FILE)
---out FILE`.
+"""Import public weights as a checkpoint: `import_weights.py (--torchvision FILE | --lpn FILE) --out
+FILE`
 
-Takes a torchvision ResNet's state dict, or that of a three_view_net of the public LPN code. Depth,
-width, rings and numbers per ring are read off the file. jobs/embed_gallery.py takes what comes out.
+Takes a torchvision ResNet's state dict, or that of a three_view_net of the public LPN code. The
+backbone, its width, the rings and the numbers per ring are read off the file.
+jobs/embed_gallery.py takes the checkpoint.
 """
 
-import jobs  # noqa: F401, I001  # before torch: Ctrl-C is heeded from here on
-
-import hashlib
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
-
-import torch
-from torch import Tensor
-
 from jobs.command_line.cli import run
-from model.checkpoint import Checkpoint, dumps, loads
-from model.errors import CheckpointError
-from model.weights.lpn import convert_lpn
-from model.pvda import FeatureEncoder
-from model.config import PVDAConfig
-from model.weights.load import TORCHVISION_HINT, load_backbone, infer_backbone, parse_state_dict
-from pipeline.core import storage
-from pipeline.core.progress import console
-from pipeline.core.errors import InputError
+from jobs.stages.settings import ImportWeightsSettings
 
 
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """Whose weights are imported, and where to."""
-
-    out: str
-    "File or URI of the checkpoint."
-    torchvision: str | None = None
-    "State dict of torchvision's ResNet-18, 34, 50 or 101 (.pth or .safetensors)."
-    lpn: str | None = None
-    "State dict of LPN's three_view_net (its net_119.pth), trained with --share and --stride=1."
-    image_size: int = 256
-    "Side in pixels of the images that the network is to see: `h` in LPN's opts.yaml."
-
-    def __post_init__(self) -> None:
-        if (self.torchvision is None) == (self.lpn is None):
-            given = "neither" if self.lpn is None else "both"
-            raise InputError(f"{given} of --torchvision and --lpn given, expected one of them")
-
-    @property
-    def kind(self) -> str:
-        return "torchvision" if self.lpn is None else "lpn"
-
-    @property
-    def source(self) -> str:
-        source = self.lpn if self.torchvision is None else self.torchvision
-        assert source is not None
-        return source
-
-
-def import_weights(settings: Settings) -> str:
-    """Write the checkpoint and return its path; one that was made of the same file is left as it
-    is.
-
-    Raises InputError or CheckpointError on unusable input.
-    """
-    if not storage.exists(settings.source):
-        expected = (
-            TORCHVISION_HINT
-            if settings.kind == "torchvision"
-            else "the net_*.pth of a training run of the LPN code"
-        )
-        raise InputError(f"no weights at {settings.source}; expected {expected}")
-    if storage.is_folder(settings.source):
-        raise InputError(
-            f"{settings.source} is a folder, expected a file of weights; name the file in it"
-        )
-    data = storage.read_bytes(settings.source)
-    made_of = {
-        "kind": settings.kind,
-        "sha256": hashlib.sha256(data).hexdigest(),
-        "image_size": settings.image_size,
-    }
-    out = storage.absolute(settings.out)
-    if storage.exists(out):
-        require_same_origin(out, made_of)
-        console.print(f"{out} is complete: made of {settings.source}; nothing to do")
-        return out
-    convert: Callable[..., Checkpoint] = (
-        from_torchvision if settings.kind == "torchvision" else from_lpn
-    )
-    try:
-        checkpoint = convert(parse_state_dict(data, settings.source), settings, made_of)
-    except CheckpointError:
-        raise
-    except ValueError as error:  # PVDAConfig's, over a size that the network cannot have
-        raise InputError(f"{settings.source}: {error}") from error
-    storage.write_bytes(out, dumps(checkpoint))
-    network = checkpoint.network
-    console.print(
-        f"{out}: {network.backbone}, {network.parts} rings of {network.part_dim} numbers, {network.image_size} px, "
-        f"{len(checkpoint.locations)} locations"
-    )
-    return out
-
-
-def require_same_origin(out: str, made_of: dict[str, Any]) -> None:
-    """Raise InputError where `out` is anything but a checkpoint made of the same."""
-    try:
-        held = loads(storage.read_bytes(out), out).recipe.get("made_of")
-    except (CheckpointError, OSError):
-        held = None
-    if held != made_of:
-        raise InputError(
-            f"{out} is there and was not made of this file and image size; choose another --out"
-        )
-
-
-def from_torchvision(
-    state: dict[str, Tensor], settings: Settings, made_of: dict[str, Any]
-) -> Checkpoint:
-    """The paper's encoder before training: torchvision's backbone, a refinement of random numbers,
-    no classifier.
-    """
-    backbone, width = infer_backbone(state, settings.source)
-    network = PVDAConfig(backbone=backbone, width=width, image_size=settings.image_size)
-    with torch.random.fork_rng(devices=()):
-        torch.manual_seed(0)  # the same file gives the same embeddings
-        encoder = FeatureEncoder(network)
-    load_backbone(encoder.backbone, state, settings.source)
-    console.print(
-        "the refinement of the rings is untrained: train before judging by the embeddings"
-    )
-    return make_checkpoint(network, {"encoder": encoder.state_dict()}, [], made_of)
-
-
-def from_lpn(state: dict[str, Tensor], settings: Settings, made_of: dict[str, Any]) -> Checkpoint:
-    """LPN's encoder and classifier."""
-    converted = convert_lpn(state, settings.source, settings.image_size)
-    if converted.left_out:
-        console.print(f"{converted.left_out} is left out: LPN's backbone of street and web images")
-    console.print(
-        "taken as trained with stride 1 and average pooling; LPN's opts.yaml says whether it was"
-    )
-    # Named by number: the file has no names. LPN numbers its training folders in the order of their
-    # names.
-    digits = len(str(converted.locations - 1))
-    names = [f"unnamed-{number:0{digits}}" for number in range(converted.locations)]
-    return make_checkpoint(converted.network, converted.modules, names, made_of)
-
-
-def make_checkpoint(
-    network: PVDAConfig,
-    modules: dict[str, dict[str, Tensor]],
-    locations: list[str],
-    made_of: dict[str, Any],
-) -> Checkpoint:
-    return Checkpoint(
-        network=network,
-        recipe={"name": f"imported from {made_of['kind']}", "made_of": made_of},
-        locations=locations,
-        epoch=0,
-        history=[],
-        state={"modules": modules},
-    )
-
-
-def main(settings: Settings) -> None:
+def main(settings: ImportWeightsSettings) -> None:
     """Import the weights of torchvision's ResNet or of LPN into a checkpoint."""
+    from jobs.stages.import_weights import import_weights
+
     import_weights(settings)
 
 

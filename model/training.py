@@ -54,7 +54,7 @@ class EncoderWithClassifier(nn.Module):
 class Training:
     """Networks and optimisers of one run, and the iteration that moves them.
 
-    `distribute` wraps each trained module (DDP over several workers); `adversary=False` leaves the discriminator out,
+    `wrap_ddp` wraps each trained module (DDP over several workers); `adversary=False` leaves the discriminator out,
     which is LPN. With `sync_bn` BatchNorm's statistics are those of all workers' images, with `joint_bn` the encoder's are
     those of both views. In `bfloat16` the networks'
     products are computed so, under autocast, and weights, losses and updates stay float32; `auto` does it on CUDA.
@@ -73,18 +73,18 @@ class Training:
         sync_bn: bool = False,
         joint_bn: bool = False,
         compile_for: int | None = None,
-        distribute: Callable[[nn.Module], nn.Module] = lambda module: module,
+        wrap_ddp: Callable[[nn.Module], nn.Module] = lambda module: module,
     ) -> None:
         self.device = torch.device(device)
         self.bfloat16 = precision == "bfloat16" or (
             precision == "auto" and self.device.type == "cuda"
         )
-        self.learner = _to_device(
+        self.model = _to_device(
             EncoderWithClassifier(config, locations, joint_bn), self.device, sync_bn
         )
         self.discriminator: ViewDiscriminator | None = None
         if adversary:
-            discriminator = ViewDiscriminator(config, self.learner.encoder.backbone.channels)
+            discriminator = ViewDiscriminator(config, self.model.encoder.backbone.channels)
             self.discriminator = _to_device(discriminator, self.device, sync_bn)
         for module in self.modules.values():
             module.train()
@@ -92,11 +92,11 @@ class Training:
             None if compile_for is None else self._compile(config.image_size, compile_for)
         )
         "Why the networks are not compiled though they should be."
-        self._learner = distribute(self.learner)
-        self._discriminator = None if self.discriminator is None else distribute(self.discriminator)
-        self.optimizers = self._optimisers(optimization)
+        self._wrapped = wrap_ddp(self.model)
+        self._discriminator = None if self.discriminator is None else wrap_ddp(self.discriminator)
+        self.optimizers = self._build_optimizers(optimization)
 
-    def _optimisers(self, rates: Optimization) -> list[Optimizer]:
+    def _build_optimizers(self, rates: Optimization) -> list[Optimizer]:
         """Of encoder and classifier, and of D where there is one; every group knows the rate that
         it starts with.
         """
@@ -105,9 +105,9 @@ class Training:
             return {"params": list(module.parameters()), "start": rate, "name": name}
 
         groups = [
-            group("backbone", self.learner.encoder.backbone, rates.backbone_lr),
-            group("head", self.learner.encoder.refine, rates.head_lr),
-            group("classifier", self.learner.classifier, rates.classifier_lr),
+            group("backbone", self.model.encoder.backbone, rates.backbone_lr),
+            group("head", self.model.encoder.refine, rates.head_lr),
+            group("classifier", self.model.classifier, rates.classifier_lr),
         ]
         optimizers: list[Optimizer] = [
             SGD(
@@ -130,20 +130,20 @@ class Training:
     def modules(self) -> dict[str, nn.Module]:
         """The networks by the name under which a checkpoint holds them."""
         named: dict[str, nn.Module] = {
-            "encoder": self.learner.encoder,
-            "classifier": self.learner.classifier,
+            "encoder": self.model.encoder,
+            "classifier": self.model.classifier,
         }
         return named | (
             {"discriminator": self.discriminator} if self.discriminator is not None else {}
         )
 
     @property
-    def rates(self) -> dict[str, float]:
+    def learning_rates(self) -> dict[str, float]:
         """Learning rates in force, by group."""
         return {
             group["name"]: group["lr"]
-            for optimiser in self.optimizers
-            for group in optimiser.param_groups
+            for optimizer in self.optimizers
+            for group in optimizer.param_groups
         }
 
     def step(
@@ -161,11 +161,11 @@ class Training:
         detached scalars that are still on the device: each loss, whole and by view (and ring), how
         often D was right, and the length of each network's gradient.
         """
-        for optimiser in self.optimizers:
-            for group in optimiser.param_groups:
+        for optimizer in self.optimizers:
+            for group in optimizer.param_groups:
                 group["lr"] = group["start"] * now.lr_scale
         with self._autocast():
-            maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = self._learner(
+            maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = self._wrapped(
                 images1_B3HW, images2_B3HW
             )
         located_VP = location_terms(logits1_BPL, location1_B, logits2_BPL, location2_B)
@@ -188,8 +188,8 @@ class Training:
         self.optimizers[0].zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
         for name, module in (
-            ("encoder", self.learner.encoder),
-            ("classifier", self.learner.classifier),
+            ("encoder", self.model.encoder),
+            ("classifier", self.model.classifier),
         ):
             measures[f"gradient_norm/{name}"] = gradient_norm(module)
         self.optimizers[0].step()
@@ -223,7 +223,7 @@ class Training:
         """Compile the networks in place, and try them: torch compiles at the first call. Returns
         why it cannot.
         """
-        networks = [self.learner] + ([self.discriminator] if self.discriminator is not None else [])
+        networks = [self.model] + ([self.discriminator] if self.discriminator is not None else [])
         held = [
             {name: tensor.clone() for name, tensor in network.state_dict().items()}
             for network in networks
@@ -234,7 +234,7 @@ class Training:
             for network in networks:
                 network.compile()
             with self._autocast():
-                maps1_BCHW, maps2_BCHW, *logits = self.learner(images_B3HW, images_B3HW)
+                maps1_BCHW, maps2_BCHW, *logits = self.model(images_B3HW, images_B3HW)
                 if self.discriminator is not None:
                     logits.append(self.discriminator(torch.cat([maps1_BCHW, maps2_BCHW])))
             sum(one.float().mean() for one in logits).backward()
@@ -251,13 +251,13 @@ class Training:
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16)
 
-    def state(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """Everything that the next step depends on, besides the data's order, as tensors and plain
         values.
         """
         return {
             "modules": {name: module.state_dict() for name, module in self.modules.items()},
-            "optimizers": [optimiser.state_dict() for optimiser in self.optimizers],
+            "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
             "rng": torch.get_rng_state(),
         }
 
@@ -265,8 +265,8 @@ class Training:
         """Go on where `state` was taken."""
         for name, module in self.modules.items():
             module.load_state_dict(state["modules"][name])
-        for optimiser, held in zip(self.optimizers, state["optimizers"], strict=True):
-            optimiser.load_state_dict(held)
+        for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
+            optimizer.load_state_dict(saved)
         torch.set_rng_state(state["rng"])
 
 

@@ -20,6 +20,8 @@ from pipeline.core import storage
 from pipeline.core.errors import InputError
 
 CHECKPOINT_FILE, METRICS_FILE = "last.pt", "metrics.jsonl"
+FoundCheckpoint = tuple[str, Checkpoint] | None
+"Name and content of the newest checkpoint that can be read."
 ARCHIVE_PATTERN = re.compile(r"checkpoint-(\d+)-(\d+)\.pt")
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.core.arrays import Doubles, Strings
-from pipeline.core.errors import InputError, require
+from pipeline.core.errors import InputError
 from pipeline.core.geo import haversine_m
 from pipeline.index.searcher import Hit
 from pipeline.locate.calibration import Calibration, confidence_features
@@ -21,6 +21,7 @@ from pipeline.locate.consensus import Consensus
 from pipeline.locate.locate import consensus_of, consensus_scores, relative_scores
 from pipeline.locate.logistic import fit_choice_model, fit_logistic
 from pipeline.locate.reliability import expected_calibration_error, reliability_bins
+from pipeline.locate.settings import CalibrationCriteria
 from pipeline.locate.track import TRACK_CANDIDATES
 
 AGREEMENT_FACTORS = (0.5, 1.5, 2.5)
@@ -46,21 +47,6 @@ class CalibrationExample:
     "Candidates, best first, from a gallery that contains the location."
     outside: tuple[Hit, ...]
     "Candidates from a gallery that does not contain it."
-
-
-@dataclass(frozen=True, kw_only=True)
-class CalibrationCriteria:
-    """What counts as a right answer, and which share of future photos has none."""
-
-    tolerance: float = 25.0
-    "Metres within which a position is right."
-    outside: float = 0.5
-    """Share of future photos that show no location of the gallery; the probabilities depend on
-    it."""
-
-    def __post_init__(self) -> None:
-        require(self.tolerance > 0, "tolerance", self.tolerance, "metres above 0")
-        require(0 < self.outside < 1, "outside", self.outside, "a share above 0 and below 1")
 
 
 @dataclass(frozen=True, kw_only=True)

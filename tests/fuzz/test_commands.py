@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jobs.command_line import cli
+from jobs.command_line.config import Choice
 from tests.fuzz.bounds import bounded, examples
 
 NUMBERS = [
@@ -224,12 +225,10 @@ OVERRIDES = [
 ]
 
 
-def job_of(name: str) -> tuple[Callable[..., Any], Callable[[list[str]], list[str]]]:
+def job_of(name: str) -> tuple[Callable[..., Any], Choice | None]:
     module = importlib.import_module(f"jobs.{name}")
-    preprocess_argv = {"make_shards": "source_as_subcommand", "train": "known_recipe"}.get(name)
-    return module.main, getattr(
-        module, preprocess_argv
-    ) if preprocess_argv else lambda arguments: arguments
+    choice = {"make_shards": "SOURCE", "train": "RECIPE"}.get(name)
+    return module.main, getattr(module, choice) if choice else None
 
 
 def call(
@@ -239,13 +238,13 @@ def call(
     monkeypatch: pytest.MonkeyPatch,
 ) -> tuple[int, str]:
     """Exit code, and what was said on the error stream."""
-    job, preprocess_argv = job_of(name)
+    job, choice = job_of(name)
     monkeypatch.setattr("sys.argv", [name, *arguments])
     capsys.readouterr()
     code: Any = 0
     with bounded(megabytes=600, seconds=20):
         try:
-            cli.run(job, preprocess_argv)
+            cli.run(job, choice)
         except SystemExit as ended:
             code = ended.code or 0
     return code, capsys.readouterr().err

@@ -17,7 +17,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jobs.import_weights import Settings, import_weights
+from jobs.stages.import_weights import import_weights
+from jobs.stages.settings import ImportWeightsSettings
 from model.checkpoint import Checkpoint, build_encoder, dumps, fingerprint, loads
 from model.config import PVDAConfig
 from model.errors import CheckpointError
@@ -233,7 +234,7 @@ def test_a_damaged_file_of_weights(
     for flag in ("torchvision", "lpn"):
         with bounded(CheckpointError, InputError):
             import_weights(
-                Settings(
+                ImportWeightsSettings(
                     out=str(folder / "out.pt"),
                     image_size=data.draw(st.sampled_from([64, 0, -1, 10**12])),
                     **{flag: str(path)},

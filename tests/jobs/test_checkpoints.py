@@ -17,11 +17,11 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from jobs.train import Settings, train
 from jobs.training.checkpoints import CheckpointWriter, find_checkpoint, list_archived
+from jobs.training.driver import train
 from jobs.training.metrics import MetricAccumulator, NotFinite
 from jobs.training.recipes import Recipe, smoke
-from jobs.training.settings import RunConfig, RunOptions
+from jobs.training.settings import RunConfig, RunOptions, TrainSettings
 from model.checkpoint import Checkpoint, loads
 from model.errors import CheckpointError
 from model.pvda import FeatureEncoder
@@ -53,7 +53,7 @@ def tiny(epochs: int = 3) -> Recipe:
     return replace(recipe, network=network, batch_size=2)
 
 
-def settings(shards: str, out: Path, **changes: Any) -> Settings:
+def settings(shards: str, out: Path, **changes: Any) -> TrainSettings:
     """Every step leaves a checkpoint."""
     given: dict[str, Any] = {
         "recipe": tiny(),
@@ -62,7 +62,7 @@ def settings(shards: str, out: Path, **changes: Any) -> Settings:
         "workers": 0,
         "checkpoint_minutes": 0.0,
     }
-    return Settings(**(given | changes))
+    return TrainSettings(**(given | changes))
 
 
 def rows(out: Path) -> list[dict[str, Any]]:
@@ -274,7 +274,7 @@ def test_a_run_that_diverges_stops_with_one_sentence_and_keeps_the_last_good_che
     def poisoned(self: Training, *arguments: Any) -> Any:
         if next(steps) == 6:  # the first of the third epoch
             with torch.no_grad():
-                next(self.learner.classifier.parameters()).fill_(float("inf"))
+                next(self.model.classifier.parameters()).fill_(float("inf"))
         return real(self, *arguments)
 
     steps = count()

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.multiprocessing import spawn  # type: ignore[attr-defined]
 
-from jobs.train import broadcast_checkpoint, wrap_ddp
+from jobs.training.ray_group import broadcast_checkpoint, wrap_ddp
 from model.checkpoint import Checkpoint
 from model.config import Optimization, PVDAConfig
 from model.schedule import ScheduleState
@@ -72,7 +72,7 @@ def work(rank: int, port: int, out: str) -> None:
     address = f"tcp://127.0.0.1:{port}"
     torch.distributed.init_process_group("gloo", init_method=address, rank=rank, world_size=WORKERS)
     torch.manual_seed(rank)  # DDP gives all workers the weights of rank 0
-    training = frozen(Training(CONFIG, Optimization(), LOCATIONS, distribute=wrap_ddp))
+    training = frozen(Training(CONFIG, Optimization(), LOCATIONS, wrap_ddp=wrap_ddp))
     drone, location1_B, satellite, location2_B = (
         tensor[rank * EACH : (rank + 1) * EACH] for tensor in batch()
     )

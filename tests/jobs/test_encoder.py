@@ -13,9 +13,9 @@ import torch
 from jobs.encoding import encoder as encoders
 from jobs.encoding.encoder import PROBE_IMAGES, first_images, make_encoder_spec
 from jobs.encoding.settings import EncoderSettings
-from jobs.training.loop import initial_checkpoint
 from jobs.training.recipes import smoke
 from jobs.training.settings import RunConfig
+from jobs.training.state import initial_checkpoint
 from model.checkpoint import build_encoder, loads
 from model.inference.embed import embed
 from model.inference.int8 import PrecisionError

@@ -71,7 +71,7 @@ def test_lpn_has_no_discriminator_and_ends_after_120_epochs_with_a_tenth_of_its_
     assert not recipe.adversary
     tiny = PVDAConfig(backbone="resnet18", width=0.25, part_dim=8)
     training = Training(tiny, recipe.optimization, 3, adversary=recipe.adversary)
-    assert list(training.rates) == ["backbone", "head", "classifier"]
+    assert list(training.learning_rates) == ["backbone", "head", "classifier"]
     rates = recipe.optimization
     assert (rates.optimizer, rates.backbone_lr, rates.head_lr, rates.classifier_lr) == (
         "sgd",

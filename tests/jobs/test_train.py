@@ -18,11 +18,15 @@ from ray.exceptions import RayActorError
 from ray.util.queue import Queue
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from jobs.train import Settings, known_recipe, listen, train
+from jobs.command_line.cli import expand
+from jobs.train import main
 from jobs.training.checkpoints import read_checkpoint
-from jobs.training.loop import WorkerContext, initial_checkpoint, train_worker
+from jobs.training.driver import train
+from jobs.training.ray_group import listen
 from jobs.training.recipes import Recipe, paper, smoke
-from jobs.training.settings import RunConfig
+from jobs.training.settings import RECIPE, RunConfig, TrainSettings
+from jobs.training.state import WorkerContext, initial_checkpoint
+from jobs.training.worker import train_worker
 from model.checkpoint import build_encoder, dumps, loads
 from model.errors import CheckpointError
 from pipeline.core.errors import Incomplete, InputError
@@ -40,7 +44,7 @@ def tiny(epochs: int = 2) -> Recipe:
     return replace(recipe, network=network, batch_size=2)
 
 
-def settings(shards: str, out: Path, recipe: Recipe, **changes: object) -> Settings:
+def settings(shards: str, out: Path, recipe: Recipe, **changes: object) -> TrainSettings:
     given = {
         "recipe": recipe,
         "shards": shards,
@@ -48,7 +52,7 @@ def settings(shards: str, out: Path, recipe: Recipe, **changes: object) -> Setti
         "workers": 0,
         "checkpoint_minutes": 0.0,
     }
-    return Settings(**(given | changes))  # type: ignore[arg-type]
+    return TrainSettings(**(given | changes))  # type: ignore[arg-type]
 
 
 def rows(out: Path) -> list[dict[str, object]]:
@@ -275,12 +279,12 @@ def test_too_few_images_for_a_batch_are_told_before_anything_starts(
         train(settings(tiny_shards, tmp_path, paper()))
 
 
-def test_an_unknown_recipe_is_answered_with_the_known_ones() -> None:
+def test_expand_of_an_unknown_recipe_names_the_known_ones() -> None:
     with pytest.raises(
         InputError, match="unknown recipe 'papr', expected one of: paper, paper_384, lpn, "
     ):
-        known_recipe(["papr", "--shards", "x"])
-    assert known_recipe(["--help"]) == ["--help"]
+        expand(main, ["papr", "--shards", "x"], RECIPE, None)
+    assert expand(main, ["--help"], RECIPE, None) == ["--help"]
 
 
 def test_the_paper_recipe_is_the_papers() -> None:

@@ -14,7 +14,6 @@ from pipeline.index.filters import Filter
 from pipeline.index.searcher import Hit
 from pipeline.locate.calibrate import (
     CalibrationContext,
-    CalibrationCriteria,
     CalibrationExample,
     choose_agreement_radius,
     cross_validated_probabilities,
@@ -26,6 +25,7 @@ from pipeline.locate.calibration import Calibration
 from pipeline.locate.calibration_data import LabelledImages, make_examples
 from pipeline.locate.locate import answers_from_hits, consensus_of, consensus_scores
 from pipeline.locate.logistic import sigmoid
+from pipeline.locate.settings import CalibrationCriteria
 from pipeline.locate.track import TRACK_CANDIDATES
 
 METRE = 1 / 111_195.08  # degrees of latitude

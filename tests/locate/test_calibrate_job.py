@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jobs.calibrate import Settings, calibrate_index
 from jobs.encoding.photo_encoder import PhotoEncoder
+from jobs.stages.calibrate import calibrate_index
+from jobs.stages.settings import CalibrateSettings
 from model.checkpoint import Checkpoint, dumps, fingerprint, loads
 from model.config import PVDAConfig
 from model.pvda import FeatureEncoder
@@ -84,7 +85,7 @@ def world(tmp_path: Path, ray_cluster: None, lively_encoder: FeatureEncoder) -> 
 def test_photos_of_places_not_trained_on_calibrate_an_index(
     world: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    made = calibrate_index(Settings(**world))
+    made = calibrate_index(CalibrateSettings(**world))
     assert (made.photos, made.locations) == (2 * HELD, HELD)
     assert made.accuracy == pytest.approx(
         0.5, abs=0.1
@@ -94,19 +95,19 @@ def test_photos_of_places_not_trained_on_calibrate_an_index(
     assert find_calibration(world["index"], facts) == made
     assert (tmp_path / "index" / "calibration.svg").read_text().startswith("<svg")
     capsys.readouterr()
-    assert calibrate_index(Settings(**world)) == made
+    assert calibrate_index(CalibrateSettings(**world)) == made
     assert "nothing to do" in capsys.readouterr().err
-    assert calibrate_index(Settings(**world, outside=0.2)).outside == 0.2
-    assert calibrate_index(Settings(**world, outside=0.2, photos=30)).photos == 30
+    assert calibrate_index(CalibrateSettings(**world, outside=0.2)).outside == 0.2
+    assert calibrate_index(CalibrateSettings(**world, outside=0.2, photos=30)).photos == 30
     (tmp_path / "index" / "calibration.json").write_text("{}")
-    assert calibrate_index(Settings(**world)) == made
+    assert calibrate_index(CalibrateSettings(**world)) == made
 
 
 def test_few_photos_are_enough_to_ask_for_but_not_few_places(
     world: dict[str, Any], tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match="5 photos of"):
-        calibrate_index(Settings(**world, photos=5))
+        calibrate_index(CalibrateSettings(**world, photos=5))
     with pytest.raises(InputError, match="no checkpoint at nowhere"):
-        calibrate_index(Settings(**world | {"checkpoint": "nowhere.pt"}))
+        calibrate_index(CalibrateSettings(**world | {"checkpoint": "nowhere.pt"}))
     assert not (tmp_path / "index" / "calibration.json").exists()

@@ -13,7 +13,9 @@ import pytest
 from PIL import Image
 
 from jobs.encoding.photo_encoder import PhotoEncoder
-from jobs.locate import Settings, locate_photos, main
+from jobs.stages.locate import locate as main
+from jobs.stages.locate import locate_photos
+from jobs.stages.settings import LocateSettings
 from model.checkpoint import Checkpoint, dumps, fingerprint, loads
 from model.config import PVDAConfig
 from model.pvda import FeatureEncoder
@@ -78,11 +80,11 @@ def world(tmp_path: Path, lively_encoder: FeatureEncoder) -> dict[str, str]:
     }
 
 
-def settings(world: dict[str, str], **changes: Any) -> Settings:
+def settings(world: dict[str, str], **changes: Any) -> LocateSettings:
     given = {"photos": (world["photos"],)} | {
         name: world[name] for name in ("checkpoint", "index", "out")
     }
-    return Settings(**(given | changes))
+    return LocateSettings(**(given | changes))
 
 
 def calibrated(world: dict[str, str]) -> None:

@@ -13,11 +13,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from jobs.embed_gallery import Settings as EmbedSettings
 from jobs.embed_gallery import main as embed_gallery
 from jobs.encoding.encoder import make_encoder_spec
 from jobs.encoding.settings import EncoderSettings
-from jobs.import_weights import Settings, import_weights
+from jobs.stages.import_weights import import_weights
+from jobs.stages.settings import EmbedSettings, ImportWeightsSettings
 from model.backbones.resnet import ResNet
 from model.checkpoint import Checkpoint, build_encoder, load_encoder, loads
 from model.errors import CheckpointError
@@ -204,7 +204,9 @@ def saved(state: State, path: Path) -> str:
 
 def imported(tmp_path: Path, state: State, image_size: int = 128) -> Checkpoint:
     given = saved(state, tmp_path / "net_119.pth")
-    out = import_weights(Settings(lpn=given, out=str(tmp_path / "ours.pt"), image_size=image_size))
+    out = import_weights(
+        ImportWeightsSettings(lpn=given, out=str(tmp_path / "ours.pt"), image_size=image_size)
+    )
     return loads(Path(out).read_bytes())
 
 
@@ -356,7 +358,7 @@ def test_torchvisions_weights_become_a_checkpoint_whose_refinement_is_said_to_be
     else:
         safetensors.torch.save_file(state, path)
     outs = [
-        import_weights(Settings(torchvision=str(path), out=str(tmp_path / name)))
+        import_weights(ImportWeightsSettings(torchvision=str(path), out=str(tmp_path / name)))
         for name in ("a.pt", "b.pt")
     ]
     assert "the refinement of the rings is untrained" in capsys.readouterr().err
@@ -398,7 +400,7 @@ def test_another_depths_names_are_listed(tmp_path: Path) -> None:
         CheckpointError,
         match=r"odd\.pth does not fit this backbone: layer1\.0\.conv9\.weight is unexpected",
     ):
-        import_weights(Settings(torchvision=given, out=str(tmp_path / "o.pt")))
+        import_weights(ImportWeightsSettings(torchvision=given, out=str(tmp_path / "o.pt")))
 
 
 def test_an_imported_checkpoint_is_what_embed_gallery_takes(
@@ -442,17 +444,17 @@ def test_a_finished_import_is_left_alone_and_anything_else_there_is_kept(
 def test_a_wrong_call_is_answered_with_the_remedy(tmp_path: Path) -> None:
     out = str(tmp_path / "o.pt")
     with pytest.raises(InputError, match="neither of --torchvision and --lpn given"):
-        Settings(out=out)
+        ImportWeightsSettings(out=out)
     with pytest.raises(InputError, match="both of --torchvision and --lpn given"):
-        Settings(out=out, torchvision="a", lpn="b")
+        ImportWeightsSettings(out=out, torchvision="a", lpn="b")
     with pytest.raises(
         InputError, match=r"no weights at .*none\.pth; expected .*torchvision\.models\.resnet50"
     ):
-        import_weights(Settings(out=out, torchvision=str(tmp_path / "none.pth")))
+        import_weights(ImportWeightsSettings(out=out, torchvision=str(tmp_path / "none.pth")))
     with pytest.raises(InputError, match=r"no weights at .*none\.pth; expected .*LPN"):
-        import_weights(Settings(out=out, lpn=str(tmp_path / "none.pth")))
+        import_weights(ImportWeightsSettings(out=out, lpn=str(tmp_path / "none.pth")))
     with pytest.raises(InputError, match="is a folder"):
-        import_weights(Settings(out=out, lpn=str(tmp_path)))
+        import_weights(ImportWeightsSettings(out=out, lpn=str(tmp_path)))
     with pytest.raises(
         InputError,
         match=r"net_119\.pth: image_size is 64, expected at least 128 pixels for 4 parts",
@@ -462,4 +464,4 @@ def test_a_wrong_call_is_answered_with_the_remedy(tmp_path: Path) -> None:
         {"conv1.weight": torch.ones(1)} | ResNet("resnet18", 0.25).state_dict(), tmp_path / "r.pth"
     )
     with pytest.raises(InputError, match="image_size is 64"):
-        import_weights(Settings(out=out, torchvision=given, image_size=64))
+        import_weights(ImportWeightsSettings(out=out, torchvision=given, image_size=64))

@@ -140,11 +140,11 @@ def test_the_gradient_of_encoder_and_classifier_is_that_of_equation_4_against_th
     None
 ):
     training = make()
-    learner = copy.deepcopy(training.learner)
+    learner = copy.deepcopy(training.model)
     training.step(*batch(), NOW)
     assert training.discriminator is not None
     by_hand = reference(learner, training.discriminator, NOW.alpha)
-    for name, parameter in training.learner.named_parameters():
+    for name, parameter in training.model.named_parameters():
         assert parameter.grad is not None
         torch.testing.assert_close(parameter.grad, by_hand[name], rtol=1e-4, atol=1e-6)
 
@@ -171,12 +171,12 @@ def test_no_gradient_reaches_the_discriminator_from_the_second_step() -> None:
 
 
 def test_the_encoder_is_pushed_by_swapped_labels_and_not_by_a_reversed_gradient() -> None:
-    adversary, plain = (reference(make().learner, _discriminator(), alpha) for alpha in (1.0, 0.0))
+    adversary, plain = (reference(make().model, _discriminator(), alpha) for alpha in (1.0, 0.0))
     training = make()
-    maps1_BCHW, maps2_BCHW, *_ = training.learner(batch()[0], batch()[2])
+    maps1_BCHW, maps2_BCHW, *_ = training.model(batch()[0], batch()[2])
     verdict_B2 = _discriminator()(torch.cat([maps1_BCHW, maps2_BCHW]))
     straight = F.cross_entropy(verdict_B2, torch.tensor([0, 0, 0, 1, 1, 1])) * 2
-    first = training.learner.encoder.backbone.get_parameter("conv1.weight")
+    first = training.model.encoder.backbone.get_parameter("conv1.weight")
     [reversed_gradient] = torch.autograd.grad(-straight, first)
     swapped_gradient = (
         adversary["encoder.backbone.conv1.weight"] - plain["encoder.backbone.conv1.weight"]
@@ -212,7 +212,7 @@ def test_the_discriminator_sees_both_views_in_one_batch_in_training_mode_twice_a
 def test_the_encoder_runs_once_on_each_view_alone() -> None:
     training = make()
     seen: list[int] = []
-    training.learner.encoder.register_forward_pre_hook(
+    training.model.encoder.register_forward_pre_hook(
         lambda module, given: seen.append(len(given[0]))
     )
     training.step(*batch(), NOW)
@@ -235,7 +235,7 @@ def test_with_alpha_zero_encoder_and_classifier_become_what_they_are_without_an_
         training = make(config, adversary=adversary)
         for seed in range(3):
             training.step(*batch(seed), ScheduleState(alpha=0.0, lr_scale=1.0))
-        learned.append(training.learner.state_dict())
+        learned.append(training.model.state_dict())
     assert learned[0].keys() == learned[1].keys()
     for name, tensor in learned[0].items():
         torch.testing.assert_close(tensor, learned[1][name], rtol=1e-5, atol=1e-7)
@@ -262,7 +262,7 @@ def test_alpha_moves_the_encoder_and_leaves_the_classifiers_first_step_alone() -
 def test_each_group_moves_at_its_own_rate_scaled_by_the_schedule() -> None:
     training = make()
     training.step(*batch(), ScheduleState(alpha=0.9, lr_scale=0.8))
-    assert training.rates == pytest.approx(
+    assert training.learning_rates == pytest.approx(
         {"backbone": 0.0008, "head": 0.008, "classifier": 0.008, "discriminator": 0.0016}
     )
     assert {len(g["params"]) for g in training.optimizers[0].param_groups} == {60, 2 * 4, 2 * 2}
@@ -327,7 +327,7 @@ def test_in_bfloat16_weights_and_losses_stay_float32_and_the_step_is_nearly_the_
     whole = make()
     rough, exact = half.step(*batch(), NOW), whole.step(*batch(), NOW)
     assert {measure.dtype for measure in rough.values()} == {torch.float32}
-    assert {parameter.dtype for parameter in half.learner.parameters()} == {torch.float32}
+    assert {parameter.dtype for parameter in half.model.parameters()} == {torch.float32}
     assert float(rough["location_loss"]) == pytest.approx(float(exact["location_loss"]), rel=0.05)
     assert rough["location_loss"] != exact["location_loss"]
     assert not Training(TINY, Optimization(), LOCATIONS, precision="auto").bfloat16  # on a CPU
@@ -352,7 +352,7 @@ def test_networks_that_cannot_be_compiled_are_as_they_were_and_the_reason_is_tol
     torch.manual_seed(1)
     uncompiled.step(*batch(), NOW)
     plain.step(*batch(), NOW)
-    assert_same(uncompiled.state(), plain.state())
+    assert_same(uncompiled.state_dict(), plain.state_dict())
 
 
 def test_the_location_loss_falls_when_the_same_images_come_again_and_again() -> None:
@@ -368,7 +368,7 @@ def test_a_run_saved_and_loaded_goes_on_to_the_last_bit(kind: Any) -> None:
     for seed in range(2):
         whole.step(*batch(seed), NOW)
     held = Checkpoint(
-        network=config, recipe={}, locations=[], epoch=1, history=[], state=whole.state()
+        network=config, recipe={}, locations=[], epoch=1, history=[], state=whole.state_dict()
     )
     data = dumps(held)
     for seed in range(2, 4):
@@ -379,12 +379,12 @@ def test_a_run_saved_and_loaded_goes_on_to_the_last_bit(kind: Any) -> None:
     resumed.load_state_dict(loads(data).state)
     for seed in range(2, 4):
         resumed.step(*batch(seed), NOW)
-    assert_same(resumed.state(), whole.state())
+    assert_same(resumed.state_dict(), whole.state_dict())
 
 
 def test_a_run_of_one_adversary_does_not_take_the_state_of_none() -> None:
     with pytest.raises(KeyError, match="discriminator"):
-        make().load_state_dict(make(adversary=False).state())
+        make().load_state_dict(make(adversary=False).state_dict())
 
 
 def test_joint_batchnorm_is_the_encoder_on_both_views_at_once() -> None:

@@ -22,7 +22,9 @@ from typing import Any
 import pytest
 
 from jobs.encoding.photo_encoder import PhotoEncoder
-from jobs.serve import Settings, load_predictor, main
+from jobs.stages.serve import load_predictor
+from jobs.stages.serve import serve as main
+from jobs.stages.settings import ServeSettings
 from model.checkpoint import Checkpoint, dumps
 from model.config import PVDAConfig
 from model.pvda import FeatureEncoder
@@ -155,17 +157,17 @@ def test_serve_other_encoder_is_refused(road: tuple[Path, Path], ray_cluster: No
     said = json_files.read_checksummed(str(index / "index.json"))
     json_files.write_checksummed(str(index / "index.json"), said | {"fingerprint": "e" * 64})
     with pytest.raises(InputError, match="did not make this index"):
-        main(Settings(checkpoint=str(checkpoint), index=str(index), port=0, threads=1))
+        main(ServeSettings(checkpoint=str(checkpoint), index=str(index), port=0, threads=1))
     assert not serve_actors()
 
 
 def test_serve_missing_input_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no checkpoint at"):
-        main(Settings(checkpoint=str(tmp_path / "none.pt"), index=str(tmp_path)))
+        main(ServeSettings(checkpoint=str(tmp_path / "none.pt"), index=str(tmp_path)))
     with pytest.raises(InputError, match="no index at"):
-        main(Settings(checkpoint=__file__, index=str(tmp_path)))
+        main(ServeSettings(checkpoint=__file__, index=str(tmp_path)))
     with pytest.raises(InputError, match="--replicas is 0"):
-        Settings(checkpoint="last.pt", index="index", replicas=0)
+        ServeSettings(checkpoint="last.pt", index="index", replicas=0)
 
 
 def test_serve_port_in_use_is_refused(road: tuple[Path, Path], ray_cluster: None) -> None:
@@ -175,7 +177,7 @@ def test_serve_port_in_use_is_refused(road: tuple[Path, Path], ray_cluster: None
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"cannot listen on 127.0.0.1 port {port}"):
-            main(Settings(checkpoint=str(checkpoint), index=str(index), port=port))
+            main(ServeSettings(checkpoint=str(checkpoint), index=str(index), port=port))
 
 
 def test_replica_retries_loading(road: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jobs.train import Settings, train
+from jobs.training.driver import train
 from jobs.training.recipes import smoke
+from jobs.training.settings import TrainSettings
 from pipeline.batches.training import StreamConfig, TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
@@ -132,7 +133,7 @@ def test_training_looks_at_sizes_first_and_at_every_byte_when_asked(
     out: Path, tmp_path: Path
 ) -> None:
     recipe = smoke(1)
-    settings = Settings(
+    settings = TrainSettings(
         recipe=replace(recipe, batch_size=2), shards=str(out), out=str(tmp_path / "run"), workers=0
     )
     _, tar = a_shard(out)

@@ -20,6 +20,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from jobs import make_shards
+from jobs.command_line.cli import expand
+from jobs.stages.settings import MakeShardsSettings
 from pipeline.core import storage
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View, make_key
@@ -449,16 +451,17 @@ def test_the_job_checks_and_exports_a_finished_set(
 ) -> None:
     out = tmp_path / "out"
     manifest = pack(SOURCE, said(imagery(tmp_path / "root"), out))
-    make_shards.check(str(out), verify=True)
-    make_shards.export(str(out), export=str(tmp_path / "all.geojson"))
+    make_shards.main(MakeShardsSettings(out=str(out), verify=True))
+    geojson = str(tmp_path / "all.geojson")
+    make_shards.main(MakeShardsSettings(out=str(out), export=geojson))
     told = capsys.readouterr().err
     assert f"all {len(manifest.shards)} shards are what was packed" in told
-    assert "0 images, 15 without a place left out" in told
+    assert "0 images, 15 without a position left out" in told
     (out / f"{manifest.shards[0].name}.tar").unlink()
     with pytest.raises(
         Incomplete, match="is damaged in 1 places; run the command that packed it again"
     ):
-        make_shards.check(str(out), verify=True)
+        make_shards.main(MakeShardsSettings(out=str(out), verify=True))
 
 
 def test_a_source_is_named_by_a_flag_in_either_form() -> None:
@@ -466,5 +469,6 @@ def test_a_source_is_named_by_a_flag_in_either_form() -> None:
         ["--root", "x", "--source", "xyz", "--zoom", "3"],
         ["--root", "x", "--source=xyz", "--zoom", "3"],
     ):
-        assert make_shards.source_as_subcommand(words) == ["xyz", "--root", "x", "--zoom", "3"]
-    assert make_shards.source_as_subcommand(["--help"]) == ["--help"]
+        found = expand(make_shards.main, words, make_shards.SOURCE, None)
+        assert found == ["xyz", "--root", "x", "--zoom", "3"]
+    assert expand(make_shards.main, ["--help"], make_shards.SOURCE, None) == ["--help"]

@@ -1,0 +1,134 @@
+"""Calibrate the probabilities of an index's answers: `calibrate.py --checkpoint FILE --shards DIR
+--index INDEX`
+
+Searches the index for photos of locations that the encoder was not trained on, once with their
+location in the gallery and once without. Writes INDEX/calibration.json, which locate.py and
+serve.py read from there, and the reliability diagram beside it.
+"""
+
+from itertools import islice
+
+import numpy as np
+
+from jobs.encoding.encoder import read_checkpoint_bytes
+from jobs.encoding.photo_encoder import PhotoEncoder
+from jobs.stages.settings import CalibrateSettings
+from model.checkpoint import loads
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.core.progress import console, progress, results
+from pipeline.core.records import View
+from pipeline.index.searcher import Index
+from pipeline.locate.calibrate import CalibrationContext, fit_calibration
+from pipeline.locate.calibration import (
+    CALIBRATION_FILE,
+    Calibration,
+    read_calibration,
+    write_calibration,
+)
+from pipeline.locate.calibration_data import LabelledImages, make_examples
+from pipeline.locate.gallery_map import read_gallery_map
+from pipeline.locate.reliability import reliability_diagram
+from pipeline.locate.settings import CalibrationCriteria
+from pipeline.shards.external import open_manifest
+from pipeline.shards.manifest import require_tars
+from pipeline.shards.samples import read_shard
+
+ENCODE_BATCH = 256
+"Images that are encoded at a time."
+
+
+def calibrate_index(settings: CalibrateSettings) -> Calibration:
+    """Calibrate an index and return the calibration; does nothing where a finished one exists, and
+    replaces one of another gallery or other settings.
+
+    Raises InputError and CheckpointError on unusable input.
+    """
+    out = settings.out or storage.join(settings.index, CALIBRATION_FILE)
+    index = Index(settings.index)
+    views = f"{settings.split} {settings.view} -> {settings.gallery_view}"
+    selection = f"{views}, at most {settings.photos} photos"
+    if done := load_if_done(out, index, selection, settings):
+        console.print(f"{out} is complete; nothing to do")
+        return done
+    data = read_checkpoint_bytes(settings.checkpoint)
+    encoder = PhotoEncoder(data, settings.checkpoint, index.facts, settings.shards)
+    trained_on = frozenset(loads(data, settings.checkpoint).locations)
+    photos = embed_view(settings, encoder, settings.view, trained_on, settings.photos)
+    overhead = embed_view(settings, encoder, settings.gallery_view, trained_on, None)
+    spacing_m = read_gallery_map(index).spacing_m
+    examples = make_examples(photos, overhead, index, spacing_m, settings.tolerance)
+    context = CalibrationContext(
+        fingerprint=encoder.fingerprint,
+        gallery_rows=len(index),
+        spacing_m=spacing_m,
+        photo_selection=selection,
+    )
+    calibration = fit_calibration(examples, settings, context)
+    write_calibration(out, calibration)
+    picture = f"{out.removesuffix('.json')}.svg"
+    title = f"Reliability over {calibration.photos} photos"
+    storage.write_bytes(picture, reliability_diagram(calibration.bins, title).encode())
+    console.print(summary(calibration))
+    results.print(f"calibration: {out}, diagram: {picture}", soft_wrap=True)
+    return calibration
+
+
+def load_if_done(
+    out: str, index: Index, selection: str, criteria: CalibrationCriteria
+) -> Calibration | None:
+    """The calibration at `out` if it is of this index, selection of photos and criteria; else None,
+    also where it is damaged or of another encoder, as it is then replaced."""
+    try:
+        found = read_calibration(out, index.facts) if storage.exists(out) else None
+    except InputError:
+        return None
+    if found is None:
+        return None
+    wanted = (selection, len(index), criteria.tolerance, criteria.outside)
+    same = (found.photo_selection, found.gallery_rows, found.tolerance_m, found.outside) == wanted
+    return found if same else None
+
+
+def embed_view(
+    settings: CalibrateSettings,
+    encoder: PhotoEncoder,
+    view: View,
+    trained_on: frozenset[str],
+    limit: int | None,
+) -> LabelledImages:
+    """The first `limit` images of a view whose locations were not trained on, with their
+    embeddings; damaged ones are left out.
+
+    Shards are in the order of hashes, so the first ones are a fair sample.
+    """
+    shards = open_manifest(settings.shards, settings.split, view).of(settings.split, view)
+    require_tars(settings.shards, shards)
+    samples = (
+        sample
+        for shard in shards
+        for sample in read_shard(settings.shards, shard.name, shard.split, shard.view)
+        if sample.facts["location"] not in trained_on
+    )
+    records, blocks = [], [np.empty((0, encoder.dimension), np.float32)]
+    with progress(None, f"{view} images", "images") as meter:
+        wanted = islice(samples, limit)
+        while batch := list(islice(wanted, ENCODE_BATCH)):
+            block_BD, rejections = encoder.encode([sample.data for sample in batch])
+            pairs = zip(batch, rejections, strict=True)
+            records += [sample.facts for sample, rejection in pairs if rejection is None]
+            blocks.append(block_BD)
+            meter.advance(len(batch))
+    return LabelledImages(records=records, embeddings_QD=np.concatenate(blocks))
+
+
+def summary(calibration: Calibration) -> str:
+    """The calibration's figures in one sentence."""
+    return (
+        f"{calibration.photos} photos of {calibration.locations} locations not trained on: "
+        f"{calibration.accuracy:.1%} answered rightly; expected calibration error "
+        f"{calibration.calibration_error:.3f}; below a probability of {calibration.threshold:.2f} "
+        f"an answer is unknown, which keeps {calibration.right_kept:.1%} of the right answers and "
+        f"answers unknown for {calibration.outside_unknown:.1%} of the photos without their "
+        "location"
+    )

@@ -1,0 +1,231 @@
+"""The whole road on one machine: `demo.py [--out DIR]`. Simulate, pack, train, embed, index,
+evaluate, report, locate.
+
+Every stage is the one that the other jobs run, on a data set small enough for minutes on two cores.
+Run again, it goes on where it was.
+"""
+
+import csv
+import io
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from jobs.encoding.encoder import make_encoder_spec
+from jobs.stages.calibrate import calibrate_index
+from jobs.stages.evaluation_tables import print_table
+from jobs.stages.locate import locate_photos
+from jobs.stages.settings import CalibrateSettings, DemoSettings, LocateSettings
+from jobs.training.driver import train
+from jobs.training.recipes import smoke
+from jobs.training.settings import RunConfig, TrainSettings
+from jobs.training.state import initial_checkpoint
+from pipeline.core import cluster, storage
+from pipeline.core.errors import InputError
+from pipeline.core.progress import console, results
+from pipeline.core.records import Split, View
+from pipeline.evaluation.evaluate import evaluate
+from pipeline.evaluation.settings import EvaluationSettings
+from pipeline.features.embed import embed_gallery
+from pipeline.features.settings import EmbeddingSettings
+from pipeline.features.table import open_table
+from pipeline.index.build import build_index
+from pipeline.index.searcher import Index
+from pipeline.index.settings import IndexSettings
+from pipeline.locate.geojson import LocatedPhoto
+from pipeline.locate.page import LatLon, distance_to_m, format_distance
+from pipeline.shards.pack import pack
+from pipeline.shards.settings import PackingSettings
+from pipeline.simulation.settings import SimulationSettings
+from pipeline.simulation.simulate import simulate
+from pipeline.sources.university1652 import University1652
+
+
+def demo(settings: DemoSettings) -> list[dict[str, Any]]:
+    """Go the whole road; returns the trained network's metric rows."""
+    out = storage.absolute(settings.out)
+    flights, shards, trained = (storage.join(out, name) for name in ("flights", "shards", "run"))
+    seconds: dict[str, float] = {}
+    with step(seconds, "1 simulate", "flights over made-up towns, in University-1652's layout"):
+        cluster.connect()
+        simulate(
+            SimulationSettings(
+                out=flights,
+                train_locations=settings.train_locations,
+                test_locations=settings.test_locations,
+                distractors=settings.distractors,
+                views=settings.views,
+                size=settings.size,
+            )
+        )
+    with step(seconds, "2 pack", "images into webdataset shards"):
+        pack(University1652(), PackingSettings(root=flights, out=shards))
+    with step(
+        seconds,
+        "3 train",
+        "PVDA from scratch by recipe smoke: small, quick, the same two-step method",
+    ):
+        recipe = replace(smoke(epochs=settings.epochs), hold_out=settings.hold_out)
+        checkpoint = train(TrainSettings(recipe=recipe, shards=shards, out=trained))
+        start = storage.join(out, "untrained.pt")
+        if not storage.exists(start):
+            storage.write_bytes(
+                start, initial_checkpoint(RunConfig(shards=shards, out=trained, recipe=recipe))
+            )
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for number, (name, file) in enumerate({"untrained": start, "trained": checkpoint}.items()):
+        table, results = (
+            storage.join(out, f"features-{name}"),
+            storage.join(out, f"evaluation-{name}"),
+        )
+        with step(
+            seconds,
+            f"{4 + 2 * number} embed",
+            f"test images with the {name} network, one Parquet part per shard",
+        ):
+            for split in (Split.QUERY, Split.GALLERY):
+                embedding = EmbeddingSettings(shards=shards, out=table, split=split)
+                embed_gallery(
+                    embedding, make_encoder_spec(storage.read_bytes(file), file, embedding)
+                )
+        with step(
+            seconds,
+            f"{5 + 2 * number} evaluate",
+            f"both directions and multi-query, the {name} network",
+        ):
+            rows[name] = evaluate(
+                EvaluationSettings(
+                    table=table,
+                    out=results,
+                    shards=shards,
+                    run=trained if name == "trained" else None,
+                    beside=storage.join(out, "evaluation-untrained") if name == "trained" else None,
+                    by=("altitude_m",),
+                    title=f"PVDA on simulated flights, {name}",
+                )
+            )
+    with step(seconds, "8 index", "satellite gallery into FAISS, asked with the UAV's images"):
+        index = storage.join(out, "index")
+        build_index(IndexSettings(table=table, out=index, split=Split.GALLERY, view=View.SATELLITE))
+        console.print(ask(index, table))
+    with step(seconds, "9 locate", "a few unseen photos: where were they taken?"):
+        page = locate_some(
+            Demo(
+                flights=flights,
+                shards=shards,
+                checkpoint=checkpoint,
+                index=index,
+                out=storage.join(out, "located"),
+            )
+        )
+    console.rule("done")
+    console.print("seconds: " + ", ".join(f"{name} {spent:.0f}" for name, spent in seconds.items()))
+    chance = 1 / rows["trained"][0]["gallery"]
+    console.print(
+        f"places never seen in training, UAV -> satellite R@1: chance {chance:.2%}, untrained "
+        f"{rows['untrained'][0]['r1']:.2%}, trained {rows['trained'][0]['r1']:.2%}"
+    )
+    print_table(rows["trained"])
+    print(
+        f"report: {storage.join(out, 'evaluation-trained', 'report.html')}\nphotos on the map: {page}"
+    )
+    return rows["trained"]
+
+
+def ask(index: str, table: str) -> str:
+    """How many UAV images of places never seen find their place first, asked of the index as a user
+    would.
+    """
+    photos = open_table(table).select(Split.QUERY, View.DRONE)
+    answers = Index(index).search(photos.embeddings(), k=1)
+    right = sum(
+        hits[0].location == place
+        for hits, place in zip(answers, photos.labels().locations, strict=True)
+    )
+    return f"{right} of {len(answers)} UAV images find their place at the first attempt"
+
+
+@contextmanager
+def step(seconds: dict[str, float], name: str, what: str) -> Iterator[None]:
+    """Say what begins, and keep how long it took."""
+    console.rule(Text.assemble((name, "bold"), " ", what), align="left")
+    start = time.monotonic()
+    yield
+    seconds[name] = time.monotonic() - start
+
+
+PHOTOS = 10
+"Places that are asked for, each by its first photo and by all of its photos together."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo:
+    """Where the demo has put what it made."""
+
+    flights: str
+    shards: str
+    checkpoint: str
+    index: str
+    out: str
+    "Folder for the answers."
+
+
+def locate_some(demo: Demo) -> str:
+    """Calibrate the index, locate photos, print how far off they are; the page's path."""
+    try:
+        calibrate_index(
+            CalibrateSettings(checkpoint=demo.checkpoint, shards=demo.shards, index=demo.index)
+        )
+    except InputError as error:  # a demo made smaller than it is may hold out too few places
+        console.print(f"not calibrated: {error}")
+    places = positions(storage.join(demo.flights, "locations.csv"))
+    root = storage.join(demo.flights, "test", "query_drone")
+    names = sorted(name for name in places if storage.is_folder(storage.join(root, name)))[:PHOTOS]
+    folders = {storage.join(root, name): places[name] for name in names}
+    firsts = {
+        storage.join(folder, storage.list_names(folder)[0]): place
+        for folder, place in folders.items()
+    }
+    page = storage.join(demo.out, "photos.html")
+    asked = LocateSettings(
+        photos=tuple(firsts),
+        checkpoint=demo.checkpoint,
+        index=demo.index,
+        shards=demo.shards,
+        page=page,
+        out=storage.join(demo.out, "photos.geojson"),
+    )
+    alone = locate_photos(asked, firsts)
+    of_places = storage.join(demo.out, "places.geojson")
+    together = locate_photos(
+        replace(asked, photos=tuple(folders), together=True, out=of_places, page=None)
+    )
+    table = Table(title="unseen UAV photos: how far off", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for heading in ("place", "one photo", "sure", "all together", "sure"):
+        table.add_column(heading, justify="left" if heading == "place" else "right", no_wrap=True)
+    for name, one, all_ in zip(names, alone, together, strict=True):
+        table.add_row(name, *_cells(one, places[name]), *_cells(all_, places[name]))
+    results.print(table)
+    return page
+
+
+def positions(path: str) -> dict[str, LatLon]:
+    """Latitude and longitude by location, as the simulator wrote them."""
+    rows = csv.DictReader(io.StringIO(storage.read_bytes(path).decode()))
+    return {row["location"]: (float(row["lat"]), float(row["lon"])) for row in rows}
+
+
+def _cells(one: LocatedPhoto, place: LatLon) -> tuple[str, str]:
+    """How far off an answer is, and how sure it was."""
+    answer = one.answer
+    if answer is None:
+        return "not decoded", ""
+    off = format_distance(distance_to_m(answer, place))
+    sure = "" if answer.probability is None else f"{answer.probability:.0%}"
+    return off if answer.known else f"unknown ({off})", sure

@@ -1,0 +1,212 @@
+"""Find where photos were taken: `locate.py PHOTO... --checkpoint FILE --index INDEX --out
+FILE.geojson`
+
+Embeds photos, or folders of them, as the index's images were embedded, and searches the index.
+Writes GeoJSON, and on request CSV and a page with a map. Photos that cannot be decoded are listed
+with the reason, the others are answered, and the exit code is 1.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from jobs.encoding.encoder import read_checkpoint_bytes
+from jobs.encoding.photo_encoder import PhotoEncoder
+from jobs.encoding.queries import Query, encode_photos, merge_by_folder
+from jobs.stages.settings import LocateSettings
+from pipeline.core import rejections, storage
+from pipeline.core.errors import Incomplete, InputError
+from pipeline.core.progress import console, results
+from pipeline.features.part import verify_part
+from pipeline.images.thumbnails import no_images
+from pipeline.index.filters import Filter
+from pipeline.index.searcher import Index
+from pipeline.locate.answer_table import answer_table
+from pipeline.locate.calibration import Calibration, find_calibration, read_calibration
+from pipeline.locate.flight import TRACK_THRESHOLD, apply_track, motion_for_gallery
+from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
+from pipeline.locate.geojson import LocatedPhoto, to_csv, to_geojson
+from pipeline.locate.locate import Answer, locate_embeddings
+from pipeline.locate.page import LatLon, PageContext, render_page
+from pipeline.locate.photo_files import find_photos, parse_time, read_times
+from pipeline.locate.track import TRACK_CANDIDATES, TrackStart
+from pipeline.shards.manifest import read_manifest
+from pipeline.shards.record_table import footprints
+from pipeline.shards.samples import fetch
+
+
+def locate_photos(
+    settings: LocateSettings, true_positions: Mapping[str, LatLon] | None = None
+) -> list[LocatedPhoto]:
+    """Answer, write the files asked for, and return the answers in the order of the photos (of
+    their folders with --together; of their times with --track).
+
+    `true_positions`: where photos were taken, by name, for the page. Raises InputError and
+    CheckpointError on unusable input.
+    """
+    photos = find_photos(settings.photos)
+    checkpoint = read_checkpoint_bytes(settings.checkpoint)
+    index = Index(settings.index, whole=settings.verify or None)
+    if settings.verify and index.told.refine == "table":
+        for name in index.told.table_parts:
+            verify_part(storage.join(index.told.table, name))
+    calibration = load_calibration(settings, index)
+    encoder = PhotoEncoder(checkpoint, settings.checkpoint, index.facts, settings.shards)
+    gallery = read_gallery_map(index)
+    queries = encode_photos(photos, encoder)
+    if settings.together:
+        queries = merge_by_folder(queries)
+    decoded = [query for query in queries if query.embedding_D is not None]
+    if settings.track:
+        decoded = with_times(decoded, settings)
+    answers = answer_queries(decoded, index, gallery, calibration, settings)
+    answered = {
+        query.name: _located(query, answer, settings.top)
+        for query, answer in zip(decoded, answers, strict=True)
+    }
+    located = [answered.get(query.name) or _located(query, None, 0) for query in queries]
+    if settings.track:
+        located.sort(key=lambda one: (one.taken_at is None, parse_time(one.taken_at or "0")))
+    context = PageContext(
+        title="Where these photos were taken",
+        gallery=gallery,
+        calibration=calibration,
+        fingerprint=encoder.fingerprint,
+        track=settings.track,
+        true_positions=true_positions or {},
+    )
+    write_answers(located, settings, context)
+    return located
+
+
+def answer_queries(
+    queries: Sequence[Query],
+    index: Index,
+    gallery: GalleryMap,
+    calibration: Calibration | None,
+    settings: LocateSettings,
+) -> list[Answer]:
+    """One answer per query; with --track given the whole flight."""
+    rows = [query.embedding_D for query in queries]
+    embeddings_QD = np.array(rows, np.float32).reshape(-1, index.dimension)
+    near = settings.near
+    if not settings.track or calibration is None:
+        where = Filter(near=near) if near else None
+        return locate_embeddings(
+            index, embeddings_QD, settings.top, where, calibration, gallery.spacing_m
+        )
+    k = max(settings.top, TRACK_CANDIDATES)
+    single = locate_embeddings(index, embeddings_QD, k, None, calibration)
+    start = TrackStart(lat=near.lat, lon=near.lon, radius_m=near.radius_m) if near else None
+    motion = motion_for_gallery(gallery, settings.max_speed, settings.elsewhere)
+    times_s = [parse_time(query.taken_at or "0") for query in queries]
+    return apply_track(single, times_s, calibration, motion, start)
+
+
+def load_calibration(settings: LocateSettings, index: Index) -> Calibration | None:
+    """The calibration named by --calibration, or the one beside the index; None, with a message,
+    where there is none.
+
+    Raises InputError where it belongs to another encoder, or is missing and a track needs one.
+    """
+    if settings.calibration:
+        return read_calibration(settings.calibration, index.facts)
+    calibration = find_calibration(settings.index, index.facts)
+    if calibration is None and settings.track:
+        raise InputError(
+            f"no calibration beside {settings.index}, and --track weighs candidates by one; "
+            "expected calibration.json; make it with jobs/calibrate.py"
+        )
+    if calibration is None:
+        console.print(
+            "not calibrated: answers come without a probability, and none is unknown; see "
+            "jobs/calibrate.py"
+        )
+    elif calibration.gallery_rows != len(index):
+        console.print(
+            f"calibrated over {calibration.gallery_rows} gallery images, the index has "
+            f"{len(index)}: probabilities are rough until jobs/calibrate.py is run again",
+            style="yellow",
+        )
+    return calibration
+
+
+def with_times(queries: Sequence[Query], settings: LocateSettings) -> list[Query]:
+    """The queries with their times: from the table, else by the interval, else from the cameras'
+    tags.
+
+    Raises InputError where the time of one is not known.
+    """
+    names = [query.name for query in queries]
+    if settings.times:
+        times = read_times(settings.times, names)
+    elif settings.interval:
+        times = {name: str(at * settings.interval) for at, name in enumerate(sorted(names))}
+    else:
+        times = {query.name: query.taken_at for query in queries if query.taken_at is not None}
+    unknown = [name for name in names if name not in times]
+    if unknown:
+        raise InputError(
+            f"{len(unknown)} of {len(names)} photos have no time in their tags, {unknown[0]} among "
+            "them; expected times for --track; give --times TABLE or --interval SECONDS"
+        )
+    return [replace(query, taken_at=times[query.name]) for query in queries]
+
+
+def _located(query: Query, answer: Answer | None, top: int) -> LocatedPhoto:
+    listed = replace(answer, candidates=answer.candidates[:top]) if answer else None
+    return LocatedPhoto(
+        name=query.name,
+        photos=query.photos,
+        answer=listed,
+        rejected=query.rejected,
+        taken_at=query.taken_at,
+    )
+
+
+def write_answers(
+    located: Sequence[LocatedPhoto], settings: LocateSettings, context: PageContext
+) -> None:
+    """Write the GeoJSON, and the CSV and the page where they were asked for."""
+    calibration = context.calibration
+    threshold = TRACK_THRESHOLD if settings.track else calibration and calibration.threshold
+    about = {
+        "index": settings.index,
+        "fingerprint": context.fingerprint,
+        "together": settings.together,
+        "threshold": threshold,
+    }
+    storage.write_bytes(settings.out, to_geojson(located, about, settings.track))
+    if settings.csv:
+        storage.write_bytes(settings.csv, to_csv(located))
+    if settings.page:
+        page = make_page(located, context, settings.shards)
+        storage.write_bytes(settings.page, page.encode("utf-8", "replace"))
+
+
+def make_page(located: Sequence[LocatedPhoto], context: PageContext, shards: str | None) -> str:
+    """The HTML page; with images and corners of the gallery's images where there are shards."""
+
+    def load_photos(paths: Iterable[str]) -> dict[str, bytes]:
+        return {path: storage.read_bytes(path) for path in paths}
+
+    if shards is None:
+        return render_page(located, context, load_photos, no_images)
+    context = replace(context, footprints=partial(footprints, shards, read_manifest(shards)))
+    return render_page(located, context, load_photos, partial(fetch, shards))
+
+
+def locate(settings: LocateSettings) -> None:
+    """Find where photos were taken: a position, its probability, and the candidates behind it."""
+    located = locate_photos(settings)
+    results.print(answer_table(located))
+    written = f"answers: {settings.out}" + (f", page: {settings.page}" if settings.page else "")
+    results.print(written, soft_wrap=True)
+    rejected = [rejection for one in located for rejection in one.rejected]
+    if rejected:
+        raise Incomplete(
+            f"{len(rejected)} of {sum(len(one.photos) for one in located)} photos could not be "
+            f"decoded: {rejections.most_common_reasons(rejected)}; they are listed in {settings.out}"
+        )

@@ -1,0 +1,233 @@
+"""The settings of the jobs whose stage needs the network and the pipeline. Imports nothing heavy, so
+that the command line is parsed at once."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import tyro
+
+from jobs.encoding.settings import EncoderSettings
+from pipeline.core.errors import InputError, require
+from pipeline.core.geo import Circle
+from pipeline.core.records import Split, View
+from pipeline.features.settings import EmbeddingSettings
+from pipeline.index.settings import IndexSettings
+from pipeline.locate.settings import CalibrationCriteria
+from pipeline.locate.track import Motion
+from pipeline.service.settings import ServiceSettings
+from pipeline.shards.settings import PackingSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class MakeShardsSettings(PackingSettings):
+    """Which imagery becomes shards, and where; or what is done with a finished set."""
+
+    root: str = ""
+    "Where the imagery is; needed for packing."
+    verify: bool = False
+    "Check every tar, count and hash of the finished set in `out`, and pack nothing."
+    export: str | None = None
+    """File for the record table of the finished set in `out`: .parquet, or .geojson with a point
+    for each image whose position is known; packs nothing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmbedSettings(EmbeddingSettings, EncoderSettings):
+    """Which shards are embedded, by which network, into which table."""
+
+    checkpoint: str
+    "A last.pt of jobs/train.py, or what jobs/import_weights.py wrote."
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuildIndexSettings(IndexSettings):
+    """Which table is indexed, and how; or how a finished index is changed."""
+
+    table: str = ""
+    "Folder or URI of the feature table; not needed for --remove, and for --verify of an index."
+    extend: bool = False
+    "Add those parts of the table to the finished index that it does not contain yet."
+    remove: tuple[str, ...] = ()
+    "Locations to remove from the finished index."
+    verify: bool = False
+    """Check every byte of the finished index; with --table, of the table first and of an index that
+    is already finished."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.extend and self.remove:
+            raise InputError(
+                "found --extend and --remove, expected one of them; run one after the other"
+            )
+        needed = not self.remove and not (self.verify and not self.extend)
+        require(bool(self.table) or not needed, "table", self.table, "a folder of features")
+
+
+CIRCLE_FLAG: Any = tyro.constructors.PrimitiveConstructorSpec(
+    nargs=3,  # tyro's own reading of an optional tuple takes the photos behind it as well
+    metavar="LAT LON METRES",
+    instance_from_str=lambda words: Circle(
+        lat=float(words[0]), lon=float(words[1]), radius_m=float(words[2])
+    ),
+    is_instance=lambda value: value is None or isinstance(value, Circle),
+    str_from_instance=lambda value: (
+        [str(value)] if value is None else [str(value.lat), str(value.lon), str(value.radius_m)]
+    ),
+)
+"Syntax of a circle on the command line."
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocateSettings:
+    """Photos to locate, the index to search, and the files to write."""
+
+    photos: tyro.conf.Positional[tuple[str, ...]]
+    "Photos, or folders with photos below them; paths or URIs."
+    checkpoint: str
+    "The encoder that the index was made with."
+    index: str
+    "Folder or URI of the index."
+    out: str
+    "The GeoJSON file with a point per photo."
+    top: int = 5
+    "Candidates to list for each photo."
+    together: bool = False
+    "All photos of a folder show one location: search for them as one, by their mean embedding."
+    near: Annotated[Circle | None, CIRCLE_FLAG] = None
+    """Search only gallery images in this circle. With --track: where the flight began, at the time
+    of its first photo."""
+    track: bool = False
+    """The photos are of one flight: each is located given all of them, and the GeoJSON begins with
+    the flight's line."""
+    max_speed: float = 25.0
+    "Of the flight, metres per second over the ground; 25 is beyond most multicopters."
+    elsewhere: float = 0.1
+    "Of the flight, the share of photos expected to show no location of the gallery."
+    times: str | None = None
+    """CSV table with the columns photo and time (seconds or ISO 8601); by default the times in the
+    camera's tags."""
+    interval: float | None = None
+    "Seconds between photos in the order of their names, where neither tables nor tags have times."
+    verify: bool = False
+    """Check every byte of the index first, and of the parts of the feature table where it searches
+    their vectors."""
+    calibration: str | None = None
+    "Output of jobs/calibrate.py; by default INDEX/calibration.json where it exists."
+    csv: str | None = None
+    "A CSV file with a row per photo."
+    page: str | None = None
+    "An HTML page with photos, candidates and a map, in one file that needs no connection."
+    shards: str | None = None
+    """The shards that the index was made of: they have the images of the page; needed also where
+    the index's embeddings are int8."""
+
+    def __post_init__(self) -> None:
+        require(self.top >= 1, "top", self.top, "at least 1")
+        if self.together and self.track:
+            raise InputError(
+                "both --together and --track were given, expected one: a track is of single "
+                "photos; leave one out"
+            )
+        positive = self.interval is None or self.interval > 0
+        require(positive, "interval", self.interval, "seconds above 0")
+        Motion(max_speed=self.max_speed, elsewhere=self.elsewhere)  # validates both
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateSettings(CalibrationCriteria):
+    """The index to calibrate, and the photos to do it with."""
+
+    checkpoint: str
+    "The encoder that the index was made with."
+    shards: str
+    """Folder or URI of shards with photos of locations that the encoder was not trained on, and the
+    gallery's view of them."""
+    index: str
+    "Folder or URI of the index."
+    out: str | None = None
+    "The calibration; by default INDEX/calibration.json."
+    split: Split = Split.TRAIN
+    """Split of the photos; in the training split, only locations held out (train.py --hold-out).
+    Never the test set's."""
+    view: View = View.DRONE
+    "View of the photos."
+    gallery_view: View = View.SATELLITE
+    "View of the gallery's images."
+    photos: int = 2000
+    "Number of photos at most."
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.photos >= 1, "photos", self.photos, "at least 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServeSettings(ServiceSettings):
+    """The index, its encoder, the address and the limits of the service."""
+
+    checkpoint: str
+    "The checkpoint that the index's gallery was embedded with."
+    index: str
+    "Folder or URI of the index; the service switches to one that is built there later."
+    shards: str | None = None
+    "The shards that the index was made of: needed only where it was embedded in int8."
+    replicas: int = 1
+    "Processes that each load encoder and index."
+    threads: int | None = None
+    "CPU cores of each; by default as many as let all of them fit on the nodes that are up."
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.replicas >= 1, "replicas", self.replicas, "at least 1")
+        require(self.threads is None or self.threads >= 1, "threads", self.threads, "at least 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportWeightsSettings:
+    """Whose weights are imported, and where to."""
+
+    out: str
+    "File or URI of the checkpoint."
+    torchvision: str | None = None
+    "State dict of torchvision's ResNet-18, 34, 50 or 101 (.pth or .safetensors)."
+    lpn: str | None = None
+    "State dict of LPN's three_view_net (its net_119.pth), trained with --share and --stride=1."
+    image_size: int = 256
+    "Side in pixels of the images that the network is to see: `h` in LPN's opts.yaml."
+
+    def __post_init__(self) -> None:
+        if (self.torchvision is None) == (self.lpn is None):
+            given = "neither" if self.lpn is None else "both"
+            raise InputError(f"{given} of --torchvision and --lpn given, expected one of them")
+
+    @property
+    def kind(self) -> str:
+        return "torchvision" if self.lpn is None else "lpn"
+
+    @property
+    def source(self) -> str:
+        source = self.lpn if self.torchvision is None else self.torchvision
+        assert source is not None
+        return source
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoSettings:
+    """Where the demo works, and how much it does."""
+
+    out: str = "runs/demo"
+    "Folder for everything that it makes."
+    train_locations: int = 230
+    "Places to learn from, with those held out."
+    hold_out: float = 0.13
+    "Share of these that is not learnt from: how sure answers are is calibrated by them."
+    test_locations: int = 100
+    "Places to find; none of them is seen in training."
+    distractors: int = 50
+    "Places in the gallery only."
+    views: int = 12
+    "UAV images per place."
+    size: int = 128
+    "Side of the images in pixels."
+    epochs: int = 80
+    "Epochs of recipe smoke."

@@ -1,0 +1,21 @@
+"""The settings of a calibration that belong to this room. Imports nothing heavy, so that the command
+line is parsed at once."""
+
+from dataclasses import dataclass
+
+from pipeline.core.errors import require
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationCriteria:
+    """What counts as a right answer, and which share of future photos has none."""
+
+    tolerance: float = 25.0
+    "Metres within which a position is right."
+    outside: float = 0.5
+    """Share of future photos that show no location of the gallery; the probabilities depend on
+    it."""
+
+    def __post_init__(self) -> None:
+        require(self.tolerance > 0, "tolerance", self.tolerance, "metres above 0")
+        require(0 < self.outside < 1, "outside", self.outside, "a share above 0 and below 1")
