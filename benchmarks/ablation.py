@@ -33,6 +33,7 @@ from model.training import Training
 from model.weights.load import load_backbone
 from pipeline.batches.training import StreamConfig, TrainingStream
 from pipeline.images.transforms import Augmentation
+from pipeline.shards.shard_set import open_shards
 
 AfterEpoch = Callable[[Training, int, dict[str, float]], None]
 "Called after each epoch with its number and mean losses."
@@ -85,7 +86,7 @@ def run(
         seed=recipe.seed,
         threads=2,
     )
-    stream = TrainingStream(shards, config)
+    stream = TrainingStream(open_shards(shards), config)
     training = Training(
         recipe.network,
         recipe.optimization,
@@ -140,7 +141,7 @@ def main() -> None:
         textures=str(Path(args.textures).absolute()),
     )
     backbone = pretrained_backbone(out, towns, args.town_epochs)
-    test = TestSet(real)
+    test = TestSet(open_shards(real))
     varied = {name: getattr(args, name) for name in VARIED}
     for seed in range(args.seeds):
         for name in args.recipes:

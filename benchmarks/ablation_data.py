@@ -15,10 +15,9 @@ from pipeline.batches.ordered import decode_samples
 from pipeline.core.records import Split, View
 from pipeline.retrieval.metrics import summarise
 from pipeline.retrieval.ranking import EmbeddingSet, embedding_set_from_array, rank
-from pipeline.shards.manifest import read_manifest
 from pipeline.shards.pack import pack
-from pipeline.shards.samples import read_shard
 from pipeline.shards.settings import PackingSettings
+from pipeline.shards.shard_set import ShardSet
 from pipeline.simulation.settings import SimulationSettings
 from pipeline.simulation.simulate import simulate
 from pipeline.sources.university1652 import University1652
@@ -54,20 +53,20 @@ def change_sensor(path: Path) -> None:
 class TestSet:
     """The test images of a set, decoded once."""
 
-    def __init__(self, shards: str) -> None:
+    def __init__(self, shards: ShardSet) -> None:
         self.images: dict[tuple[Split, View], Tensor] = {}
         self.locations: dict[tuple[Split, View], np.ndarray] = {}
         for split in (Split.QUERY, Split.GALLERY):
             for view in (View.DRONE, View.SATELLITE):
                 samples = [
                     pair
-                    for shard in read_manifest(shards).of(split, view)
-                    for pair in decode_samples(read_shard(shards, shard.name), IMAGE_SIZE, 2, 64)
+                    for shard in shards.manifest.of(split, view)
+                    for pair in decode_samples(shards.samples(shard), IMAGE_SIZE, 2, 64)
                 ]
                 pixels = np.stack([image for _, image in samples if isinstance(image, np.ndarray)])
                 self.images[split, view] = torch.from_numpy(pixels.transpose(0, 3, 1, 2))
                 self.locations[split, view] = np.asarray(
-                    [sample.facts["location"] for sample, _ in samples], np.str_
+                    [sample.metadata["location"] for sample, _ in samples], np.str_
                 )
 
     def measure(self, training: Training) -> dict[str, float]:

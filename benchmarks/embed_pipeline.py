@@ -32,7 +32,9 @@ from pipeline.core import cluster
 from pipeline.core.records import Split, View
 from pipeline.features.embed_worker import IN_FLIGHT, EmbedJob, EncoderSpec, ShardEmbedder
 from pipeline.features.settings import EmbeddingSettings
-from pipeline.shards.manifest import Shard
+from pipeline.shards.external import EXTERNAL
+from pipeline.shards.manifest import Manifest, Shard
+from pipeline.shards.shard_set import ShardSet
 
 SOURCE_SIDE = 512
 "Side of the images in the tars, pixels: University-1652's."
@@ -123,7 +125,10 @@ def encoder_spec(
 def start_worker(folder: str, spec: EncoderSpec, batch: int, threads: int, decoders: int) -> Any:
     """A worker that has built its encoder; it writes its parts to `folder`/table."""
     job = EmbedJob(
-        shards=folder,
+        shards=ShardSet(
+            path=folder,
+            manifest=Manifest(shards=(), classes=(), packing=EXTERNAL, rejected=0),
+        ),
         out=f"{folder}/table",
         batch_size=batch,
         dtype="float32",

@@ -26,7 +26,7 @@ from pipeline.core.records import Split, View
 from pipeline.images.decode import decode
 from pipeline.images.inspect import inspect
 from pipeline.images.transforms import resize
-from pipeline.shards.samples import read_shard
+from pipeline.shards.samples import read_samples
 
 CASES = {
     "512 -> 256": (512, 512, 256),
@@ -98,7 +98,7 @@ def stream(folder: str, count: int) -> Iterator[float]:
     """Stream images as the embedder does."""
     left = count
     for path in sorted(Path(folder).glob("*.tar")):
-        samples = read_shard(folder, path.stem, Split.GALLERY, View.SATELLITE)
+        samples = read_samples(str(path), external=(Split.GALLERY, View.SATELLITE))
         for _, image in decode_samples(samples, 128, 2, 64):
             assert isinstance(image, np.ndarray)
             yield float(image[0, 0, 0])

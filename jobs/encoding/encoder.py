@@ -31,9 +31,8 @@ from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import Floats
 from pipeline.images.decode import DecodeError, Pixels
 from pipeline.images.transforms import Resizer, preprocessing_name
-from pipeline.shards.external import open_manifest
-from pipeline.shards.manifest import Manifest, repair_hint, require_tars
-from pipeline.shards.samples import Sample, read_shard
+from pipeline.shards.samples import Sample
+from pipeline.shards.shard_set import ShardSet, open_or_scan
 
 PROBE_IMAGES, CALIBRATION_IMAGES = 16, 128
 "Images by which the fast encoder is checked, and by which int8 is calibrated."
@@ -115,9 +114,9 @@ def make_encoder_spec(
         except PrecisionError as error:
             raise InputError(str(error)) from None
     # Once: of shards that others made it is a pass over all tars.
-    manifest = open_manifest(embedding.shards, embedding.split, embedding.view)
+    shards = open_or_scan(embedding.shards, embedding.split, embedding.view)
     count = PROBE_IMAGES + (CALIBRATION_IMAGES if precision == "int8" else 0)
-    some_B3HW = first_images(embedding.shards, manifest, size, settings.resizer, count)
+    some_B3HW = first_images(shards, size, settings.resizer, count)
     calibration_B3HW = some_B3HW[PROBE_IMAGES:] if precision == "int8" else None
     digest = (
         None if calibration_B3HW is None else calibration_digest(torch.from_numpy(calibration_B3HW))
@@ -130,7 +129,7 @@ def make_encoder_spec(
         settings=settings,
         precision=precision,
         batch_size=embedding.batch_size,
-        images=sum(shard.samples for shard in manifest.of(embedding.split, embedding.view))
+        images=sum(shard.samples for shard in shards.manifest.of(embedding.split, embedding.view))
         // (embedding.workers or 1),
         probe_B3HW=some_B3HW[:PROBE_IMAGES],
         calibration_B3HW=calibration_B3HW,
@@ -143,7 +142,7 @@ def make_encoder_spec(
     )
 
 
-def first_images(shards: str, manifest: Manifest, size: int, resizer: Resizer, count: int) -> Bytes:
+def first_images(shards: ShardSet, size: int, resizer: Resizer, count: int) -> Bytes:
     """The first images of a set, from each split and view alike, as bytes (at most `count`, 3,
     size, size).
 
@@ -153,12 +152,14 @@ def first_images(shards: str, manifest: Manifest, size: int, resizer: Resizer, c
     not the image that was packed.
     """
     first = {
-        (shard.split, shard.view): shard for shard in reversed(manifest.shards) if shard.samples
+        (shard.split, shard.view): shard
+        for shard in reversed(shards.manifest.shards)
+        if shard.samples
     }
     found = []
-    require_tars(shards, first.values())
+    shards.require_tars(first.values())
     for shard in first.values():
-        samples = read_shard(shards, shard.name, shard.split, shard.view)
+        samples = shards.samples(shard)
         images = (
             usable_pixels(shards, *opened)
             for opened in decode_samples(samples, size, 1, 4, resizer)
@@ -171,19 +172,19 @@ def first_images(shards: str, manifest: Manifest, size: int, resizer: Resizer, c
     ]
     if not mixed:
         raise InputError(
-            f"none of the first images of {shards} can be decoded, expected some to check the encoder by; see "
+            f"none of the first images of {shards.path} can be decoded, expected some to check the encoder by; see "
             "make_shards.py --verify, and pack again"
         )
     return stack(mixed)
 
 
-def usable_pixels(shards: str, sample: Sample, image: Pixels | DecodeError) -> Pixels | None:
+def usable_pixels(shards: ShardSet, sample: Sample, image: Pixels | DecodeError) -> Pixels | None:
     """An image's pixels, None where it has none. Raises InputError where it is not the one that was
     packed.
     """
     if isinstance(image, DecodeError) and image.reason == CHANGED:
         raise InputError(
-            f"image {sample.key} of {shards} is not the one that was packed, expected it to check the encoder by; "
-            f"{repair_hint(shards)}"
+            f"image {sample.key} of {shards.path} is not the one that was packed, expected it to check the encoder by; "
+            f"{shards.repair_hint}"
         )
     return None if isinstance(image, DecodeError) else image

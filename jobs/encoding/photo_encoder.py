@@ -27,7 +27,7 @@ from pipeline.features.table import Floats
 from pipeline.images.decode import DecodeError, Pixels, decode
 from pipeline.images.inspect import inspect
 from pipeline.images.transforms import Resizer, preprocessing_name, resize
-from pipeline.shards.external import open_manifest
+from pipeline.shards.shard_set import open_or_scan
 
 FORWARD_BATCH = 32
 "Photos of a forward pass."
@@ -149,9 +149,9 @@ def candidate_configs(shards: str | None, size: int) -> Iterator[EncodingConfig]
         )
     if shards is None:
         return
-    manifest = open_manifest(shards)
+    opened = open_or_scan(shards)
     for resizer, mirror in product(resizers, (True, False)):
-        some_B3HW = first_images(shards, manifest, size, resizer, PROBE_IMAGES + CALIBRATION_IMAGES)
+        some_B3HW = first_images(opened, size, resizer, PROBE_IMAGES + CALIBRATION_IMAGES)
         yield EncodingConfig(
             mirror=mirror,
             resizer=resizer,

@@ -30,9 +30,7 @@ from pipeline.locate.calibration_data import LabelledImages, make_examples
 from pipeline.locate.gallery_map import read_gallery_map
 from pipeline.locate.reliability import reliability_diagram
 from pipeline.locate.settings import CalibrationCriteria
-from pipeline.shards.external import open_manifest
-from pipeline.shards.manifest import require_tars
-from pipeline.shards.samples import read_shard
+from pipeline.shards.shard_set import open_or_scan
 
 ENCODE_BATCH = 256
 "Images that are encoded at a time."
@@ -102,21 +100,22 @@ def embed_view(
 
     Shards are in the order of hashes, so the first ones are a fair sample.
     """
-    shards = open_manifest(settings.shards, settings.split, view).of(settings.split, view)
-    require_tars(settings.shards, shards)
+    shards = open_or_scan(settings.shards, settings.split, view)
+    wanted = shards.manifest.of(settings.split, view)
+    shards.require_tars(wanted)
     samples = (
         sample
-        for shard in shards
-        for sample in read_shard(settings.shards, shard.name, shard.split, shard.view)
-        if sample.facts["location"] not in trained_on
+        for shard in wanted
+        for sample in shards.samples(shard)
+        if sample.metadata["location"] not in trained_on
     )
     records, blocks = [], [np.empty((0, encoder.dimension), np.float32)]
     with progress(None, f"{view} images", "images") as meter:
-        wanted = islice(samples, limit)
-        while batch := list(islice(wanted, ENCODE_BATCH)):
+        chosen = islice(samples, limit)
+        while batch := list(islice(chosen, ENCODE_BATCH)):
             block_BD, rejections = encoder.encode([sample.data for sample in batch])
             pairs = zip(batch, rejections, strict=True)
-            records += [sample.facts for sample, rejection in pairs if rejection is None]
+            records += [sample.metadata for sample, rejection in pairs if rejection is None]
             blocks.append(block_BD)
             meter.advance(len(batch))
     return LabelledImages(records=records, embeddings_QD=np.concatenate(blocks))

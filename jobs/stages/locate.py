@@ -8,7 +8,6 @@ with the reason, the others are answered, and the exit code is 1.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -32,9 +31,7 @@ from pipeline.locate.locate import Answer, locate_embeddings
 from pipeline.locate.page import LatLon, PageContext, render_page
 from pipeline.locate.photo_files import find_photos, parse_time, read_times
 from pipeline.locate.track import TRACK_CANDIDATES, TrackStart
-from pipeline.shards.manifest import read_manifest
-from pipeline.shards.record_table import footprints
-from pipeline.shards.samples import fetch
+from pipeline.shards.shard_set import open_shards
 
 
 def locate_photos(
@@ -194,8 +191,9 @@ def make_page(located: Sequence[LocatedPhoto], context: PageContext, shards: str
 
     if shards is None:
         return render_page(located, context, load_photos, no_images)
-    context = replace(context, footprints=partial(footprints, shards, read_manifest(shards)))
-    return render_page(located, context, load_photos, partial(fetch, shards))
+    opened = open_shards(shards)
+    context = replace(context, footprints=opened.footprints)
+    return render_page(located, context, load_photos, opened.fetch)
 
 
 def locate(settings: LocateSettings) -> None:

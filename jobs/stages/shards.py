@@ -3,13 +3,11 @@
 from dataclasses import fields
 
 from jobs.stages.settings import MakeShardsSettings
-from pipeline.core import storage
 from pipeline.core.errors import Incomplete, require
 from pipeline.core.progress import console
-from pipeline.shards import record_table
-from pipeline.shards.manifest import read_manifest
 from pipeline.shards.pack import pack
 from pipeline.shards.settings import PackingSettings
+from pipeline.shards.shard_set import open_shards
 from pipeline.shards.verify import verify
 from pipeline.sources.base import Source
 
@@ -23,7 +21,8 @@ def pack_source(source: Source, settings: MakeShardsSettings) -> None:
 
 def verify_shards(out: str) -> None:
     """Check every tar, count and hash of a finished set. Raises Incomplete where it is damaged."""
-    count, wrong = verify(out)
+    shards = open_shards(out)
+    wrong = verify(shards)
     for sentence in wrong:
         console.print(sentence)
     if wrong:
@@ -31,14 +30,14 @@ def verify_shards(out: str) -> None:
             f"{out} is damaged in {len(wrong)} places; run the command that packed it again: it "
             "repairs the shards that are named, and no others"
         )
-    console.print(f"{out}: all {count} shards are what was packed")
+    console.print(f"{out}: all {len(shards.manifest.shards)} shards are what was packed")
 
 
 def export_records(out: str, path: str) -> None:
     """Write the record table of a finished set: .parquet, or .geojson with a point for each image
     whose position is known.
     """
-    written, without = record_table.export(storage.absolute(out), read_manifest(out), path)
+    written, without = open_shards(out).export(path)
     console.print(
         f"{path}: {written} images"
         + (f", {without} without a position left out" if without else "")

@@ -22,7 +22,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.lock import locks_output
 from pipeline.core.progress import console, progress
 from pipeline.core.records import Split
-from pipeline.shards.manifest import read_manifest, require_tars
+from pipeline.shards.shard_set import open_shards
 from pipeline.shards.verify import require_intact
 
 
@@ -72,10 +72,11 @@ def check_input(settings: TrainSettings, run: RunConfig, resumes: bool) -> int:
             encoder = FeatureEncoder(run.recipe.network)
     except ValueError as error:  # a width or an image size that this backbone cannot have
         raise InputError(str(error)) from None
+    shards = open_shards(run.shards)
     if settings.verify:
-        require_intact(run.shards, None if settings.workers else 0)
+        require_intact(shards, None if settings.workers else 0)
     else:
-        require_tars(run.shards, read_manifest(run.shards).of(Split.TRAIN))
+        shards.require_tars(shards.manifest.of(Split.TRAIN))
     steps = open_stream(run, WorkerContext(world_size=max(1, settings.workers))).steps
     if run.weights is not None and not resumes:
         load_backbone(encoder.backbone, read_state_dict(run.weights), run.weights)

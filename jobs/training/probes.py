@@ -24,7 +24,6 @@ from pipeline.core.records import Split, View
 from pipeline.features.table import Floats
 from pipeline.retrieval.metrics import summarise
 from pipeline.retrieval.ranking import EmbeddingSet, embedding_set_from_array, rank
-from pipeline.shards.samples import read_shard
 
 GAP_IMAGES = 256
 "Of each view, for the view gap; half of them fit the probe, the other half is asked."
@@ -77,13 +76,13 @@ def embed_view(encoder: FeatureEncoder, stream: TrainingStream, view: View) -> P
             maps_BCHW, g_BPD = encoder(
                 torch.from_numpy(stack([image for _, image in whole])).to(device)
             )
-            locations += [sample.facts["location"] for sample, _ in whole]
+            locations += [sample.metadata["location"] for sample, _ in whole]
             pooled.append(maps_BCHW.mean((2, 3)).float().cpu().numpy())
             embeddings.append(unit_embedding(g_BPD.float()).cpu().numpy())
     encoder.train(was_training)
     if not locations:
         raise InputError(
-            f"not one {view} image of {stream.shards} that the probes look at can be decoded, expected some; pack again"
+            f"not one {view} image of {stream.shards.path} that the probes look at can be decoded, expected some; pack again"
         )
     return ProbeFeatures(
         locations=locations,
@@ -94,18 +93,18 @@ def embed_view(encoder: FeatureEncoder, stream: TrainingStream, view: View) -> P
 
 def probe_images(stream: TrainingStream, view: View) -> Iterator[Decoded]:
     """The images that are looked at, as they are when tested: resized and nothing else."""
-    reading, held_out = stream.reading, stream.held_out
+    config, held_out = stream.config, stream.held_out
     samples = (
         s
-        for shard in stream.manifest.of(Split.TRAIN, view)
-        for s in read_shard(stream.shards, shard.name)
+        for shard in stream.shards.manifest.of(Split.TRAIN, view)
+        for s in stream.shards.samples(shard)
     )
     chosen = (
-        (s for s in samples if s.facts["location"] in held_out)
+        (s for s in samples if s.metadata["location"] in held_out)
         if held_out
         else islice(samples, GAP_IMAGES)
     )
-    return decode_samples(chosen, reading.image_size, reading.threads, 2 * BATCH, reading.resizer)
+    return decode_samples(chosen, config.image_size, config.threads, 2 * BATCH, config.resizer)
 
 
 def embedding_set(seen: ProbeFeatures) -> EmbeddingSet:

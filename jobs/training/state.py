@@ -21,6 +21,7 @@ from model.weights.load import load_backbone, read_state_dict
 from pipeline.batches.training import StreamConfig, TrainingStream
 from pipeline.core import storage
 from pipeline.core.errors import Incomplete
+from pipeline.shards.shard_set import open_shards
 
 Report = Callable[[dict[str, Any]], None]
 """Takes a worker's messages: `steps` taken since the last one with figures to show, or a `note`."""
@@ -124,7 +125,7 @@ def open_stream(run: RunConfig, context: WorkerContext) -> TrainingStream:
         threads=max(1, torch.get_num_threads()),
         hold_out=recipe.hold_out,
     )
-    return TrainingStream(run.shards, config, context.rank, context.world_size)
+    return TrainingStream(open_shards(run.shards), config, context.rank, context.world_size)
 
 
 def build_training(run: RunConfig, context: WorkerContext, locations: int) -> Training:

@@ -1,4 +1,7 @@
-"""TODO pipeline.batches.ordered."""
+"""Samples -> decoded images in their order, for embedding and for looking at them.
+
+In: samples. Out: each with its pixels, or with the reason why it has none.
+"""
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,7 +15,7 @@ from pipeline.images.transforms import Resizer, resize
 from pipeline.shards.samples import Sample
 
 Decoded = tuple[Sample, Pixels | DecodeError]
-"A sample and its pixels, or why there are none."
+"A sample and its pixels, or the reason why it has none."
 CHANGED = "changed since it was packed"
 
 
@@ -20,14 +23,14 @@ def check_unchanged(sample: Sample) -> None:
     """Raise DecodeError where an image is not the one that was packed: 25 us, where decoding takes
     a millisecond or more.
     """
-    said = sample.facts.get("sha256")
-    if said is not None and hashlib.sha256(sample.data).hexdigest() != said:
+    packed = sample.metadata.get("sha256")
+    if packed is not None and hashlib.sha256(sample.data).hexdigest() != packed:
         raise DecodeError(CHANGED, "other bytes than were packed")
 
 
 def stack(images_HW3: Sequence[Pixels]) -> npt.NDArray[np.uint8]:
-    """Images of one size as (B, 3, H, W), channels last in memory, which is how the network wants
-    them.
+    """Images of one size as (B, 3, H, W), channels last in memory, the layout that the network is
+    fastest with.
     """
     return np.stack(images_HW3).transpose(0, 3, 1, 2)
 
@@ -35,8 +38,8 @@ def stack(images_HW3: Sequence[Pixels]) -> npt.NDArray[np.uint8]:
 def decode_samples(
     samples: Iterable[Sample], image_size: int, threads: int, depth: int, resizer: Resizer = "torch"
 ) -> Iterator[Decoded]:
-    """The samples' images in order, decoded and resized by threads; what cannot be decoded comes as
-    its error.
+    """The samples' images in order, decoded and resized by threads that prefetch `depth` of them;
+    an image that cannot be decoded is returned as its error.
     """
     return prefetch_map(
         lambda sample: decode_sample(sample, image_size, resizer), samples, threads, depth
@@ -54,11 +57,11 @@ def decode_sample(sample: Sample, image_size: int, resizer: Resizer = "torch") -
 
 def split_failed(images: Iterable[Decoded]) -> tuple[list[tuple[Sample, Pixels]], list[str]]:
     """The images that could be decoded, and the keys of the others."""
-    whole: list[tuple[Sample, Pixels]] = []
+    intact: list[tuple[Sample, Pixels]] = []
     damaged: list[str] = []
     for sample, image in images:
         if isinstance(image, DecodeError):
             damaged.append(sample.key)
         else:
-            whole.append((sample, image))
-    return whole, damaged
+            intact.append((sample, image))
+    return intact, damaged

@@ -1,4 +1,7 @@
-"""TODO pipeline.batches.sampler."""
+"""Which samples a rank reads in an epoch: spans of shards, planned from random numbers alone.
+
+In: the shards of a view with their counts. Out: spans, and their samples. The planner does no I/O.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -6,15 +9,17 @@ from itertools import islice
 
 import numpy as np
 
+from pipeline.core.errors import InputError
 from pipeline.shards.manifest import Shard
-from pipeline.shards.samples import Sample, read_shard
+from pipeline.shards.samples import Sample
+from pipeline.shards.shard_set import ShardSet
 
 
 @dataclass(frozen=True, kw_only=True)
 class Span:
     """A run of samples within one shard."""
 
-    name: str
+    shard: Shard
     start: int
     stop: int
 
@@ -25,9 +30,9 @@ def plan_pass(
     """The spans that `rank` of `world` reads so that all ranks together see `world * wanted`
     samples of these shards.
 
-    The shards in random order form a ring, entered at a random sample: which samples fall off at
+    The shards in random order form a ring, entered at a random sample: which samples are dropped at
     the end differs from pass to pass, and no two ranks see the same one while the ring is long
-    enough. A shorter ring is gone round again.
+    enough. A shorter ring is read more than once.
     """
     order = [shards[number] for number in rng.permutation(len(shards))]
     total = sum(shard.samples for shard in order)
@@ -40,7 +45,7 @@ def plan_pass(
         for shard in order:
             if inside < shard.samples:
                 take = min(wanted, shard.samples - inside)
-                spans.append(Span(name=shard.name, start=inside, stop=inside + take))
+                spans.append(Span(shard=shard, start=inside, stop=inside + take))
                 break
             inside -= shard.samples
         position, wanted = (position + take) % total, wanted - take
@@ -48,27 +53,25 @@ def plan_pass(
 
 
 def read_spans(
-    shards: str, spans: Iterable[Span], left_out: frozenset[str] = frozenset()
+    shards: ShardSet, left_out: frozenset[str], spans: Iterable[Span]
 ) -> Iterator[Sample]:
-    """The spans' samples; those of the locations that are left out do not count as there."""
+    """The spans' samples; samples of the locations that are left out are not counted.
+
+    Raises InputError where a shard has fewer samples than the manifest says, which would otherwise
+    end one view's batches before the other's.
+    """
     for span in spans:
         samples = (
             sample
-            for sample in read_shard(shards, span.name)
-            if sample.facts["location"] not in left_out
+            for sample in shards.samples(span.shard)
+            if sample.metadata["location"] not in left_out
         )
-        yield from islice(samples, span.start, span.stop)
-
-
-def shuffled(samples: Iterable[Sample], buffer: int, rng: np.random.Generator) -> Iterator[Sample]:
-    """Samples in random order as far as `buffer` encoded images allow."""
-    held: list[Sample] = []
-    for sample in samples:
-        if len(held) < buffer:
-            held.append(sample)
-            continue
-        chosen = int(rng.integers(buffer))
-        yield held[chosen]
-        held[chosen] = sample
-    for chosen in rng.permutation(len(held)):
-        yield held[chosen]
+        read = 0
+        for sample in islice(samples, span.start, span.stop):
+            yield sample
+            read += 1
+        if read < span.stop - span.start:
+            raise InputError(
+                f"{shards.tar(span.shard)} ends before sample {span.stop}, expected the "
+                f"{span.shard.samples} samples of the manifest; {shards.repair_hint}"
+            )

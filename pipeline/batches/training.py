@@ -1,28 +1,29 @@
-"""Shards -> batches: shuffled pairs of views for training, in order for embedding, by key for
-pictures.
+"""Shards -> shuffled pairs of batches for training, by a webdataset pipeline.
 
-In: a set of shards. Out: batches of images as bytes (B, 3, H, W) with their labels. What is seen
-when is a pure function of the seed, the epoch and the rank, so a run that is continued sees what it
-would have seen.
+In: a ShardSet. Out: batches of images as bytes (B, 3, H, W) with their labels. Which images come when
+is a pure function of the seed, the epoch and the rank, so a resumed run sees the same images.
 """
 
-from collections.abc import Iterator
+import random
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from itertools import islice
+from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import webdataset as wds
 
 from pipeline.batches.holdout import exclude_locations, holdout_locations
 from pipeline.batches.ordered import Decoded, check_unchanged, split_failed, stack
-from pipeline.batches.sampler import plan_pass, read_spans, shuffled
+from pipeline.batches.sampler import Span, plan_pass, read_spans
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import Split, View, key_matches
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.transforms import Augmentation, Resizer, augment
-from pipeline.shards.manifest import Manifest, read_manifest, repair_hint
 from pipeline.shards.samples import Sample
+from pipeline.shards.shard_set import ShardSet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,12 +32,11 @@ class Batch:
 
     images_B3HW: npt.NDArray[np.uint8]
     location_B: npt.NDArray[np.int64]
-    "Class numbers, as the manifest's classes are in order."
+    "Class numbers, in the order of the manifest's classes."
     view: View
     keys: tuple[str, ...]
     damaged: tuple[str, ...] = ()
-    """Keys of images that could not be decoded; the first image of the batch that could stands in
-    their places."""
+    """Keys of images that could not be decoded; the batch's first image that could replaces them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,17 +46,17 @@ class StreamConfig:
     batch_size: int = 8
     "Images of each view per step and worker [LPN lineage: 8]."
     image_size: int = 256
-    "Side in pixels that the network is given."
+    "Side in pixels of the network's input."
     resizer: Resizer = "torch"
-    "Whose bicubic brings images to that size."
+    "Whose bicubic resizes images to it."
     augmentation: Augmentation = field(default_factory=Augmentation)
     seed: int = 0
     shuffle_buffer: int = 4096
-    "Encoded images held for shuffling; those of University-1652 take some 40 kB each."
+    "Encoded images buffered for shuffling; those of University-1652 take some 40 kB each."
     threads: int = 2
-    "That decode and augment ahead of the network."
+    "Threads that decode and augment ahead of the network."
     hold_out: float = 0.0
-    "Share of the locations that is left out: `holdout_locations` of the stream."
+    "Share of the locations that is left out: `held_out` of the stream."
 
 
 class TrainingStream:
@@ -68,95 +68,127 @@ class TrainingStream:
     Raises InputError when the set cannot be trained on.
     """
 
-    def __init__(self, shards: str, reading: StreamConfig, rank: int = 0, world: int = 1) -> None:
-        self.shards, self.reading, self.rank, self.world = shards, reading, rank, world
-        self.manifest: Manifest = read_manifest(shards)
-        self.held_out = holdout_locations(self.manifest.classes, reading.hold_out)
-        kept = [location for location in self.manifest.classes if location not in self.held_out]
+    def __init__(
+        self, shards: ShardSet, config: StreamConfig, rank: int = 0, world: int = 1
+    ) -> None:
+        self.shards, self.config, self.rank, self.world = shards, config, rank, world
+        classes = shards.manifest.classes
+        self.held_out = holdout_locations(classes, config.hold_out)
+        kept = [location for location in classes if location not in self.held_out]
         self.classes = {location: number for number, location in enumerate(kept)}
         self._shards = {
-            view: exclude_locations(shards, self.manifest.of(Split.TRAIN, view), self.held_out)
+            view: exclude_locations(shards, shards.manifest.of(Split.TRAIN, view), self.held_out)
             for view in (View.DRONE, View.SATELLITE)
         }
         counts = {
             view: sum(shard.samples for shard in found) for view, found in self._shards.items()
         }
-        together = reading.batch_size * world
+        together = config.batch_size * world
         self.steps = counts[View.SATELLITE] // together
         "Steps of an epoch, the same for every rank."
         if self.steps == 0 or counts[View.DRONE] == 0:
             raise InputError(
-                f"{shards} has {counts[View.SATELLITE]} satellite and {counts[View.DRONE]} UAV training images; expected at "
-                f"least one batch of {together} satellite images and some of the UAV; pack more, or train with a smaller batch"
+                f"{shards.path} has {counts[View.SATELLITE]} satellite and {counts[View.DRONE]} "
+                f"UAV training images; expected at least one batch of {together} satellite images "
+                "and some of the UAV; pack more, or train with a smaller batch"
             )
 
     def epoch(self, epoch: int, skip: int = 0) -> Iterator[tuple[Batch, Batch]]:
         """The (UAV, satellite) batches of one epoch, a pure function of seed, epoch, rank and
         world.
 
-        The first `skip` batches are left out, without decoding them; those that follow are what
-        they always are.
+        The first `skip` batches are skipped without decoding them; the others are those of a full
+        epoch.
         """
         return zip(
-            self._view(View.DRONE, epoch, skip),
-            self._view(View.SATELLITE, epoch, skip),
+            self.pipeline(View.DRONE, epoch, skip),
+            self.pipeline(View.SATELLITE, epoch, skip),
             strict=True,
         )
 
-    def _view(self, view: View, epoch: int, skip: int) -> Iterator[Batch]:
-        reading, wanted = self.reading, self.steps * self.reading.batch_size
-        number = list(View).index(view)
-        # The plan is every rank's alike; the order within a rank is its own.
-        plan_rng = np.random.default_rng([reading.seed, epoch, number])
-        spans = plan_pass(self._shards[view], wanted, self.rank, self.world, plan_rng)
-        order_rng = np.random.default_rng([reading.seed, epoch, number, self.rank])
-        samples = shuffled(
-            read_spans(self.shards, spans, self.held_out), reading.shuffle_buffer, order_rng
+    def pipeline(self, view: View, epoch: int, skip: int = 0) -> Any:
+        """The batches of one view and epoch: a `webdataset.DataPipeline` of `Batch`, to iterate
+        over or to extend with `compose`.
+        """
+        batched = wds.batched(
+            self.config.batch_size, collation_fn=partial(self._collate, view), partial=False
+        )
+        return self.sample_pipeline(view, epoch, skip).compose(
+            partial(self._decode, view, epoch), batched
         )
 
+    def sample_pipeline(self, view: View, epoch: int, skip: int = 0) -> Any:
+        """The encoded samples of one view and epoch in their order, each with its number in the
+        epoch: a `webdataset.DataPipeline` of (int, Sample), to compose with stages of your own.
+
+        The samples of the first `skip` batches are read and dropped.
+        """
+        config = self.config
+        rng = random.Random(repr((config.seed, epoch, view.value, self.rank)))
+        return wds.DataPipeline(
+            partial(self.plan, view, epoch),
+            partial(read_spans, self.shards, self.held_out),
+            wds.shuffle(config.shuffle_buffer, initial=config.shuffle_buffer, rng=rng),
+            enumerate,
+            wds.slice(skip * config.batch_size, None),
+        )
+
+    def plan(self, view: View, epoch: int) -> Iterator[Span]:
+        """The spans of one view and epoch that this rank reads."""
+        # The plan is the same on every rank; the order within a rank is its own.
+        rng = np.random.default_rng([self.config.seed, epoch, list(View).index(view)])
+        wanted = self.steps * self.config.batch_size
+        yield from plan_pass(self._shards[view], wanted, self.rank, self.world, rng)
+
+    def _decode(
+        self, view: View, epoch: int, numbered: Iterable[tuple[int, Sample]]
+    ) -> Iterator[Decoded]:
+        """The samples' images, decoded and augmented by threads, in order."""
+        config, view_number = self.config, list(View).index(view)
+
         def prepare(numbered: tuple[int, Sample]) -> Decoded:
-            position, sample = numbered
-            # A generator for each image: what becomes of it does not depend on which thread had it.
-            rng = np.random.default_rng([reading.seed, epoch, number, self.rank, position])
+            number, sample = numbered
+            # A generator for each image, so that its augmentation does not depend on the thread.
+            rng = np.random.default_rng([config.seed, epoch, view_number, self.rank, number])
             try:
                 check_unchanged(sample)
                 image_HW3 = decode(sample.data)
             except DecodeError as error:
                 return sample, error
             return sample, augment(
-                image_HW3, view, reading.image_size, reading.augmentation, rng, reading.resizer
+                image_HW3, view, config.image_size, config.augmentation, rng, config.resizer
             )
 
-        numbered = islice(enumerate(samples), skip * reading.batch_size, None)
-        prepared = prefetch_map(prepare, numbered, reading.threads, 4 * reading.batch_size)
-        while group := list(islice(prepared, reading.batch_size)):
-            whole, damaged = split_failed(group)
-            if not whole:
-                raise InputError(
-                    f"not one of {len(group)} {view} images of a batch from {self.shards} can be decoded ({damaged[0]} and "
-                    "on), expected at least one; pack these shards again"
-                )
-            # A batch keeps its size, and what stands in is a function of the data alone.
-            chosen = [
-                (sample, image) if not isinstance(image, DecodeError) else whole[0]
-                for sample, image in group
-            ]
-            yield Batch(
-                images_B3HW=stack([image for _, image in chosen]),
-                location_B=np.asarray(
-                    [self._class(sample, view) for sample, _ in chosen], np.int64
-                ),
-                view=view,
-                keys=tuple(sample.key for sample, _ in chosen),
-                damaged=tuple(damaged),
+        return prefetch_map(prepare, numbered, config.threads, 4 * config.batch_size)
+
+    def _collate(self, view: View, group: list[Decoded]) -> Batch:
+        """One batch. Raises InputError where none of its images can be decoded."""
+        intact, damaged = split_failed(group)
+        if not intact:
+            raise InputError(
+                f"not one of {len(group)} {view} images of a batch from {self.shards.path} can be "
+                f"decoded ({damaged[0]} and on), expected at least one; pack these shards again"
             )
+        # A batch keeps its size, and the replacement is a function of the data alone.
+        chosen = [
+            (sample, image) if not isinstance(image, DecodeError) else intact[0]
+            for sample, image in group
+        ]
+        return Batch(
+            images_B3HW=stack([image for _, image in chosen]),
+            location_B=np.asarray([self._class(sample, view) for sample, _ in chosen], np.int64),
+            view=view,
+            keys=tuple(sample.key for sample, _ in chosen),
+            damaged=tuple(damaged),
+        )
 
     def _class(self, sample: Sample, view: View) -> int:
-        """An image's label. The key says it too, and the tar's headers have checksums."""
-        location = sample.facts["location"]
+        """An image's class number. The key states the location too; the two are compared."""
+        location = sample.metadata["location"]
         if location not in self.classes or not key_matches(sample.key, Split.TRAIN, view, location):
             raise InputError(
-                f"image {sample.key} of {self.shards} is of location {location!r}, expected the one of its key and of "
-                f"the manifest's {len(self.classes)}; {repair_hint(self.shards)}"
+                f"image {sample.key} of {self.shards.path} is of location {location!r}, expected "
+                f"the one of its key and of the manifest's {len(self.classes)}; "
+                f"{self.shards.repair_hint}"
             )
         return self.classes[location]

@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 from pipeline.core.errors import InputError
 from pipeline.retrieval.bootstrap import metrics_with_intervals
 from pipeline.shards import record_table
-from pipeline.shards.manifest import read_manifest
+from pipeline.shards.shard_set import ShardSet
 
 SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
 MAX_VALUES = 12  # a number with more values than a table shows well is binned
@@ -25,7 +25,7 @@ MAX_BINS = 6
 UNKNOWN = "unknown"
 
 
-def read_column(shards: str, column: str) -> dict[str, Any]:
+def read_column(shards: ShardSet, column: str) -> dict[str, Any]:
     """What the records say of each key under one column.
 
     Raises InputError when there is no such column.
@@ -35,11 +35,7 @@ def read_column(shards: str, column: str) -> dict[str, Any]:
         raise InputError(
             f"--by is {column}, expected a column of the shards' records: {', '.join(usable)}"
         )
-    known: dict[str, Any] = {}
-    for shard in read_manifest(shards).shards:
-        table = record_table.read_part(shards, shard.name, ["key", column])
-        known.update(zip(table["key"].to_pylist(), table[column].to_pylist(), strict=True))
-    return known
+    return shards.column(column)
 
 
 def break_down(results: pa.Table, column: str, known: dict[str, Any]) -> list[dict[str, Any]]:

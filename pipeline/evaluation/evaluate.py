@@ -47,8 +47,7 @@ from pipeline.retrieval.tasks import (
     possible_tasks,
     retrieve,
 )
-from pipeline.shards.manifest import read_manifest
-from pipeline.shards.samples import fetch
+from pipeline.shards.shard_set import ShardSet, open_shards
 from pipeline.shards.verify import require_intact
 
 OUTPUT_SETTINGS = (
@@ -78,12 +77,10 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
         "fingerprint": queries.fingerprint, "queries": queries.digest, "gallery": gallery.digest,
         "protocol": settings.protocol, "tasks": [str(task) for task in tasks],
     }  # fmt: skip
-    if settings.shards:
-        if settings.verify:
-            require_intact(settings.shards)
-        read_manifest(
-            settings.shards
-        )  # that there are none is better said before the ranking than after it
+    # Opened before the ranking, so that a wrong folder is refused before hours of work.
+    shards = open_shards(settings.shards) if settings.shards else None
+    if shards is not None and settings.verify:
+        require_intact(shards)
     extras = read_report_context(settings.title, settings.run, settings.beside)
     shown = {name: _as_json(getattr(settings, name)) for name in OUTPUT_SETTINGS} | {
         "extras": extras.sha256
@@ -113,14 +110,15 @@ def evaluate(settings: EvaluationSettings) -> list[dict[str, Any]]:
         json_files.write_checksummed(
             storage.join(settings.out, INPUTS_FILE), {"ranked": ranked, "shown": {}}
         )
-        _write_besides(settings, queries, gallery, tasks, results)
-        _write_report(settings, queries, gallery, read_evaluation(settings.out), extras)
+        _write_besides(settings, shards, queries, gallery, tasks, results)
+        _write_report(settings, shards, queries, gallery, read_evaluation(settings.out), extras)
         write_inputs(settings.out, {"ranked": ranked, "shown": shown})
         console.print(
             f"{settings.out}: ranked before; wrote report.html and what goes with it anew"
         )
     else:
-        _evaluate(settings, queries, gallery, tasks, {"ranked": ranked, "shown": shown}, extras)
+        inputs = {"ranked": ranked, "shown": shown}
+        _evaluate(settings, shards, queries, gallery, tasks, inputs, extras)
     return read_result_rows(settings.out, METRICS_FILE)
 
 
@@ -162,8 +160,8 @@ def plan_tasks(settings: EvaluationSettings) -> tuple[FeatureTable, FeatureTable
 
 
 def _evaluate(
-    settings: EvaluationSettings, queries: FeatureTable, gallery: FeatureTable, tasks: list[Task],
-    inputs: dict[str, Any], extras: ReportContext,
+    settings: EvaluationSettings, shards: ShardSet | None, queries: FeatureTable,
+    gallery: FeatureTable, tasks: list[Task], inputs: dict[str, Any], extras: ReportContext,
 ) -> None:  # fmt: skip
     begin = time.monotonic()
     if storage.exists(storage.join(settings.out, INPUTS_FILE)):
@@ -193,13 +191,13 @@ def _evaluate(
     ):
         parquet.write_table(storage.join(settings.out, name), table)
     started = time.monotonic()
-    _write_besides(settings, queries, gallery, tasks, results)
+    _write_besides(settings, shards, queries, gallery, tasks, results)
     spent["views, groups and exports"] = time.monotonic() - started
     started = time.monotonic()
     findings = EvaluationResults(
         name=settings.title, metrics=rows, results=results, **read_extras(settings.out)
     )
-    _write_report(settings, queries, gallery, findings, extras)
+    _write_report(settings, shards, queries, gallery, findings, extras)
     spent["report"] = time.monotonic() - started
     metrics = storage.encode_json(rows)
     write_inputs(settings.out, inputs, metrics)
@@ -212,6 +210,7 @@ def _evaluate(
 
 def _write_besides(
     settings: EvaluationSettings,
+    shards: ShardSet | None,
     queries: FeatureTable,
     gallery: FeatureTable,
     tasks: list[Task],
@@ -226,7 +225,7 @@ def _write_besides(
             parts=settings.parts,
             by=settings.by,
             exports=settings.exports,
-            shards=settings.shards,
+            shards=shards,
             answer_order=settings.answer_order,
         ),
         queries,
@@ -238,13 +237,12 @@ def _write_besides(
 
 def _write_report(
     settings: EvaluationSettings,
+    shards: ShardSet | None,
     queries: FeatureTable,
     gallery: FeatureTable,
     findings: EvaluationResults,
     extras: ReportContext,
 ) -> None:
-    shards = settings.shards
-
     def vectors(keys: Iterable[str]) -> dict[str, Floats]:
         wanted = set(keys)
         sides = (
@@ -257,7 +255,7 @@ def _write_report(
             for key, vector_D in vectors_by_key(side, wanted).items()
         }
 
-    pictures = (lambda keys: fetch(shards, keys)) if shards else no_images
+    pictures = no_images if shards is None else shards.fetch
     page = render_report(findings, extras, pictures, vectors, settings.panels)
     storage.write_bytes(storage.join(settings.out, "report.html"), page.encode())
     if settings.figures:

@@ -18,20 +18,14 @@ from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.features.table import FeatureTable
-from pipeline.shards import record_table
-from pipeline.shards.manifest import read_manifest
+from pipeline.shards.shard_set import ShardSet
 
 MAX_MAT_BYTES = 2**32 - 1  # bytes of one array in a MATLAB 5 file
 
 
-def source_file_names(shards: str) -> dict[str, str]:
+def source_file_names(shards: ShardSet) -> dict[str, str]:
     """The name of the file that each key was made from, without its folder."""
-    names: dict[str, str] = {}
-    for shard in read_manifest(shards).shards:
-        table = record_table.read_part(shards, shard.name, ["key", "path"])
-        paths = (path.rsplit("/", 1)[-1] for path in table["path"].to_pylist())
-        names.update(zip(table["key"].to_pylist(), paths, strict=True))
-    return names
+    return {key: path.rsplit("/", 1)[-1] for key, path in shards.column("path").items()}
 
 
 def answer_text(

@@ -27,6 +27,7 @@ from pipeline.retrieval.results import GAP_FILE, GROUPS_FILE, PARTS_FILE, VIEWS_
 from pipeline.retrieval.subsets import take_rows
 from pipeline.retrieval.tasks import Task, task_embedding_sets
 from pipeline.retrieval.views import measure_views
+from pipeline.shards.shard_set import ShardSet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +41,7 @@ class ExtraOutputs:
     parts: bool
     by: tuple[str, ...]
     exports: tuple[ExportFormat, ...]
-    shards: str | None
+    shards: ShardSet | None
     answer_order: str | None
 
 

@@ -40,8 +40,8 @@ from pipeline.features.part import (
     write_rejected,
 )
 from pipeline.features.settings import EmbeddingSettings
-from pipeline.shards.external import open_manifest
-from pipeline.shards.manifest import MANIFEST, Manifest, Shard, missing_tars, repair_hint
+from pipeline.shards.manifest import Shard
+from pipeline.shards.shard_set import ShardSet, open_or_scan
 from pipeline.shards.verify import require_intact
 
 __all__ = ["EmbeddingSettings", "Encoder", "EncoderSpec", "IncompleteEmbedding", "embed_gallery"]
@@ -60,15 +60,16 @@ def embed_gallery(settings: EmbeddingSettings, network: EncoderSpec) -> int:
     `settings` must name paths that a worker can open (absolute, or URIs). Raises InputError on unusable input, Incomplete
     where shards are unreadable or kill their workers, the others being done.
     """
-    if settings.verify and storage.exists(storage.join(settings.shards, MANIFEST)):
-        require_intact(settings.shards)
-    wanted = requested_shards(settings)
+    shards = open_or_scan(settings.shards, settings.split, settings.view)
+    if settings.verify and not shards.external:
+        require_intact(shards)
+    wanted = requested_shards(settings, shards)
     missing = pending_shards(settings, network, wanted)
     expected_parts.add_expected(settings.out, [f"{shard.name}.parquet" for shard in wanted])
-    absent = missing_tars(settings.shards, missing)  # said now, and not when their turn comes
-    asked = repair_hint(settings.shards)
+    absent = shards.missing_tars(missing)  # said now, and not when their turn comes
     lost = {
-        name: Skipped(reason="unusable", found=f"{said}; {asked}") for name, said in absent.items()
+        name: Skipped(reason="unusable", found=f"{said}; {shards.repair_hint}")
+        for name, said in absent.items()
     }
     embedded = 0
     for name, aside in lost.items():
@@ -78,7 +79,7 @@ def embed_gallery(settings: EmbeddingSettings, network: EncoderSpec) -> int:
         nodes = cluster.nodes()
         given = (settings.workers, settings.cpus_per_worker, settings.gpus_per_worker)
         placement = plan_placement(nodes, len(todo), *given)
-        crew = ActorPool(pool_config(settings, network, placement, nodes))
+        crew = ActorPool(pool_config(settings, shards, network, placement, nodes))
         embedded, given_up = run_pool(settings, crew, todo, placement)
         lost |= given_up
     expected_parts.remove_expected(settings.out, [f"{name}.parquet" for name in lost])
@@ -115,12 +116,12 @@ def embed_gallery(settings: EmbeddingSettings, network: EncoderSpec) -> int:
     return embedded
 
 
-def requested_shards(settings: EmbeddingSettings) -> list[Shard]:
+def requested_shards(settings: EmbeddingSettings, shards: ShardSet) -> list[Shard]:
     """The shards that were asked for.
 
     Raises InputError when there are none.
     """
-    manifest: Manifest = open_manifest(settings.shards, settings.split, settings.view)
+    manifest = shards.manifest
     wanted = [shard for shard in manifest.of(settings.split, settings.view) if shard.samples]
     if not wanted:
         held = (
@@ -178,12 +179,16 @@ def check_same_encoder(
 
 
 def pool_config(
-    settings: EmbeddingSettings, network: EncoderSpec, placement: Placement, nodes: Sequence[Node]
+    settings: EmbeddingSettings,
+    shards: ShardSet,
+    network: EncoderSpec,
+    placement: Placement,
+    nodes: Sequence[Node],
 ) -> PoolConfig:
     """How the crew works: what an actor is, and which failures are whose."""
     cpus, gpus = placement.cpus, placement.gpus
     assignment = EmbedJob(
-        shards=settings.shards,
+        shards=shards.for_workers(),
         out=settings.out,
         batch_size=settings.batch_size,
         dtype=settings.dtype,

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from queue import SimpleQueue
 
@@ -30,7 +31,8 @@ from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.images.decode import DecodeError, Pixels
 from pipeline.images.transforms import Resizer
 from pipeline.shards.manifest import Shard
-from pipeline.shards.samples import Sample, read_shard
+from pipeline.shards.samples import Sample
+from pipeline.shards.shard_set import ShardSet
 
 Encoder = Callable[[npt.NDArray[np.uint8]], Floats]
 """Images as bytes (B, 3, H, W) -> unit vectors (B, D), float32. Made and called by one thread. What
@@ -64,7 +66,7 @@ class EncoderSpec:
 class EmbedJob:
     """What the work on every shard has in common."""
 
-    shards: str
+    shards: ShardSet
     out: str
     batch_size: int
     dtype: str
@@ -146,33 +148,28 @@ class ShardEmbedder:
             self._readers.put(reader)
 
     def _tar(self, shard: Shard) -> str:
-        return storage.join(self._given.shards, f"{shard.name}.tar")
+        return self._given.shards.tar(shard)
 
     def _batches(
         self, shard: Shard, kept: list[Sample], rejected: list[Rejection], seconds: Seconds
     ) -> Iterator[npt.NDArray[np.uint8]]:
-        """Images (B, 3, H, W) of a shard: all batches but the last are full, whatever had to be
-        left out.
+        """Images (B, 3, H, W) of a shard by a webdataset pipeline: all batches but the last are
+        full, whatever images were rejected.
         """
-        given = self._given
-        samples = _timed(
-            read_shard(given.shards, shard.name, shard.split, shard.view, shard.sha256), seconds
+        import webdataset as wds  # here, because it imports torch
+
+        return iter(
+            wds.DataPipeline(
+                partial(self._given.shards.samples, shard, verify=True),
+                partial(_timed, seconds),
+                self._decode,
+                partial(_keep_decoded, kept, rejected, seconds),
+                wds.batched(self._given.batch_size, collation_fn=stack),
+            )
         )
-        images: list[Pixels] = []
-        for (sample, image), spent in prefetch_map(
-            self._open, samples, self._decoders, given.batch_size
-        ):
-            seconds["decode"] += spent
-            if isinstance(image, DecodeError):
-                rejected.append(Rejection(path=sample.key, reason=image.reason, found=image.found))
-                continue
-            kept.append(Sample(key=sample.key, data=b"", facts=sample.facts))
-            images.append(image)
-            if len(images) == given.batch_size:
-                yield stack(images)
-                images = []
-        if images:
-            yield stack(images)
+
+    def _decode(self, samples: Iterable[Sample]) -> Iterator[tuple[Decoded, float]]:
+        return prefetch_map(self._open, samples, self._decoders, self._given.batch_size)
 
     def _open(self, sample: Sample) -> tuple[Decoded, float]:
         start = time.perf_counter()
@@ -225,12 +222,12 @@ class ShardEmbedder:
         embeddings_BD: Floats | Halves,
         rejected: list[Rejection],
     ) -> None:
-        tags = [sample.facts["geotag"] or {} for sample in samples]
+        tags = [sample.metadata["geotag"] or {} for sample in samples]
         rows = PartRows(
             keys=[sample.key for sample in samples],
-            locations=[sample.facts["location"] for sample in samples],
-            views=[sample.facts["view"] for sample in samples],
-            splits=[sample.facts["split"] for sample in samples],
+            locations=[sample.metadata["location"] for sample in samples],
+            views=[sample.metadata["view"] for sample in samples],
+            splits=[sample.metadata["split"] for sample in samples],
             lats=[tag.get("lat") for tag in tags],
             lons=[tag.get("lon") for tag in tags],
             embeddings_BD=embeddings_BD,
@@ -253,7 +250,7 @@ class ShardEmbedder:
             ) from None
 
 
-def _timed(samples: Iterator[Sample], seconds: Seconds) -> Iterator[Sample]:
+def _timed(seconds: Seconds, samples: Iterator[Sample]) -> Iterator[Sample]:
     """The same samples, with the time that each took counted as reading."""
     while True:
         start = time.perf_counter()
@@ -262,3 +259,21 @@ def _timed(samples: Iterator[Sample], seconds: Seconds) -> Iterator[Sample]:
         if sample is None:
             return
         yield sample
+
+
+def _keep_decoded(
+    kept: list[Sample],
+    rejected: list[Rejection],
+    seconds: Seconds,
+    images: Iterable[tuple[Decoded, float]],
+) -> Iterator[Pixels]:
+    """The pixels of the images that could be decoded. Their samples are added to `kept` without
+    their bytes, the others to `rejected`.
+    """
+    for (sample, image), spent in images:
+        seconds["decode"] += spent
+        if isinstance(image, DecodeError):
+            rejected.append(Rejection(path=sample.key, reason=image.reason, found=image.found))
+            continue
+        kept.append(Sample(key=sample.key, data=b"", metadata=sample.metadata))
+        yield image

@@ -1,17 +1,23 @@
-"""Images that are there twice: the same bytes, in one split and view, of one location or of one
-place.
+"""Images that a set holds already, and images that come twice: the same bytes, in one split and
+view, of one location or at one position.
 
-In: the record table of packed tars. Out: which images to leave out. A blank tile of the sea may be
-there many times, each at its own place; University-1652's queries are in its gallery too: these are
-not duplicates.
+In: records and record tables. Out: the new records when extending, and the images to leave out. A
+blank tile of the sea may come many times, each at its own position, and University-1652's queries are
+in its gallery too: these are not duplicates.
 """
 
+import hashlib
 from collections import defaultdict
 from collections.abc import Iterable
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
+
+from pipeline.core import storage
+from pipeline.core.records import ImageRecord, Rejection
+from pipeline.shards.shard_set import ShardSet
+from pipeline.sources.base import Source
 
 COLUMNS = ["key", "shard", "split", "view", "location", "lat", "lon", "path", "part", "sha256"]
 
@@ -42,3 +48,39 @@ def find_duplicates(
         elif row["shard"] not in settled:
             left_out[row["shard"]][row["key"]] = earlier
     return dict(left_out)
+
+
+def new_records(
+    records: Iterable[ImageRecord], source: Source, shards: ShardSet
+) -> tuple[list[ImageRecord], list[Rejection], int]:
+    """Records that the set does not hold, refusals of those whose key another image has, and the
+    number of records that it holds already.
+
+    A file with the path and size of a packed one is taken for the same. Only where another file has
+    a known key are bytes compared.
+    """
+    columns = ["key", "path", "part", "bytes", "sha256"]
+    packed = {
+        row["key"]: row
+        for shard in shards.manifest.shards
+        for row in shards.records(shard, columns).to_pylist()
+    }
+    new, refused, known = [], [], 0
+    for record in records:
+        earlier = packed.get(record.key)
+        if earlier is None:
+            new.append(record)
+        elif (
+            _is_same_file(record, earlier)
+            or hashlib.sha256(source.read(record)).hexdigest() == earlier["sha256"]
+        ):
+            known += 1
+        else:
+            found = f"{earlier['path']}, in {storage.absolute(shards.path)}, has its key"
+            refused.append(Rejection(path=record.name, reason="same name twice", found=found))
+    return new, refused, known
+
+
+def _is_same_file(record: ImageRecord, earlier: dict[str, str | int]) -> bool:
+    same_path = (record.path, record.part) == (earlier["path"], earlier["part"])
+    return same_path and record.bytes in (None, earlier["bytes"])

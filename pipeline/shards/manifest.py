@@ -1,10 +1,9 @@
-"""A set of shards as its manifest describes it. Packing writes it; training, embedding and the
-pictures read it.
+"""The manifest of a set of shards: its tars with their sizes and hashes, its classes, its settings.
 
-In: a folder or URI. Out: the Manifest.
+In: a folder or URI. Out: the Manifest. Packing writes it last; a `ShardSet` holds it.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,8 +15,7 @@ from pipeline.core.records import Split, View, excerpt
 SCHEMA_VERSION = 2
 MANIFEST = "manifest.json"
 DAMAGED_FILE = "damaged.json"
-"""Names of the shards that verification found damaged: packing makes them anew, and takes the note
-away."""
+"""Names of the shards that verification found damaged: packing repairs them and removes the file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,16 +33,16 @@ class Shard:
 
 @dataclass(frozen=True, kw_only=True)
 class Manifest:
-    """What a set of shards holds."""
+    """The content of a set of shards."""
 
     shards: tuple[Shard, ...]
     classes: tuple[str, ...]
-    """Locations of the training split: the classifier's outputs in order. Sorted; an extension's
-    stand behind those before."""
+    """Locations of the training split: the classifier's outputs in order. Sorted; those of an
+    extension follow the earlier ones."""
     packing: dict[str, Any]
-    "What of the settings decides its content."
+    "The settings that determine its content."
     added: tuple[dict[str, Any], ...] = ()
-    "The same of each time that it was extended, in order."
+    "The same settings of each extension, in order."
     rejected: int
     schema_version: int = SCHEMA_VERSION
 
@@ -57,99 +55,72 @@ class Manifest:
         ]
 
 
-def read_manifest(shards: str) -> Manifest:
+def read_manifest(folder: str) -> Manifest:
     """The manifest of a set of shards.
 
     Raises InputError when there is none or it cannot be read.
     """
-    path = storage.join(shards, MANIFEST)
+    path = storage.join(folder, MANIFEST)
     if not storage.exists(path):
         raise InputError(
-            f"no {MANIFEST} in {shards}: not a finished set of shards; make one with jobs/make_shards.py"
+            f"no {MANIFEST} in {folder}: not a finished set of shards; make one with "
+            "jobs/make_shards.py"
         )
     try:
-        said = json_files.read_checksummed(path)
-        if said["schema_version"] != SCHEMA_VERSION:
+        content = json_files.read_checksummed(path)
+        if content["schema_version"] != SCHEMA_VERSION:
             raise InputError(
-                f"{path} has schema version {said['schema_version']}, expected {SCHEMA_VERSION}; pack again"
+                f"{path} has schema version {content['schema_version']}, expected "
+                f"{SCHEMA_VERSION}; pack again"
             )
-        manifest = from_json(Manifest, said)
-        for shard in (
-            manifest.shards
-        ):  # its name becomes that of files, of the set and of what is made of it
+        manifest = from_json(Manifest, content)
+        # A shard's name becomes part of paths, in the set and in everything made from it.
+        for shard in manifest.shards:
             if not is_file_name(shard.name) or min(shard.samples, shard.bytes) < 0:
                 raise ValueError(
-                    f"shard {excerpt(shard.name)} with {shard.samples} samples in {shard.bytes} bytes"
+                    f"shard {excerpt(shard.name)} with {shard.samples} samples in "
+                    f"{shard.bytes} bytes"
                 )
         if len({shard.name for shard in manifest.shards}) < len(manifest.shards):
             raise ValueError("a shard that is listed twice")
         return manifest
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(
-            f"{path} is damaged ({error}), expected what packing writes last; put it back from a copy, or delete it and run "
-            "jobs/make_shards.py again as it was run, and after it each --extend"
+            f"{path} is damaged ({error}), expected the file that packing writes last; put it "
+            "back from a copy, or delete it and run jobs/make_shards.py again as it was run, and "
+            "after it each --extend"
         ) from None
 
 
-def write_damaged(shards: str, names: Iterable[str]) -> None:
-    """Leave a note of the shards that are damaged, for packing; with none, take it away."""
-    path, listed = storage.join(shards, DAMAGED_FILE), sorted(set(names))
+def write_damaged(folder: str, names: Iterable[str]) -> None:
+    """List the damaged shards in DAMAGED_FILE, for packing to repair; without any, remove it."""
+    path, listed = storage.join(folder, DAMAGED_FILE), sorted(set(names))
     if listed:
         json_files.write_checksummed(path, {"shards": listed})
     elif storage.exists(path):
         storage.remove(path)
 
 
-def read_damaged(shards: str) -> frozenset[str]:
-    """The shards that the note names; none where there is no note.
+def read_damaged(folder: str) -> frozenset[str]:
+    """The shards listed in DAMAGED_FILE; none without that file.
 
     Raises InputError where it cannot be read.
     """
-    path = storage.join(shards, DAMAGED_FILE)
+    path = storage.join(folder, DAMAGED_FILE)
+    if not storage.exists(path):
+        return frozenset()
     try:
-        return (
-            frozenset(json_files.read_checksummed(path)["shards"])
-            if storage.exists(path)
-            else frozenset()
-        )
+        return frozenset(json_files.read_checksummed(path)["shards"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{path} is damaged ({error!r}), expected the names of damaged shards; delete it and run jobs/make_shards.py "
-            f"--verify --out {shards}"
+            f"{path} is damaged ({error!r}), expected the names of damaged shards; delete it and "
+            f"run jobs/make_shards.py --verify --out {folder}"
         ) from None
 
 
-def missing_tars(shards: str, described: Iterable[Shard]) -> dict[str, str]:
-    """By name, what is wrong with the tars that are not there or have another size than the
-    manifest says. One listing.
-    """
-    sizes, wrong = storage.walk(shards), dict[str, str]()
-    for shard in described:
-        path, size = storage.join(shards, f"{shard.name}.tar"), sizes.get(f"{shard.name}.tar")
-        if size is None:
-            wrong[shard.name] = f"{path} is missing"
-        elif size != shard.bytes:
-            wrong[shard.name] = f"{path} has {size} bytes, the manifest says {shard.bytes}"
-    return wrong
-
-
-def require_tars(shards: str, described: Iterable[Shard]) -> None:
-    """Raise InputError where tars are not there or have another size than the manifest says."""
-    if wrong := missing_tars(shards, described):
-        raise InputError(
-            f"{len(wrong)} shards cannot be used: {first_three(wrong.values())}; {repair_hint(shards)}"
-        )
-
-
-def repair_hint(shards: str) -> str:
-    """What to do about damaged shards."""
+def repair_hint(folder: str) -> str:
+    """The commands that repair damaged shards, for the end of an error message."""
     return (
-        f"run jobs/make_shards.py --verify --out {shards} and then the command that packed them again, which makes anew what "
-        "is damaged"
+        f"run jobs/make_shards.py --verify --out {folder} and then the command that packed them "
+        "again, which repairs the damaged shards"
     )
-
-
-def first_three(sentences: Collection[str]) -> str:
-    """The first three."""
-    told = list(sentences)
-    return "; ".join(told[:3]) + (f"; and {len(told) - 3} more" if len(told) > 3 else "")

@@ -1,6 +1,6 @@
 """Which image goes into which tar: a pure function of the records.
 
-In: records. Out: plans of shards, each of one split and view; records that cannot have a place.
+In: records. Out: plans of shards, each of one split and view, and the records that are refused.
 """
 
 import hashlib
@@ -10,11 +10,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from pipeline.core.records import ImageRecord, Rejection, Split, View
+from pipeline.shards.manifest import Manifest
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShardPlan:
-    """A tar that is to be written."""
+    """A tar to be written."""
 
     name: str
     "Without `.tar`."
@@ -22,25 +23,27 @@ class ShardPlan:
     view: View
     records: tuple[ImageRecord, ...]
 
-    def digest(self, said: Mapping[str, object]) -> str:
-        """Hash of all that decides the tar's bytes, as far as it is known without reading the
+    def digest(self, config: Mapping[str, object]) -> str:
+        """Hash of everything that determines the tar's bytes and is known without reading the
         images.
 
-        `said`: what of the settings matters to it. A file that was mended has another size, as a rule.
+        `config`: the settings that matter to it. A file that was repaired has another size, as a
+        rule.
         """
-        told = [said, self.name, self.records]
-        return hashlib.sha256(json.dumps(told, sort_keys=True, default=vars).encode()).hexdigest()
+        content = [config, self.name, self.records]
+        text = json.dumps(content, sort_keys=True, default=vars)
+        return hashlib.sha256(text.encode()).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShardSize:
-    """Where a tar ends."""
+    """The size at which a tar ends."""
 
     samples_per_shard: int = 1000
     "Images per tar at most."
     megabytes_per_shard: float | None = None
     """Bytes of images per tar at most, 1e6 each, by the sizes of files: None for any number. Tiles
-    that are cut out of larger files have no size before they are cut, and count as nothing."""
+    that are cut out of larger files have no known size, and count as 0."""
     numbered_from: Mapping[tuple[Split, View], int] = field(default_factory=dict)
     "Number of the first new tar of a split and view, where there are some already."
 
@@ -48,14 +51,14 @@ class ShardSize:
         """Records in runs of one tar each."""
         limit = float("inf") if self.megabytes_per_shard is None else self.megabytes_per_shard * 1e6
         part: list[ImageRecord] = []
-        held = 0
+        total = 0
         for record in records:
             size = record.bytes or 0
-            if part and (len(part) >= self.samples_per_shard or held + size > limit):
+            if part and (len(part) >= self.samples_per_shard or total + size > limit):
                 yield tuple(part)
-                part, held = [], 0
+                part, total = [], 0
             part.append(record)
-            held += size
+            total += size
         if part:
             yield tuple(part)
 
@@ -65,7 +68,7 @@ def plan_shards(
 ) -> tuple[list[ShardPlan], list[Rejection]]:
     """Divide records into shards, one split and view each, ordered by the hash of their keys.
 
-    In that order any run of images is a fair sample of the whole: training shuffles well with a
+    In that order any run of images is a fair sample of the set: training shuffles well with a
     small buffer, and an index trains on the first parts. The second of two records with one key is
     refused.
     """
@@ -92,3 +95,12 @@ def plan_shards(
                 ShardPlan(name=f"{split}-{view}-{number:06d}", split=split, view=view, records=part)
             )
     return plans, rejected
+
+
+def next_numbers(manifest: Manifest) -> dict[tuple[Split, View], int]:
+    """Number of the first new tar of each split and view that the set has tars of."""
+    after: dict[tuple[Split, View], int] = {}
+    for shard in manifest.shards:
+        number = int(shard.name.rsplit("-", 1)[1])
+        after[shard.split, shard.view] = max(number + 1, after.get((shard.split, shard.view), 0))
+    return after

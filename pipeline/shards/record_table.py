@@ -1,12 +1,12 @@
-"""The record table of a set of shards: `records/<shard>.parquet`, one row per image, all that is
+"""The record table of a set of shards: `records/<shard>.parquet`, one row per image with all that is
 known of it but its bytes.
 
-In: rows that packing made. Out: Parquet parts, which tell packing what it has done already and
-extending what is there; and one table for other programs, as Parquet or GeoJSON.
+In: rows that packing made. Out: Parquet parts, by which packing resumes, extends and repairs; and
+one table for other programs, as Parquet or GeoJSON.
 """
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,17 +14,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline.core import parquet, storage
-from pipeline.core import parquet as parquet_files
 from pipeline.core.errors import InputError
 from pipeline.core.json_files import from_json
 from pipeline.core.records import ImageRecord, Rejection
-from pipeline.shards.manifest import Manifest, Shard, repair_hint
-
-
-def part_intact(out: str, name: str) -> bool:
-    """Whether every byte of a record part is what was written."""
-    return parquet.parquet_intact(storage.join(out, FOLDER, f"{name}.parquet"))
-
+from pipeline.shards.manifest import Shard, repair_hint
 
 FOLDER = "records"
 SCHEMA = pa.schema(
@@ -42,7 +35,7 @@ FOOTER = b"pvda.packed"
 
 @dataclass(frozen=True, kw_only=True)
 class Packed:
-    """What became of one planned tar. It stands in the footer of the tar's record part."""
+    """The result of one planned tar, stored in the footer of the tar's record part."""
 
     shard: Shard
     plan: str
@@ -50,26 +43,26 @@ class Packed:
     rejected: tuple[Rejection, ...]
 
 
-def row(record: ImageRecord, shard: str, facts: dict[str, Any], size: int) -> dict[str, Any]:
-    """One image as the table has it. `facts`: the JSON beside it in the tar."""
+def row(record: ImageRecord, shard: str, metadata: dict[str, Any], size: int) -> dict[str, Any]:
+    """One image's row of the table. `metadata`: the JSON beside it in the tar."""
     tag = asdict(record.geotag) if record.geotag else {}
-    known = {name: facts.get(name, tag.get(name)) for name in SCHEMA.names}
+    known = {name: metadata.get(name, tag.get(name)) for name in SCHEMA.names}
     return known | {"shard": shard, "path": record.path, "part": record.part, "bytes": size}
 
 
 def write_part(out: str, packed: Packed, rows: list[dict[str, Any]]) -> None:
     footer = {FOOTER: json.dumps(asdict(packed), sort_keys=True)}
     table = pa.Table.from_pylist(rows, SCHEMA.with_metadata(footer))
-    parquet_files.write_table(_path(out, packed.shard.name), table)
+    parquet.write_table(_path(out, packed.shard.name), table)
 
 
 def read_packed(out: str, name: str) -> Packed | None:
-    """What became of a tar; None where its part is missing or cannot be read."""
+    """The result of a tar; None where its part is missing or cannot be read."""
     try:
-        with parquet_files.open_parquet(_path(out, name)) as parquet:
-            said = json.loads(parquet.schema_arrow.metadata[FOOTER])
-        return from_json(Packed, said)
-    except (*parquet_files.DAMAGE_ERRORS, KeyError, TypeError, RecursionError):
+        with parquet.open_parquet(_path(out, name)) as part:
+            footer = json.loads(part.schema_arrow.metadata[FOOTER])
+        return from_json(Packed, footer)
+    except (*parquet.DAMAGE_ERRORS, KeyError, TypeError, RecursionError):
         return None
 
 
@@ -80,74 +73,67 @@ def read_part(out: str, name: str, columns: list[str] | None = None) -> pa.Table
     """
     path = _path(out, name)
     try:
-        return parquet_files.read_table(path, columns)
-    except parquet_files.DAMAGE_ERRORS as error:
+        return parquet.read_table(path, columns)
+    except parquet.DAMAGE_ERRORS as error:
         raise InputError(
-            f"{path} cannot be read ({error}), expected the record table that packing wrote beside the tars; {repair_hint(out)}"
+            f"{path} cannot be read ({error}), expected the record table that packing wrote beside "
+            f"the tars; {repair_hint(out)}"
         ) from None
 
 
-def footprints(
-    shards: str, manifest: Manifest, keys: Iterable[str]
-) -> dict[str, list[list[float]]]:
-    """Corners (lat, lon) of the ground that some images show, from the upper left clockwise; those
-    unknown are absent.
-    """
-    wanted = set(keys)
-    found: dict[str, list[list[float]]] = {}
-    for shard in manifest.shards:
-        if any(key.startswith(f"{shard.split}-{shard.view}-") for key in wanted):
-            table = read_part(shards, shard.name, ["key", "footprint"])
-            known = table.filter(
-                pc.and_(pc.is_in(table["key"], pa.array(wanted)), pc.is_valid(table["footprint"]))
-            )
-            found |= dict(
-                zip(known["key"].to_pylist(), known["footprint"].to_pylist(), strict=True)
-            )
-    return found
+def part_intact(out: str, name: str) -> bool:
+    """Whether every byte of a record part is the one that was written."""
+    return parquet.parquet_intact(_path(out, name))
 
 
-def export(shards: str, manifest: Manifest, file: str) -> tuple[int, int]:
-    """All records as one file: `.parquet`, or `.geojson` with a point for each image whose place is
-    known.
+def footprints(table: pa.Table, keys: Collection[str]) -> dict[str, list[list[float]]]:
+    """The known footprints of some keys in a table with the columns key and footprint."""
+    known = table.filter(
+        pc.and_(pc.is_in(table["key"], pa.array(keys)), pc.is_valid(table["footprint"]))
+    )
+    return dict(zip(known["key"].to_pylist(), known["footprint"].to_pylist(), strict=True))
 
-    Returns how many were written and how many have no place and are left out. Raises InputError for
-    another ending.
+
+def export(parts: Iterable[pa.Table], file: str) -> tuple[int, int]:
+    """Write all records as one file: `.parquet`, or `.geojson` with a point for each image whose
+    position is known.
+
+    Returns how many were written, and how many have no position and were skipped. Raises InputError
+    for another ending.
     """
     if file.lower().endswith(".parquet"):
         written = 0
-        with parquet_files.writer(file, SCHEMA) as columns:
-            for shard in manifest.shards:
-                table = read_part(shards, shard.name).cast(SCHEMA)
-                columns.write_table(table)
+        with parquet.writer(file, SCHEMA) as columns:
+            for table in parts:
+                columns.write_table(table.cast(SCHEMA))
                 written += len(table)
         return written, 0
     if not file.lower().endswith((".geojson", ".json")):
         raise InputError(f"--export is {file}, expected a name that ends in .parquet or .geojson")
-    written = without = 0
+    written = skipped = 0
     with storage.atomic_write(file) as stream:
         stream.write(b'{"type": "FeatureCollection", "features": [')
-        for shard in manifest.shards:
-            for feature in _features(read_part(shards, shard.name)):
+        for table in parts:
+            for feature in _features(table):
                 if feature is None:
-                    without += 1
+                    skipped += 1
                     continue
                 stream.write(b",\n" if written else b"\n")
                 stream.write(json.dumps(feature, ensure_ascii=False).encode())
                 written += 1
         stream.write(b"\n]}\n")
-    return written, without
+    return written, skipped
 
 
 def _features(table: pa.Table) -> Iterator[dict[str, Any] | None]:
+    """Each row as a GeoJSON feature; None for a row without a position."""
     for known in table.to_pylist():
         lat, lon, footprint = (known.pop(name) for name in ("lat", "lon", "footprint"))
         if lat is None:
             yield None
             continue
-        if (
-            footprint
-        ):  # RFC 7946: longitude first, the ring closed and counter-clockwise seen from above
+        if footprint:
+            # RFC 7946: longitude first, the ring closed and counter-clockwise seen from above.
             known["footprint"] = [[corner[1], corner[0]] for corner in footprint]
         point = {"type": "Point", "coordinates": [lon, lat]}
         yield {"type": "Feature", "id": known["key"], "geometry": point, "properties": known}

@@ -1,9 +1,9 @@
-"""A finished set of shards with damaged tars or record parts: which they are, and how they are made
-anew, to the same bytes.
+"""Repair of a finished set of shards: damaged tars and record parts are found, and packed again to
+the same bytes.
 
-In: a set, its manifest, imagery as a source found it. Out: the tars whose images the source has,
-written again and held against the manifest's hashes before they take the damaged ones' places. So a
-set that was extended is mended as well: by each of the commands that packed it, its own images.
+In: a ShardSet and the imagery that a source found. Out: the damaged tars whose images the source has,
+packed again and compared with the manifest's hashes before they replace the damaged ones. Extended
+sets can be repaired too: rerun each packing command; it repairs the shards it wrote.
 """
 
 import hashlib
@@ -13,107 +13,104 @@ from typing import Any
 from pipeline.core import rejections, storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import ImageRecord
-from pipeline.shards.manifest import Manifest, Shard, missing_tars, read_damaged, write_damaged
+from pipeline.shards.manifest import Manifest, Shard, read_damaged, write_damaged
 from pipeline.shards.plan import ShardPlan
-from pipeline.shards.record_table import FOLDER, read_packed, read_part
+from pipeline.shards.record_table import FOLDER, read_packed
+from pipeline.shards.shard_set import ShardSet
 from pipeline.shards.writer import write_shard
 from pipeline.sources.base import Source
 
-SCRATCH = "_mending"
+SCRATCH = "_repair"
 
 
-def find_damaged(out: str, manifest: Manifest) -> list[Shard]:
-    """Shards whose tar or record part is not there, has another size, or was found damaged by
+def find_damaged(shards: ShardSet) -> list[Shard]:
+    """Shards whose tar or record part is absent, has another size, or was found damaged by
     verification.
     """
-    wrong = read_damaged(out).union(missing_tars(out, manifest.shards))
-    parts = set(storage.list_names(storage.join(out, FOLDER)))
+    listed = shards.manifest.shards
+    wrong = read_damaged(shards.path).union(shards.missing_tars(listed))
+    parts = set(storage.list_names(storage.join(shards.path, FOLDER)))
     return [
-        shard
-        for shard in manifest.shards
-        if shard.name in wrong or f"{shard.name}.parquet" not in parts
+        shard for shard in listed if shard.name in wrong or f"{shard.name}.parquet" not in parts
     ]
 
 
 def repair(
-    source: Source,
-    out: str,
-    manifest: Manifest,
-    damaged: Sequence[Shard],
-    records: Iterable[ImageRecord],
+    source: Source, shards: ShardSet, damaged: Sequence[Shard], records: Iterable[ImageRecord]
 ) -> None:
-    """Make the damaged shards anew whose images are among the records. The others' note stays.
+    """Pack the damaged shards again whose images are among the records. The others stay listed.
 
     Raises InputError where some are left, with the commands that packed the set.
     """
     left: list[Shard] = []
-    for plan, shard in _plans(out, manifest, damaged, records):
-        if plan is None or not _write(source, out, shard, plan):
+    for shard, plan in _plan_repairs(shards, damaged, records):
+        if plan is None or not _replace(source, shards.path, shard, plan):
             left.append(shard)
-    storage.remove_folder(storage.join(out, SCRATCH))
-    write_damaged(out, [shard.name for shard in left])
+    storage.remove_folder(storage.join(shards.path, SCRATCH))
+    write_damaged(shards.path, [shard.name for shard in left])
     if left:
         raise InputError(
-            f"{len(left)} shards of {out} are damaged, {left[0].name} first, and this imagery does not hold what they were "
-            f"packed from; expected that of {packing_commands(manifest)}; run these again as they were run, or put the tars and their "
-            "record parts back from a copy"
+            f"{len(left)} shards of {shards.path} are damaged, {left[0].name} first, and this "
+            "imagery does not hold what they were packed from; expected that of "
+            f"{packing_commands(shards.manifest)}; run these again as they were run, or put the "
+            "tars and their record parts back from a copy"
         )
 
 
 def packing_commands(manifest: Manifest) -> str:
-    """The calls that packed a set, as far as a manifest says."""
+    """The commands that packed a set, as far as a manifest records them."""
     packed: Sequence[Mapping[str, Any]] = (manifest.packing, *manifest.added)
-    said = [
-        f"jobs/make_shards.py --source {one.get('source')} --root {one.get('root')}"
-        for one in packed
+    commands = [
+        f"jobs/make_shards.py --source {settings.get('source')} --root {settings.get('root')}"
+        for settings in packed
     ]
-    return ", then ".join([said[0], *(f"{one} --extend" for one in said[1:])])
+    return ", then ".join([commands[0], *(f"{command} --extend" for command in commands[1:])])
 
 
-def _plans(
-    out: str, manifest: Manifest, damaged: Sequence[Shard], records: Iterable[ImageRecord]
-) -> list[tuple[ShardPlan | None, Shard]]:
-    """What each damaged shard held, in its order; None where these records are not it.
+def _plan_repairs(
+    shards: ShardSet, damaged: Sequence[Shard], records: Iterable[ImageRecord]
+) -> list[tuple[Shard, ShardPlan | None]]:
+    """Each damaged shard with the plan of its images in their order; None where these records do
+    not have them.
 
-    By the shard's record part; where that is lost, by what no other shard of its split and view
-    holds, in the order that packing has. The hash decides in the end.
+    By the shard's record part; where that is lost, by the records of its split and view that no
+    other shard holds, in the order that packing has. The hash decides in the end.
     """
-    held = {record.key: record for record in records}
-    keys = {shard.name: _keys(out, shard) for shard in manifest.shards}
+    by_key = {record.key: record for record in records}
+    keys = {shard.name: _keys(shards, shard) for shard in shards.manifest.shards}
     known = {key for each in keys.values() for key in each or ()}
-    refused = rejections.rejected_paths(out)
-    lost = sorted(
-        (key for key, record in held.items() if key not in known and record.name not in refused),
+    refused = rejections.rejected_paths(shards.path)
+    unassigned = sorted(
+        (key for key, record in by_key.items() if key not in known and record.name not in refused),
         key=lambda key: hashlib.sha256(key.encode()).hexdigest(),
     )
-    plans: list[tuple[ShardPlan | None, Shard]] = []
-    for shard in sorted(damaged, key=lambda one: one.name):
+    plans: list[tuple[Shard, ShardPlan | None]] = []
+    for shard in sorted(damaged, key=lambda shard: shard.name):
         wanted = keys[shard.name]
         if wanted is None:
-            alike = [
-                key
-                for key in lost
-                if (held[key].split, held[key].view) == (shard.split, shard.view)
-            ]
+            kind = shard.split, shard.view
+            alike = [key for key in unassigned if (by_key[key].split, by_key[key].view) == kind]
             wanted = alike[: shard.samples]
-            lost = [key for key in lost if key not in set(wanted)]
-        found = tuple(held[key] for key in wanted if key in held)
+            unassigned = [key for key in unassigned if key not in set(wanted)]
+        found = tuple(by_key[key] for key in wanted if key in by_key)
         plan = ShardPlan(name=shard.name, split=shard.split, view=shard.view, records=found)
-        plans.append((plan if len(found) == shard.samples else None, shard))
+        plans.append((shard, plan if len(found) == shard.samples else None))
     return plans
 
 
-def _keys(out: str, shard: Shard) -> list[str] | None:
-    """The keys of a shard's images in their order, by its record part; None where it cannot say."""
+def _keys(shards: ShardSet, shard: Shard) -> list[str] | None:
+    """The keys of a shard's images in their order, by its record part; None where it is damaged."""
     try:
-        keys: list[str] = read_part(out, shard.name, ["key"])["key"].to_pylist()
+        keys: list[str] = shards.records(shard, ["key"])["key"].to_pylist()
     except InputError:
         return None
     return keys if len(keys) == shard.samples else None
 
 
-def _write(source: Source, out: str, shard: Shard, plan: ShardPlan) -> bool:
-    """Write a shard anew; whether it is what the manifest says. Else nothing has changed."""
+def _replace(source: Source, out: str, shard: Shard, plan: ShardPlan) -> bool:
+    """Pack a shard again and replace it where the result is what the manifest says; returns whether
+    it is.
+    """
     before, scratch = read_packed(out, shard.name), storage.join(out, SCRATCH)
     packed = write_shard(plan, source, scratch, "" if before is None else before.plan)
     if packed.shard != shard:

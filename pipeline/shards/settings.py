@@ -4,10 +4,10 @@ line is parsed at once."""
 from dataclasses import dataclass
 from typing import Literal
 
-from pipeline.core.errors import InputError
+from pipeline.core.errors import require
 
 Check = Literal["quick", "full"]
-"How an image is judged: by its headers and its end, or by decoding it."
+"How an image is checked: by its headers and its end, or by decoding it."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +25,7 @@ class PackingSettings:
     max_bad_fraction: float = 0.01
     "Refused images over all images; above it the job stops."
     check: Check = "quick"
-    """How images are judged: quick, by their headers and ends, or full, by decoding them: finds
+    """How images are checked: quick, by their headers and ends, or full, by decoding them: finds
     every damage and takes long."""
     extend: bool = False
     "Add the imagery to the finished set in `out`, as new tars."
@@ -34,17 +34,17 @@ class PackingSettings:
     the other in this process."""
 
     def __post_init__(self) -> None:
-        if self.samples_per_shard < 1:
-            raise InputError(
-                f"--samples-per-shard is {self.samples_per_shard}, expected at least 1"
-            )
-        if self.megabytes_per_shard is not None and not self.megabytes_per_shard > 0:
-            raise InputError(
-                f"--megabytes-per-shard is {self.megabytes_per_shard}, expected more than 0"
-            )
-        if not 0 <= self.max_bad_fraction <= 1:
-            raise InputError(
-                f"--max-bad-fraction is {self.max_bad_fraction}, expected a fraction from 0 to 1"
-            )
-        if self.workers is not None and self.workers < 0:
-            raise InputError(f"--workers is {self.workers}, expected 0 (this process) or more")
+        samples, megabytes, bad = (
+            self.samples_per_shard,
+            self.megabytes_per_shard,
+            self.max_bad_fraction,
+        )
+        require(samples >= 1, "samples_per_shard", samples, "at least 1")
+        require(megabytes is None or megabytes > 0, "megabytes_per_shard", megabytes, "more than 0")
+        require(0 <= bad <= 1, "max_bad_fraction", bad, "a fraction from 0 to 1")
+        require(
+            self.workers is None or self.workers >= 0,
+            "workers",
+            self.workers,
+            "0 (this process) or more",
+        )

@@ -1,16 +1,17 @@
-"""One planned shard -> one tar with the source's own bytes and a JSON per image, and its part of
-the record table.
+"""One planned shard -> one tar with the source's own bytes and a JSON per image, and its part of the
+record table.
 
-In: a plan and its source. Out: two files, each whole or not there; the same input gives the same
+In: a plan and its source. Out: two files, each complete or absent; the same input gives the same
 bytes.
 """
 
 import hashlib
+import io
 import json
 import tarfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import IO, Any
+from typing import IO, Any, cast
 
 from pipeline.core import storage
 from pipeline.core.prefetch import prefetch_map
@@ -26,33 +27,19 @@ from pipeline.sources import name_of
 from pipeline.sources.base import Source
 
 READERS, REMOTE_READERS, READ_AHEAD = 1, 16, 64
-"""Threads that read and judge images ahead of the tar, from a disk of this machine (more only get
+"""Threads that read and check images ahead of the tar, from a disk of this machine (more only get
 in each other's way) and over a network, and how many images they may be ahead."""
 UNREADABLE = "unreadable file"
 
 
-def _template() -> bytes:
-    info = tarfile.TarInfo("")
-    info.uname = info.gname = "root"
-    block = info.tobuf(tarfile.USTAR_FORMAT)
-    return (
-        block[:124] + bytes(12) + block[136:148] + bytes(8) + block[156:]
-    )  # without size and checksum
-
-
-TEMPLATE = _template()
-CHECKSUM = sum(TEMPLATE) + 8 * ord(" ")
-"Of the template; the checksum counts its own eight characters as blanks."
-
-
 @dataclass(frozen=True, kw_only=True)
 class Member:
-    """An image on its way into the tar."""
+    """An image to be written into the tar."""
 
     name: str
     "Of the file in the tar."
     data: bytes
-    facts: dict[str, Any]
+    metadata: dict[str, Any]
     "The JSON beside it."
 
 
@@ -62,13 +49,13 @@ def write_shard(
     out: str,
     digest: str,
     check: Check = "quick",
-    doubles: Mapping[str, str] | None = None,
+    duplicates: Mapping[str, str] | None = None,
 ) -> Packed:
-    """Write one tar and its record part; images that cannot be used are left out and told of.
+    """Write one tar and its record part; unusable images are rejected, with the reason.
 
-    `doubles`: keys to leave out, with the name of the image that has the same bytes.
+    `duplicates`: keys to leave out, with the name of the image that has the same bytes.
     """
-    left_out = doubles or {}
+    left_out = duplicates or {}
 
     def prepare(record: ImageRecord) -> Member | Rejection:
         if record.key in left_out:
@@ -82,20 +69,22 @@ def write_shard(
 
     rejected, rows = [], []
     with storage.atomic_write(storage.join(out, f"{plan.name}.tar")) as stream:
-        tar = TarStream(stream)
+        hashed = HashedWriter(stream)
         near = not plan.records or storage.is_local(plan.records[0].path)
-        found = prefetch_map(prepare, plan.records, READERS if near else REMOTE_READERS, READ_AHEAD)
-        for record, member in zip(plan.records, found, strict=True):
-            if isinstance(member, Rejection):
-                rejected.append(member)
-                continue
-            tar.add(member.name, member.data)
-            tar.add(f"{record.key}.json", json.dumps(member.facts, ensure_ascii=False).encode())
-            rows.append(record_table.row(record, plan.name, member.facts, len(member.data)))
-        tar.close()
+        threads = READERS if near else REMOTE_READERS
+        members = prefetch_map(prepare, plan.records, threads, READ_AHEAD)
+        with open_tar(hashed) as tar:
+            for record, member in zip(plan.records, members, strict=True):
+                if isinstance(member, Rejection):
+                    rejected.append(member)
+                    continue
+                add_file(tar, member.name, member.data)
+                text = json.dumps(member.metadata, ensure_ascii=False)
+                add_file(tar, f"{record.key}.json", text.encode())
+                rows.append(record_table.row(record, plan.name, member.metadata, len(member.data)))
     shard = Shard(
         name=plan.name, split=plan.split, view=plan.view,
-        samples=len(rows), bytes=tar.bytes, sha256=tar.digest.hexdigest(),
+        samples=len(rows), bytes=hashed.tell(), sha256=hashed.digest.hexdigest(),
     )  # fmt: skip
     packed = Packed(shard=shard, plan=digest, rejected=tuple(rejected))
     record_table.write_part(out, packed, rows)
@@ -103,16 +92,16 @@ def write_shard(
 
 
 def read_member(record: ImageRecord, source: Source, check: Check) -> Member:
-    """An image's bytes, never encoded again, and what the tar says of them.
+    """An image's bytes, never re-encoded, and the metadata beside them.
 
-    Raises DecodeError when they are no image, or cannot be read, and are neither when they are read
-    once more: a storage that fails for a moment costs no image.
+    Raises DecodeError when they are no image or cannot be read, twice in a row: a storage that fails
+    for a moment costs no image.
     """
     try:
-        data, (width, height) = _judged(record, source, check)
+        data, (width, height) = _read_checked(record, source, check)
     except DecodeError:
-        data, (width, height) = _judged(record, source, check)
-    facts = {
+        data, (width, height) = _read_checked(record, source, check)
+    metadata = {
         "key": record.key,
         "location": record.location,
         "view": record.view,
@@ -125,10 +114,12 @@ def read_member(record: ImageRecord, source: Source, check: Check) -> Member:
         "width": width,
         "height": height,
     }
-    return Member(name=f"{record.key}.{source.ending(record)}", data=data, facts=facts)
+    return Member(name=f"{record.key}.{source.ending(record)}", data=data, metadata=metadata)
 
 
-def _judged(record: ImageRecord, source: Source, check: Check) -> tuple[bytes, tuple[int, int]]:
+def _read_checked(
+    record: ImageRecord, source: Source, check: Check
+) -> tuple[bytes, tuple[int, int]]:
     """An image's bytes, with its width and height."""
     try:
         data = source.read(record)
@@ -140,48 +131,32 @@ def _judged(record: ImageRecord, source: Source, check: Check) -> tuple[bytes, t
     return data, size
 
 
-def header(name: str, size: int) -> bytes:
-    """The tar header of a file: 512 bytes, ustar, fixed time, owner and mode.
+def open_tar(stream: "HashedWriter") -> tarfile.TarFile:
+    """A tar to be written into a stream."""
+    return tarfile.open(fileobj=cast(IO[bytes], stream), mode="w", format=tarfile.USTAR_FORMAT)
 
-    `name`: ASCII, at most 100 characters; `size`: bytes, below 8 GiB. tarfile makes the same, at a tenth of the speed.
+
+def add_file(tar: tarfile.TarFile, name: str, data: bytes) -> None:
+    """Add a file with a fixed time, owner and mode, so that the same files give the same tar.
+
+    `name`: at most 100 ASCII characters; `data`: below 8 GiB. A longer one raises ValueError.
     """
-    named, sized = name.encode("ascii"), b"%011o\0" % size
-    checksum = b"%06o\0 " % (CHECKSUM + sum(named) + sum(sized))
-    return b"".join(
-        (
-            named.ljust(100, b"\0"),
-            TEMPLATE[100:124],
-            sized,
-            TEMPLATE[136:148],
-            checksum,
-            TEMPLATE[156:],
-        )
-    )
+    header = tarfile.TarInfo(name)
+    header.size = len(data)
+    header.uname = header.gname = "root"
+    tar.addfile(header, io.BytesIO(data))
 
 
-class TarStream:
-    """A tar that is written from front to back, counted and hashed on its way.
-
-    Fixed time, owner and mode: the same members give the same bytes.
-    """
+class HashedWriter:
+    """A stream that counts and hashes the bytes that are written through it."""
 
     def __init__(self, stream: IO[bytes]) -> None:
-        self._stream, self.digest, self.bytes = stream, hashlib.sha256(), 0
+        self._stream, self.digest, self._bytes = stream, hashlib.sha256(), 0
 
-    def add(self, name: str, data: bytes) -> None:
-        self._write(header(name, len(data)))
-        self._write(data)
-        if rest := -len(data) % tarfile.BLOCKSIZE:
-            self._write(bytes(rest))
-
-    def close(self) -> None:
-        """Two empty blocks end a tar; tar programs fill the last record, so that others do not
-        complain.
-        """
-        end = 2 * tarfile.BLOCKSIZE
-        self._write(bytes(end + -(self.bytes + end) % tarfile.RECORDSIZE))
-
-    def _write(self, data: bytes) -> None:
+    def write(self, data: bytes) -> int:
         self.digest.update(data)
-        self.bytes += len(data)
-        self._stream.write(data)
+        self._bytes += len(data)
+        return self._stream.write(data)
+
+    def tell(self) -> int:
+        return self._bytes

@@ -11,6 +11,7 @@ from pipeline.batches.training import StreamConfig, TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.shards.manifest import read_manifest
+from pipeline.shards.shard_set import open_shards
 
 NAMES = [f"{number:04d}" for number in range(1000)]
 
@@ -37,9 +38,11 @@ def test_places_held_out_are_neither_streamed_nor_classes_and_an_epoch_is_a_pass
     share = next(
         share for tenth in range(1, 10) if len(chosen(tiny_shards, share := tenth / 10)) == 2
     )
-    stream = TrainingStream(tiny_shards, StreamConfig(batch_size=2, image_size=32, hold_out=share))
+    stream = TrainingStream(
+        open_shards(tiny_shards), StreamConfig(batch_size=2, image_size=32, hold_out=share)
+    )
     assert len(stream.held_out) == 2
-    assert set(stream.classes) == set(stream.manifest.classes) - stream.held_out
+    assert set(stream.classes) == set(stream.shards.manifest.classes) - stream.held_out
     assert sorted(stream.classes.values()) == [0, 1, 2, 3]
     assert stream.steps == 2
     names = {number: name for name, number in stream.classes.items()}
@@ -62,8 +65,8 @@ def chosen(shards: str, share: float) -> frozenset[str]:
 def test_shards_are_counted_without_the_places_left_out(tiny_shards: str) -> None:
     manifest = read_manifest(tiny_shards)
     drones = manifest.of(Split.TRAIN, View.DRONE)
-    assert exclude_locations(tiny_shards, drones, frozenset()) == drones
-    counted = exclude_locations(tiny_shards, drones, frozenset(manifest.classes[:2]))
+    assert exclude_locations(open_shards(tiny_shards), drones, frozenset()) == drones
+    counted = exclude_locations(open_shards(tiny_shards), drones, frozenset(manifest.classes[:2]))
     assert sum(shard.samples for shard in counted) == 3 * (len(manifest.classes) - 2)
     assert [replace(shard, samples=0) for shard in counted] == [
         replace(shard, samples=0) for shard in drones

@@ -20,9 +20,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from pipeline.batches.ordered import decode_samples  # fmt: skip
-from pipeline.batches.sampler import plan_pass, read_spans, shuffled  # fmt: skip
-from pipeline.batches.training import Batch, StreamConfig, TrainingStream  # fmt: skip
+from pipeline.batches.ordered import decode_samples
+from pipeline.batches.sampler import Span, plan_pass, read_spans
+from pipeline.batches.training import Batch, StreamConfig, TrainingStream
 from pipeline.core import json_files, storage
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch, prefetch_map
@@ -31,11 +31,8 @@ from pipeline.images.decode import DecodeError, decode
 from pipeline.images.transforms import Augmentation
 from pipeline.shards.manifest import MANIFEST, Manifest, Shard
 from pipeline.shards.plan import ShardPlan
-from pipeline.shards.samples import (
-    Sample,
-    fetch,  # fmt: skip
-    read_shard,
-)
+from pipeline.shards.samples import read_samples
+from pipeline.shards.shard_set import open_shards
 from pipeline.shards.writer import write_shard
 from pipeline.sources.university1652 import University1652
 
@@ -87,7 +84,7 @@ def keys(batches: list[tuple[Batch, Batch]], view: View) -> list[str]:
 def epoch(
     shards: str, number: int = 0, rank: int = 0, world: int = 1, reading: StreamConfig = PLAIN
 ) -> list[tuple[Batch, Batch]]:
-    return list(TrainingStream(shards, reading, rank, world).epoch(number))
+    return list(TrainingStream(open_shards(shards), reading, rank, world).epoch(number))
 
 
 # The planner.
@@ -114,7 +111,9 @@ def planned(
 ) -> list[tuple[str, int]]:
     """Shard and position of each sample that a rank reads."""
     spans = plan_pass(shard_list(sizes), wanted, rank, world, np.random.default_rng(seed))
-    return [(span.name, position) for span in spans for position in range(span.start, span.stop)]
+    return [
+        (span.shard.name, position) for span in spans for position in range(span.start, span.stop)
+    ]
 
 
 @settings(max_examples=200)
@@ -160,19 +159,17 @@ def test_shards_without_samples_give_an_empty_plan() -> None:
 # Reading and its order.
 
 
-def sample(number: int) -> Sample:
-    return Sample(key=str(number), data=b"", facts={})
-
-
 @pytest.mark.parametrize("buffer", [1, 7, 100])
-def test_shuffling_keeps_every_sample_once_and_is_repeatable(buffer: int) -> None:
+def test_shuffle_keeps_every_sample_and_repeats(shards: str, buffer: int) -> None:
+    stream = TrainingStream(open_shards(shards), replace(PLAIN, shuffle_buffer=buffer))
     once, again = (
-        [held.key for held in shuffled(map(sample, range(50)), buffer, np.random.default_rng(3))]
-        for _ in range(2)
+        [sample.key for _, sample in stream.sample_pipeline(View.SATELLITE, 3)] for _ in range(2)
     )
+    spans = stream.plan(View.SATELLITE, 3)
+    planned_keys = [sample.key for sample in read_spans(stream.shards, frozenset(), spans)]
     assert once == again
-    assert sorted(once, key=int) == [str(number) for number in range(50)]
-    assert (once == sorted(once, key=int)) == (buffer == 1)
+    assert sorted(once) == sorted(planned_keys)
+    assert (once == planned_keys) == (buffer == 1)
 
 
 def test_work_ahead_keeps_its_order_and_stays_within_its_depth() -> None:
@@ -224,14 +221,15 @@ def test_items_are_ready_before_they_are_asked_for_and_no_more_than_so_many() ->
 
 
 def test_a_shard_reads_back_as_it_was_packed(shards: str) -> None:
-    samples = list(read_shard(shards, "train-satellite-000002"))
-    assert [held.key for held in samples] == [held.facts["key"] for held in samples]
-    assert [held.facts["location"] for held in samples] == [
+    samples = list(read_samples(f"{shards}/train-satellite-000002.tar"))
+    assert [held.key for held in samples] == [held.metadata["key"] for held in samples]
+    assert [held.metadata["location"] for held in samples] == [
         CLASSES[number % 4] for number in range(16, 21)
     ]
     assert all(held.data.startswith(b"\x89PNG") for held in samples)
-    [span] = plan_pass(shard_list([5]), 5, 0, 1, np.random.default_rng(5))[:1]
-    part = list(read_spans(shards, [replace(span, name="train-satellite-000002", start=1, stop=3)]))
+    opened = open_shards(shards)
+    shard = next(one for one in opened.manifest.shards if one.name == "train-satellite-000002")
+    part = list(read_spans(opened, frozenset(), [Span(shard=shard, start=1, stop=3)]))
     assert [held.key for held in part] == [held.key for held in samples[1:3]]
 
 
@@ -242,7 +240,7 @@ def test_an_epoch_sees_each_satellite_image_at_most_once_and_all_but_the_last_pa
     shards: str,
 ) -> None:
     batches = epoch(shards)
-    assert TrainingStream(shards, PLAIN).steps == len(batches) == SATELLITES // 4
+    assert TrainingStream(open_shards(shards), PLAIN).steps == len(batches) == SATELLITES // 4
     seen = keys(batches, View.SATELLITE)
     assert len(seen) == len(set(seen)) == 20
 
@@ -307,7 +305,7 @@ def test_each_epoch_and_each_rank_augments_in_its_own_way(shards: str) -> None:
 
 
 def test_an_epoch_can_be_seen_without_those_before_it(shards: str) -> None:
-    stream = TrainingStream(shards, PLAIN)
+    stream = TrainingStream(open_shards(shards), PLAIN)
     for number in (0, 1):
         last = list(stream.epoch(number))
     assert [pair[1].keys for pair in last] == [pair[1].keys for pair in epoch(shards, 1)]
@@ -323,7 +321,7 @@ def test_an_epoch_can_be_entered_at_any_step_and_goes_on_as_it_would_have(
     monkeypatch.setattr(
         "pipeline.batches.training.decode", lambda data: (next(opened), decode(data))[1]
     )
-    rest = list(TrainingStream(shards, lively).epoch(2, skip))
+    rest = list(TrainingStream(open_shards(shards), lively).epoch(2, skip))
     assert len(rest) == len(whole) - skip
     assert next(opened) == 2 * 4 * len(rest)  # what is skipped is not decoded
     for pair, same in zip(whole[skip:], rest, strict=True):
@@ -359,7 +357,7 @@ def test_a_set_too_small_for_one_step_is_refused_with_the_remedy(
     with pytest.raises(
         InputError, match=r"21 satellite and 40 UAV .* one batch of 22 .*smaller batch"
     ):
-        TrainingStream(shards, replace(PLAIN, batch_size=batch_size), 0, world)
+        TrainingStream(open_shards(shards), replace(PLAIN, batch_size=batch_size), 0, world)
 
 
 def test_fewer_uav_than_satellite_images_come_again_within_an_epoch(
@@ -426,7 +424,7 @@ def test_a_damaged_images_place_is_taken_by_the_first_whole_one_of_its_batch_und
 def test_damaged_images_leave_an_epoch_that_is_entered_later_as_it_would_have_been(
     shards: str, tmp_path: Path
 ) -> None:
-    stream = TrainingStream(with_damage(shards, tmp_path, odd), PLAIN)
+    stream = TrainingStream(open_shards(with_damage(shards, tmp_path, odd)), PLAIN)
     for pair, same in zip(list(stream.epoch(1))[3:], stream.epoch(1, 3), strict=True):
         for batch, other in zip(pair, same, strict=True):
             assert (batch.keys, batch.damaged) == (other.keys, other.damaged)
@@ -459,9 +457,9 @@ def test_images_for_embedding_come_in_the_shards_order_and_an_undecodable_one_as
             if number == 2:  # the second sample's image, cut short
                 member.size -= 30
             new.addfile(member, stream)
-    found = list(decode_samples(read_shard(str(tmp_path), "x"), 8, threads=2, depth=4))
+    found = list(decode_samples(read_samples(str(tmp_path / "x.tar")), 8, threads=2, depth=4))
     assert [held.key for held, _ in found] == [
-        held.key for held in read_shard(shards, "train-drone-000002")
+        held.key for held in read_samples(f"{shards}/train-drone-000002.tar")
     ]
     kinds = [type(image) for _, image in found]
     assert kinds == [np.ndarray, DecodeError, *[np.ndarray] * 8]
@@ -477,10 +475,10 @@ def test_pictures_are_fetched_by_key_as_the_sources_bytes_and_unknown_keys_are_a
         "train-drone-0839-no",
         "query-x",
     ]
-    found = fetch(shards, wanted)
+    found = open_shards(shards).fetch(wanted)
     assert set(found) == set(wanted[:2])
     assert found[wanted[1]] == (Path(shards).parent / "drone-038.png").read_bytes()
-    assert fetch(shards, []) == {}
+    assert open_shards(shards).fetch([]) == {}
 
 
 def test_plain_tarfile_opens_a_shard_and_finds_two_members_a_sample(shards: str) -> None:

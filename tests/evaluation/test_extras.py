@@ -18,6 +18,7 @@ from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.settings import EvaluationSettings
 from pipeline.features.table import PartFooter, PartRows, write_part
 from pipeline.retrieval.tasks import RESULTS_SCHEMA
+from pipeline.shards.shard_set import open_shards
 from tests.evaluation.test_evaluate import TEST_SET, made_table
 
 
@@ -115,12 +116,15 @@ def test_directions_fall_into_sectors_and_many_numbers_into_round_bins() -> None
 
 
 def test_groups_come_from_the_records_beside_the_shards(tiny_shards: str) -> None:
-    assert set(breakdowns.read_column(tiny_shards, "view").values()) == {"drone", "satellite"}
+    assert set(breakdowns.read_column(open_shards(tiny_shards), "view").values()) == {
+        "drone",
+        "satellite",
+    }
     with pytest.raises(
         InputError,
         match=r"--by is colour, expected a column of the shards' records: location, view",
     ):
-        breakdowns.read_column(tiny_shards, "colour")
+        breakdowns.read_column(open_shards(tiny_shards), "colour")
 
 
 def test_positions_of_the_table_become_distances(

@@ -14,7 +14,7 @@ from pipeline.features.part import read_rejected
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table, read_footer
 from pipeline.shards.manifest import read_manifest
-from pipeline.shards.samples import read_shard
+from pipeline.shards.shard_set import open_shards
 from tests.damaging import update_checksum
 
 
@@ -44,12 +44,12 @@ def test_every_image_has_one_row_with_its_label_and_position(
     table = open_table(out)
     assert sorted(table.parts) == sorted(f"{shard.name}.parquet" for shard in manifest.shards)
     samples = [
-        sample for shard in manifest.shards for sample in read_shard(tiny_shards, shard.name)
+        sample for shard in manifest.shards for sample in open_shards(tiny_shards).samples(shard)
     ]
     labels = table.labels()
     assert labels.keys.tolist() == [sample.key for sample in samples]
-    assert labels.locations.tolist() == [sample.facts["location"] for sample in samples]
-    assert labels.lats.tolist() == [sample.facts["geotag"]["lat"] for sample in samples]
+    assert labels.locations.tolist() == [sample.metadata["location"] for sample in samples]
+    assert labels.lats.tolist() == [sample.metadata["geotag"]["lat"] for sample in samples]
     assert np.allclose(np.linalg.norm(table.embeddings(), axis=1), 1, atol=1e-6)
 
 

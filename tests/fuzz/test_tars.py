@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.shards.external import open_manifest
 from pipeline.shards.manifest import Shard
-from pipeline.shards.samples import read_locations, read_shard
+from pipeline.shards.samples import read_locations, read_samples
+from pipeline.shards.shard_set import open_or_scan
 from pipeline.shards.tar_reader import read_members
 from pipeline.shards.verify import check_shard
 from tests.fuzz.bounds import bounded, examples
@@ -300,13 +300,14 @@ def test_the_json_of_a_sample(folder: Path, data: st.DataObject, said: Any) -> N
             tarfile.GNU_FORMAT,
         )
     )
-    for split, view in ((Split.QUERY, View.DRONE), (None, None)):
+    tar = str(folder / "query-drone-000000.tar")
+    for external in ((Split.QUERY, View.DRONE), None):
         with bounded(InputError):
-            for sample in read_shard(str(folder), "query-drone-000000", split, view):
-                usable(sample.facts)
+            for sample in read_samples(tar, external):
+                usable(sample.metadata)
                 pa.array([sample.key], pa.string())
     with bounded(InputError):
-        for location in read_locations(str(folder), "query-drone-000000"):
+        for location in read_locations(tar):
             assert isinstance(location, str)
     with bounded(InputError):
         assert check_shard(
@@ -321,4 +322,4 @@ def test_the_json_of_a_sample(folder: Path, data: st.DataObject, said: Any) -> N
             ),
         )
     with bounded(InputError):
-        open_manifest(str(folder), Split.QUERY, View.DRONE)
+        open_or_scan(str(folder), Split.QUERY, View.DRONE)

@@ -25,7 +25,7 @@ from pipeline.features.embed import embed_gallery
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table
 from pipeline.images.transforms import Resizer
-from pipeline.shards.external import open_manifest
+from pipeline.shards.shard_set import open_or_scan
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +42,8 @@ def asked(shards: str, **changes: object) -> EmbeddingSettings:
 def images_of(
     embedding: EmbeddingSettings, size: int, resizer: Resizer, count: int
 ) -> encoders.Bytes:
-    manifest = open_manifest(embedding.shards, embedding.split, embedding.view)
-    return first_images(embedding.shards, manifest, size, resizer, count)
+    shards = open_or_scan(embedding.shards, embedding.split, embedding.view)
+    return first_images(shards, size, resizer, count)
 
 
 def test_the_images_to_check_by_are_the_same_each_time_and_of_every_split_and_view(

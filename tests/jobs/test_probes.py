@@ -15,6 +15,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.records import View
 from pipeline.features.table import Floats
 from pipeline.images.decode import DecodeError, Pixels, decode
+from pipeline.shards.shard_set import open_shards
 
 
 def features(shift: float, count: int = 80, channels: int = 40) -> tuple[Floats, Floats]:
@@ -59,7 +60,9 @@ def test_a_look_at_training_places_leaves_the_encoder_as_it_was(
     torch.manual_seed(0)
     encoder = FeatureEncoder(replace(smoke().network, part_dim=16)).train()
     before = {name: tensor.clone() for name, tensor in encoder.state_dict().items()}
-    stream = TrainingStream(tiny_shards, StreamConfig(batch_size=2, image_size=64, hold_out=share))
+    stream = TrainingStream(
+        open_shards(tiny_shards), StreamConfig(batch_size=2, image_size=64, hold_out=share)
+    )
     found = probe(encoder, stream)
     assert encoder.training
     assert all(torch.equal(before[name], tensor) for name, tensor in encoder.state_dict().items())
@@ -78,7 +81,8 @@ def test_a_look_leaves_out_damaged_images_and_says_where_all_are(
 ) -> None:
     encoder = FeatureEncoder(replace(smoke().network, part_dim=16))
     stream = TrainingStream(
-        tiny_shards, StreamConfig(batch_size=2, image_size=64, hold_out=share, threads=1)
+        open_shards(tiny_shards),
+        StreamConfig(batch_size=2, image_size=64, hold_out=share, threads=1),
     )
     whole = embed_view(encoder, stream, View.DRONE)
     drawn, every = count(), 2

@@ -32,7 +32,7 @@ from model.errors import CheckpointError
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.progress import progress
 from pipeline.images.decode import DecodeError, Pixels, decode
-from pipeline.shards.samples import read_shard
+from pipeline.shards.samples import read_samples
 
 
 def tiny(epochs: int = 2) -> Recipe:
@@ -146,7 +146,7 @@ def test_damaged_images_are_counted_in_the_row_and_said_once_an_epoch(
     tiny_shards: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert [row["damaged_images"] for row in rows_of(tiny_shards, tmp_path / "whole")] == [0]
-    bad = next(sample for sample in read_shard(tiny_shards, "train-drone-000000")).data
+    bad = next(sample for sample in read_samples(f"{tiny_shards}/train-drone-000000.tar")).data
 
     def failing(data: bytes) -> Pixels:
         if data == bad:

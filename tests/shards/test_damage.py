@@ -23,8 +23,8 @@ from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.shards.manifest import DAMAGED_FILE, Shard, read_manifest
 from pipeline.shards.pack import pack
-from pipeline.shards.samples import read_shard
 from pipeline.shards.settings import PackingSettings
+from pipeline.shards.shard_set import open_shards
 from pipeline.shards.verify import check_shard, verify
 from pipeline.sources.university1652 import University1652
 from tests.damaging import (
@@ -89,9 +89,7 @@ def a_shard(out: Path) -> tuple[Shard, Path]:
 
 def test_verification_and_embedding_find_each_damage_of_a_tar(out: Path) -> None:
     shard, tar = a_shard(out)
-    look = raising_if_missing(
-        tar, lambda: list(read_shard(str(out), shard.name, shard.split, shard.view, shard.sha256))
-    )
+    look = raising_if_missing(tar, lambda: list(open_shards(str(out)).samples(shard, verify=True)))
     assert count_detected(tar, look, 200) == 201
     for data in damaged_versions(tar.read_bytes(), 60, seed=1):
         tar.write_bytes(data or b"")
@@ -105,7 +103,7 @@ def test_training_refuses_a_damaged_tar_or_leaves_the_damaged_image_out(out: Pat
     reading = StreamConfig(batch_size=2, image_size=16, seed=1, threads=1, shuffle_buffer=4)
 
     def batches() -> list[Any]:
-        return list(TrainingStream(str(out), reading).epoch(0))
+        return list(TrainingStream(open_shards(str(out)), reading).epoch(0))
 
     expected = batches()
     for data in damaged_versions(good, 100):
@@ -182,7 +180,7 @@ def test_the_command_that_packed_makes_the_damaged_shard_anew(
 ) -> None:
     (root, whole), (shard, _) = packed, a_shard(out)
     spoil(what, out, shard)
-    _, wrong = verify(str(out), workers=0)
+    wrong = verify(open_shards(str(out)), workers=0)
     assert wrong
     assert all(shard.name in sentence for sentence in wrong)
     others = {
@@ -190,7 +188,7 @@ def test_the_command_that_packed_makes_the_damaged_shard_anew(
     }
     pack(SOURCE, said(root, out))
     now = {name: (out / name).stat().st_mtime_ns for name in others}
-    assert (now, verify(str(out), workers=0)[1]) == (others, [])
+    assert (now, verify(open_shards(str(out)), workers=0)) == (others, [])
     assert {name: data for name, data in content(out).items() if name.endswith(".tar")} == {
         name: data for name, data in content(whole).items() if name.endswith(".tar")
     }
@@ -212,14 +210,14 @@ def test_an_extended_set_is_mended_by_the_commands_that_packed_it(
     spoilt = manifest.of(Split.TRAIN, View.DRONE)[1], manifest.shards[-1]
     for shard in spoilt:
         spoil(what, out, shard)
-    assert verify(str(out), workers=0)[1]
+    assert verify(open_shards(str(out)), workers=0)
     with pytest.raises(
         InputError,
         match=rf"1 shards of \S+ are damaged, .*--root {first}, then .*--root {second} --extend",
     ):
         pack(SOURCE, said(first, out))
     assert pack(SOURCE, said(second, out, extend=True)) == manifest
-    assert verify(str(out), workers=0)[1] == []
+    assert verify(open_shards(str(out)), workers=0) == []
     same = (".tar", ".json") if "part" in what else (".tar", ".json", ".parquet")
     after = content(out)
     assert after.keys() == before.keys()
@@ -236,7 +234,7 @@ def test_imagery_that_has_changed_mends_nothing_and_spoils_nothing(tmp_path: Pat
     manifest = pack(SOURCE, said(second, out, extend=True))
     shard = manifest.shards[0]
     spoil("tar flipped", out, shard)
-    verify(str(out), workers=0)
+    verify(open_shards(str(out)), workers=0)
     before = content(out)
     for path in (tmp_path / "a").rglob("*.jpg"):
         path.write_bytes(path.read_bytes()[:-2] + b"\0\xff\xd9")

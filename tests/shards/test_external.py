@@ -19,9 +19,10 @@ from pipeline.core.records import Split, View
 from pipeline.features.embed import Encoder, EncoderSpec, embed_gallery
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table
-from pipeline.shards.external import external_metadata, open_manifest
+from pipeline.shards.external import external_metadata
 from pipeline.shards.manifest import read_manifest
-from pipeline.shards.samples import read_shard
+from pipeline.shards.samples import read_samples
+from pipeline.shards.shard_set import open_or_scan, open_shards
 
 TWO = (Split.GALLERY, View.SATELLITE)
 
@@ -68,7 +69,7 @@ def foreign(tmp_path: Path) -> str:
 
 
 def test_a_manifest_is_made_of_what_the_tars_hold(foreign: str) -> None:
-    manifest = open_manifest(foreign, *TWO)
+    manifest = open_or_scan(foreign, *TWO).manifest
     assert [(shard.name, shard.samples) for shard in manifest.shards] == [
         ("part-00", 5),
         ("part-01", 5),
@@ -77,25 +78,27 @@ def test_a_manifest_is_made_of_what_the_tars_hold(foreign: str) -> None:
         data = (Path(foreign) / f"{shard.name}.tar").read_bytes()
         assert (shard.bytes, shard.sha256) == (len(data), hashlib.sha256(data).hexdigest())
         assert (shard.split, shard.view) == (Split.GALLERY, View.SATELLITE)
-    assert open_manifest(Path(foreign).as_uri(), *TWO).shards == manifest.shards
+    assert open_or_scan(Path(foreign).as_uri(), *TWO).manifest.shards == manifest.shards
 
 
 def test_samples_come_with_legal_keys_their_labels_and_their_positions(foreign: str) -> None:
-    first, second = (list(read_shard(foreign, name, *TWO)) for name in ("part-00", "part-01"))
+    first, second = (
+        list(read_samples(f"{foreign}/{name}.tar", TWO)) for name in ("part-00", "part-01")
+    )
     assert [sample.key for sample in first] == [
         f"gallery-satellite-{n // 2}-{n:05d}" for n in range(5)
     ]
-    assert [sample.facts["location"] for sample in first] == ["0", "0", "1", "1", "2"]
-    assert first[3].facts["geotag"] == {"lat": 51.0, "lon": 11.0}
+    assert [sample.metadata["location"] for sample in first] == ["0", "0", "1", "1", "2"]
+    assert first[3].metadata["geotag"] == {"lat": 51.0, "lon": 11.0}
     assert first[3].data == picture(3)
-    assert [sample.facts["location"] for sample in second] == [str(7 + n) for n in range(5)]
+    assert [sample.metadata["location"] for sample in second] == [str(7 + n) for n in range(5)]
     assert len({sample.key for sample in first + second}) == 10
     assert all(
         set(sample.key) <= set("abcdefghijklmnopqrstuvwxyz0123456789_-")
         for sample in first + second
     )
     assert all(
-        sample.key == sample.facts["key"] and sample.facts["view"] == "satellite"
+        sample.key == sample.metadata["key"] and sample.metadata["view"] == "satellite"
         for sample in first + second
     )
 
@@ -137,21 +140,25 @@ def test_without_a_manifest_both_split_and_view_must_be_given(foreign: str, tmp_
     with pytest.raises(
         InputError, match=r"holds 2 tars and no manifest\.json: .* expected both --split and --view"
     ):
-        open_manifest(foreign, view=View.SATELLITE)
+        open_or_scan(foreign, view=View.SATELLITE).manifest
     with pytest.raises(InputError, match=r"part-00\.tar was not packed by jobs/make_shards\.py"):
-        list(read_shard(foreign, "part-00"))
+        list(read_samples(f"{foreign}/part-00.tar"))
     with pytest.raises(InputError, match="not a finished set of shards"):
-        open_manifest(str(tmp_path), *TWO)
+        open_or_scan(str(tmp_path), *TWO).manifest
     with pytest.raises(InputError, match=r"no manifest\.json"):
-        TrainingStream(foreign, StreamConfig())
+        TrainingStream(open_shards(foreign), StreamConfig())
 
 
 def test_shards_of_ours_read_as_they_did(tiny_shards: str) -> None:
     assert (
-        open_manifest(tiny_shards) == open_manifest(tiny_shards, *TWO) == read_manifest(tiny_shards)
+        open_or_scan(tiny_shards).manifest
+        == open_or_scan(tiny_shards, *TWO).manifest
+        == read_manifest(tiny_shards)
     )
     name = read_manifest(tiny_shards).shards[0].name
-    assert list(read_shard(tiny_shards, name)) == list(read_shard(tiny_shards, name, *TWO))
+    assert list(read_samples(f"{tiny_shards}/{name}.tar")) == list(
+        read_samples(f"{tiny_shards}/{name}.tar", TWO)
+    )
 
 
 def test_a_key_that_comes_twice_is_refused(foreign: str) -> None:
@@ -162,13 +169,13 @@ def test_a_key_that_comes_twice_is_refused(foreign: str) -> None:
     with pytest.raises(
         InputError, match=r"sample 00004 is in part-00\.tar and again in part-02\.tar"
     ):
-        open_manifest(foreign, *TWO)
+        open_or_scan(foreign, *TWO).manifest
 
 
 def test_tars_whose_names_say_another_split_or_view_are_left_out(foreign: str) -> None:
     (Path(foreign) / "part-01.tar").rename(Path(foreign) / "query-drone-000000.tar")
-    assert [shard.name for shard in open_manifest(foreign, *TWO).shards] == ["part-00"]
-    found = open_manifest(foreign, Split.QUERY, View.DRONE).shards
+    assert [shard.name for shard in open_or_scan(foreign, *TWO).manifest.shards] == ["part-00"]
+    found = open_or_scan(foreign, Split.QUERY, View.DRONE).manifest.shards
     assert [shard.name for shard in found] == ["part-00", "query-drone-000000"]
 
 

@@ -21,7 +21,8 @@ from pipeline.core import json_files, storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import ImageRecord, Split, View
 from pipeline.shards.manifest import read_manifest
-from pipeline.shards.pack import TooManyRejected, pack
+from pipeline.shards.pack import pack
+from pipeline.shards.pack_tars import TooManyRejected
 from pipeline.shards.plan import ShardSize, plan_shards
 from pipeline.shards.settings import PackingSettings
 from pipeline.sources.university1652 import University1652

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.shards.manifest import read_manifest
-from pipeline.shards.samples import read_locations, read_shard
+from pipeline.shards.samples import read_locations, read_samples
 from pipeline.shards.tar_reader import read_members, read_tar
 
 
@@ -121,12 +121,12 @@ def test_a_shard_of_ours_that_is_cut_off_or_hostile_is_named(
     data = (Path(tiny_shards) / f"{name}.tar").read_bytes()
     (tmp_path / f"{name}.tar").write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match=rf"{name}\.tar is cut off"):
-        list(read_shard(str(tmp_path), name))
+        list(read_samples(str(tmp_path / f"{name}.tar")))
     with pytest.raises(InputError, match=rf"{name}\.tar is cut off"):
-        list(read_locations(str(tmp_path), name))
+        list(read_locations(str(tmp_path / f"{name}.tar")))
     (tmp_path / f"{name}.tar").write_bytes(b"no tar at all" * 100)
     with pytest.raises(InputError, match=rf"{name}\.tar is cut off or damaged"):
-        list(read_shard(str(tmp_path), name))
+        list(read_samples(str(tmp_path / f"{name}.tar")))
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
@@ -139,8 +139,8 @@ def test_hugging_faces_datasets_reads_a_shard_of_ours(tiny_shards: str, tmp_path
     found = datasets.load_dataset(
         "webdataset", data_files=f"{tiny_shards}/{name}.tar", split="train", cache_dir=str(tmp_path)
     )
-    ours = list(read_shard(tiny_shards, name))
+    ours = list(read_samples(f"{tiny_shards}/{name}.tar"))
     assert [row["__key__"] for row in found] == [sample.key for sample in ours]
     assert [row["json"]["location"] for row in found] == [
-        sample.facts["location"] for sample in ours
+        sample.metadata["location"] for sample in ours
     ]
