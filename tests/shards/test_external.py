@@ -140,11 +140,11 @@ def test_without_a_manifest_both_split_and_view_must_be_given(foreign: str, tmp_
     with pytest.raises(
         InputError, match=r"holds 2 tars and no manifest\.json: .* expected both --split and --view"
     ):
-        open_or_scan(foreign, view=View.SATELLITE).manifest
+        open_or_scan(foreign, view=View.SATELLITE)
     with pytest.raises(InputError, match=r"part-00\.tar was not packed by jobs/make_shards\.py"):
         list(read_samples(f"{foreign}/part-00.tar"))
     with pytest.raises(InputError, match="not a finished set of shards"):
-        open_or_scan(str(tmp_path), *TWO).manifest
+        open_or_scan(str(tmp_path), *TWO)
     with pytest.raises(InputError, match=r"no manifest\.json"):
         TrainingStream(open_shards(foreign), StreamConfig())
 
@@ -169,7 +169,7 @@ def test_a_key_that_comes_twice_is_refused(foreign: str) -> None:
     with pytest.raises(
         InputError, match=r"sample 00004 is in part-00\.tar and again in part-02\.tar"
     ):
-        open_or_scan(foreign, *TWO).manifest
+        open_or_scan(foreign, *TWO)
 
 
 def test_tars_whose_names_say_another_split_or_view_are_left_out(foreign: str) -> None:

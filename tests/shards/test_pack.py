@@ -273,7 +273,7 @@ def test_verification_names_every_kind_of_damage(tmp_path: Path, ray_cluster: No
 def test_the_record_table_is_exported_as_parquet_and_geojson(tmp_path: Path) -> None:
     root, out = imagery(tmp_path / "root"), tmp_path / "out"
     (root / "locations.csv").write_text("location,lat,lon\n0001,52.5,13.4\n")
-    manifest = pack(SOURCE, said(root, out))
+    pack(SOURCE, said(root, out))
     assert open_shards(str(out)).export(str(tmp_path / "all.parquet")) == (15, 0)
     rows = pq.read_table(tmp_path / "all.parquet").to_pylist()
     assert len({row["key"] for row in rows}) == 15
