@@ -4,34 +4,24 @@ A finished set is checked by `make_shards.py --verify --out DIR`, and `make_shar
 --out DIR` writes its record table as Parquet or GeoJSON.
 """
 
-from typing import TYPE_CHECKING
-
-import tyro
-
 from jobs.command_line.cli import run
 from jobs.command_line.config import Choice
 from jobs.stages.settings import MakeShardsSettings
 from pipeline.core.errors import InputError
-from pipeline.sources import SOURCES, name_of
+from pipeline.sources import SOURCES, name_of, source_class
 from pipeline.sources.base import Source
 
-SOURCE = Choice(name="source", names=tuple(SOURCES), name_of=name_of, flag=True)
-
-if TYPE_CHECKING:
-    SourceChoice = Source
-else:  # subcommands of the command line: each source has flags of its own
-    SourceChoice = tyro.extras.subcommand_type_from_defaults(
-        {name: kind() for name, kind in SOURCES.items()},
-        {name: (kind.__doc__ or "").splitlines()[0] for name, kind in SOURCES.items()},
-        prefix_names=False,
-    )
+SOURCE = Choice(
+    name="source",
+    names=tuple(SOURCES),
+    name_of=name_of,
+    kind_of=source_class,
+    help=f"Layout of the imagery: {', '.join(SOURCES)}; --source NAME --help lists its flags.",
+)
 
 
-def main(settings: MakeShardsSettings, source: SourceChoice | None = None) -> None:
-    """Pack imagery into webdataset shards, or check or export a finished set.
-
-    `--source NAME` names the imagery's layout; `--source NAME --help` lists the layout's flags.
-    """
+def main(settings: MakeShardsSettings, source: Source | None = None) -> None:
+    """Pack imagery into webdataset shards, or check or export a finished set."""
     from jobs.stages.shards import export_records, pack_source, verify_shards
 
     if settings.verify:

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NoReturn, get_type_hints
+from typing import Annotated, Any, NoReturn, get_type_hints
 
 import tyro
 
@@ -105,10 +105,19 @@ def parse(
 
     Raises InputError, and SystemExit as tyro does.
     """
-    words = expand(job, list(argv), choice, like_file)
-    own = inspect.signature(job).parameters.values()
+    word, words = expand(job, list(argv), choice, like_file)
     hints = get_type_hints(job, include_extras=True)
     added = {"config_flags": ConfigFlags} | ({"like_flag": LikeFlag} if like_file else {})
+    own = dict(inspect.signature(job).parameters)
+    if choice is not None and choice.kind_of is not None:
+        hints[choice.name] = Annotated[str | None, tyro.conf.arg(help=choice.help)]
+        default = None
+        if word is not None:
+            hints[choice.name] = choice.kind_of(word)
+            default = choice.kind_of(word)()
+        own[choice.name] = own[choice.name].replace(default=default)
+    elif word is not None:
+        words = [word, *words]
 
     def collect(**arguments: Any) -> dict[str, Any]:
         return arguments
@@ -118,7 +127,7 @@ def parse(
         inspect.Parameter(name, KEYWORD_ONLY, default=flags(), annotation=flags)
         for name, flags in added.items()
     ]
-    parameters = [parameter.replace(kind=KEYWORD_ONLY) for parameter in own]
+    parameters = [parameter.replace(kind=KEYWORD_ONLY) for parameter in own.values()]
     collect.__signature__ = inspect.Signature(parameters + shared)  # type: ignore[attr-defined]
     collect.__annotations__ = hints | added
     collect.__doc__ = job.__doc__
@@ -132,9 +141,9 @@ def parse(
 
 def expand(
     job: Callable[..., Any], words: list[str], choice: Choice | None, like_file: str | None
-) -> list[str]:
-    """A command line as tyro knows it: the words of `--config` or `--like` before its own, and the
-    choice's word first.
+) -> tuple[str | None, list[str]]:
+    """The choice's word, and the other words, those of `--config` or `--like` before the command
+    line's own.
 
     Raises InputError.
     """
@@ -146,18 +155,18 @@ def expand(
         path = storage.join(run_folder, like_file)
     word, given = read_config(path, job, choice) if path else (None, [])
     if choice is None:
-        return given + words
+        return None, given + words
     chosen = None
-    if choice.flag:
+    if choice.kind_of is not None:
         chosen = take_flag(words, f"--{choice.name}")
     elif words and not words[0].startswith("-"):
         chosen = words.pop(0)
     word = word if chosen is None else chosen
     if word is not None and word not in choice.names:
         known = ", ".join(choice.names)
-        found = f"--{choice.name} is" if choice.flag else f"unknown {choice.name}"
+        found = f"--{choice.name} is" if choice.kind_of else f"unknown {choice.name}"
         raise InputError(f"{found} {word!r}, expected one of: {known}; see --help")
-    return ([] if word is None else [word]) + given + words
+    return word, given + words
 
 
 def take_flag(words: list[str], flag: str) -> str | None:

@@ -29,8 +29,11 @@ class Choice:
     "The words to choose from."
     name_of: Callable[[Any], str]
     "The word for a parsed value."
-    flag: bool
-    "Whether it is given as `--NAME WORD`; else it is the command line's first word."
+    kind_of: Callable[[str], type[Any]] | None = None
+    """The settings that `--NAME WORD` adds; None where the word is a subcommand, the command line's
+    first word."""
+    help: str = ""
+    "Of the flag, where no word was given."
 
 
 def flatten(

@@ -19,7 +19,6 @@ RECIPE = Choice(
     name="recipe",
     names=tuple(RECIPES),
     name_of=lambda recipe: recipe.name if recipe.name in RECIPES else "paper",
-    flag=False,
 )
 """The command line's first word. A recipe of another name is written as all of its settings, so any
 word may stand before them."""

@@ -284,7 +284,7 @@ def test_expand_of_an_unknown_recipe_names_the_known_ones() -> None:
         InputError, match="unknown recipe 'papr', expected one of: paper, paper_384, lpn, "
     ):
         expand(main, ["papr", "--shards", "x"], RECIPE, None)
-    assert expand(main, ["--help"], RECIPE, None) == ["--help"]
+    assert expand(main, ["--help"], RECIPE, None) == (None, ["--help"])
 
 
 def test_the_paper_recipe_is_the_papers() -> None:

@@ -474,5 +474,5 @@ def test_a_source_is_named_by_a_flag_in_either_form() -> None:
         ["--root", "x", "--source=xyz", "--zoom", "3"],
     ):
         found = expand(make_shards.main, words, make_shards.SOURCE, None)
-        assert found == ["xyz", "--root", "x", "--zoom", "3"]
-    assert expand(make_shards.main, ["--help"], make_shards.SOURCE, None) == ["--help"]
+        assert found == ("xyz", ["--root", "x", "--zoom", "3"])
+    assert expand(make_shards.main, ["--help"], make_shards.SOURCE, None) == (None, ["--help"])

@@ -16,7 +16,7 @@ from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import ImageRecord, Rejection, Scanned, SkippedFile, Split, View
 from pipeline.images.decode import decode
-from pipeline.sources import SOURCES, name_of
+from pipeline.sources import name_of, source_class
 from pipeline.sources.base import scan_images
 from pipeline.sources.maps.georeference import ELLIPSOID
 from pipeline.sources.photos import HEAD_BYTES, Photos, aim_point
@@ -69,7 +69,7 @@ def test_a_photo_becomes_a_query_from_a_drone_with_the_cameras_geotag(tmp_path: 
         -45,
     )
     assert name_of(Photos()) == "photos"
-    assert SOURCES["photos"] is Photos
+    assert source_class("photos") is Photos
 
 
 def test_photos_are_found_at_any_depth_with_any_name(tmp_path: Path) -> None:

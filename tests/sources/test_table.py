@@ -16,7 +16,7 @@ import pytest
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View
-from pipeline.sources import SOURCES
+from pipeline.sources import source_class
 from pipeline.sources.maps.geojson_shapes import centroid, order_footprint
 from pipeline.sources.table import Table
 
@@ -69,7 +69,7 @@ def test_a_row_of_csv_becomes_a_record(tmp_path: Path) -> None:
         geotag=GeoTag(lat=-33.5, lon=-70.75, altitude_m=100, heading_deg=270, pitch_deg=-45),
         taken_at="2024-05-01T12:34:56+02:00",
     )
-    assert SOURCES["table"] is Table
+    assert source_class("table") is Table
 
 
 def test_a_path_is_enough_and_settings_say_the_rest(tmp_path: Path) -> None:
