@@ -39,7 +39,7 @@ def compare(runs: Sequence[EvaluationResults]) -> list[dict[str, Any]]:
     for base in baseline.metrics:
         rows.append({"run": baseline.name, **base})
         for run in runs[1:]:
-            own = run.of(base)
+            own = run.metrics_for(base)
             if own is not None:
                 rows.append({"run": run.name, **own} | _differences(run, baseline, base))
     if len(rows) == len(baseline.metrics):
@@ -72,7 +72,7 @@ def _differences(
 
 def _by_query(run: EvaluationResults, base: dict[str, Any]) -> pa.Table:
     columns = ("query", "location", "first_match_rank", "ap")
-    rows = [{name: row[name] for name in columns} for row in run.results_of(base)]
+    rows = [{name: row[name] for name in columns} for row in run.rows_for(base)]
     return pa.Table.from_pylist(sorted(rows, key=lambda row: str(row["query"])))
 
 

@@ -1,168 +1,261 @@
-"""Charts that say how far to trust the measures: by number of views, and how scores of right and
-wrong answers part.
+"""Charts, each described once in data units: series, intervals, axes and labels.
+
+In: metric rows, per-query rows and view gaps of an evaluation. Out: a `Chart` or a `Scatter`. `svg`
+draws them for the page, `figure_charts` for papers.
 """
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from pipeline.core.arrays import Ints
 from pipeline.report.inputs import EvaluationResults
-from pipeline.report.svg import Chart, Frame, Tick, nice_ticks
+from pipeline.retrieval.metrics import one_percent_k, recall_at
 
+CURVE_POINTS = 160  # of a curve over thousands of K: more than the pixels can resolve
 SCORE_BINS = 24
 
-
-def views_chart(title: str, rows: Sequence[Mapping[str, Any]]) -> Chart | None:
-    """R@1 over the number of views a query is the mean of, with the bounds of its 95 % intervals;
-    None without rows.
-    """
-    if not rows:
-        return None
-    at = {row["views"]: np.log2(row["views"]) for row in rows}
-    frame = Frame(0, max(at.values()), 0, 1)
-    dots = [
-        (at[row["views"]], row["r1"], f"{row['views']} views: {100 * row['r1']:.2f} %")
-        for row in rows
-    ]
-    lines = [
-        frame.line(
-            f"95 % interval, {end}",
-            "beside",
-            [(at[row["views"]], row[f"r1_{end}"]) for row in rows],
-        )
-        for end in ("low", "high")
-    ]
-    lines.append(frame.line("R@1", "main", [(x, y) for x, y, _ in dots], dots))
-    return Chart(
-        title=title,
-        note=f"from {rows[0]['queries']:,} queries of one view; dashed: 95 % intervals",
-        summary=f"{title}: " + ", ".join(text for _, _, text in dots),
-        lines=tuple(lines),
-        x_ticks=tuple(Tick(at=frame.x(x), label=str(views)) for views, x in at.items()),
-        y_ticks=tuple(Tick(at=frame.y(y), label=f"{100 * y:g} %") for y in (0, 0.25, 0.5, 0.75, 1)),
-    )
+Row = Mapping[str, Any]
+Point = tuple[float, float]
 
 
-def scores_chart(title: str, rows: Sequence[Mapping[str, Any]]) -> Chart | None:
-    """Shares of the queries by the score of their best true match and of their best wrong answer;
-    None where none has both.
-
-    A wrong answer that is not among the top ten is worth less than these, and is left out.
-    """
-    right, wrong = best_scores(rows)
-    if not right or not wrong:
-        return None
-    low, high = min(*right, *wrong), max(*right, *wrong)
-    x_ticks = nice_ticks(low, high)
-    edges = np.linspace(x_ticks[0], x_ticks[-1], SCORE_BINS + 1)
-    shares = {
-        name: np.histogram(scores, edges)[0] / len(scores)
-        for name, scores in (("wrong", wrong), ("right", right))
-    }
-    y_ticks = nice_ticks(0, float(max(share.max() for share in shares.values())))
-    frame = Frame(x_ticks[0], x_ticks[-1], 0, y_ticks[-1])
-    middles = (edges[:-1] + edges[1:]) / 2
-    styles = {"right": "main", "wrong": "beside"}
-    return Chart(
-        title=title,
-        note="queries by the score of their best true match; dashed: of their best wrong answer",
-        summary=f"{title}: median score {np.median(right):.3f} of true matches, {np.median(wrong):.3f} of wrong answers",
-        lines=tuple(
-            frame.line(
-                f"best {name} answer",
-                styles[name],
-                list(zip(middles.tolist(), share.tolist(), strict=True)),
-            )
-            for name, share in shares.items()
-        ),
-        x_ticks=tuple(Tick(at=frame.x(x), label=f"{x:g}") for x in x_ticks),
-        y_ticks=tuple(Tick(at=frame.y(y), label=f"{100 * y:g} %") for y in y_ticks),
-    )
+@dataclass(frozen=True, kw_only=True)
+class Tick:
+    at: float
+    label: str
 
 
-def best_scores(rows: Sequence[Mapping[str, Any]]) -> tuple[list[float], list[float]]:
-    """Scores of the best true match and of the best wrong answer, of the queries that have one."""
-    right = [row["first_match_score"] for row in rows if row["first_match_score"] is not None]
-    return right, [score for row in rows if (score := _best_wrong(row)) is not None]
+@dataclass(frozen=True, kw_only=True)
+class Axis:
+    label: str
+    "Without the unit. Only papers show it; the page has the chart's note."
+    low: float
+    high: float
+    ticks: tuple[Tick, ...]
+    log: bool = False
+    percent: bool = False
+    "The values are fractions, shown as percent."
 
 
-def _best_wrong(row: Mapping[str, Any]) -> float | None:
-    answers = zip(row["top_locations"], row["top_scores"], strict=True)
-    return next((score for location, score in answers if location != row["location"]), None)
+@dataclass(frozen=True, kw_only=True)
+class Series:
+    """One curve."""
+
+    name: str
+    points: tuple[Point, ...]
+    role: Literal["main", "beside"] = "main"
+    "beside: drawn dashed, for comparison."
+    dots: tuple[tuple[float, float, str], ...] = ()
+    "x, y and text of the points that are drawn as dots."
+    interval: tuple[tuple[float, float, float], ...] = ()
+    "x, low and high of the 95 % interval; empty if there is none."
+    bin_edges: tuple[float, ...] = ()
+    "Edges of the bins whose middles the points are; empty if the series is no histogram."
 
 
-WIDTH, HEIGHT, MARGIN = 400, 320, 14
+@dataclass(frozen=True, kw_only=True)
+class Chart:
+    title: str
+    note: str
+    summary: str
+    "The chart in words, for screen readers."
+    series: tuple[Series, ...]
+    x: Axis
+    y: Axis
+    marks: tuple[float, ...] = ()
+    "x of the vertical hairlines."
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scatter:
-    """Points of two views; each view's are one path of the template."""
+    """Embeddings of two views in two dimensions. Both axes have one scale, since distances in the
+    embedding have."""
 
     title: str
     summary: str
-    "The picture in words, for those who cannot see it."
+    "The picture in words, for screen readers."
     query_view: str
     gallery_view: str
-    dots: str
-    "The queries' view: strokes of no length, which round caps make discs."
-    triangles: str
-    joins: str
-    "Thin lines between the two images of a true pair."
+    query_points: tuple[Point, ...]
+    gallery_points: tuple[Point, ...]
+    pairs: tuple[tuple[Point, Point], ...]
+    "The two images of a true pair, to be joined by a line."
     shares: tuple[float, float]
-    figures: tuple[tuple[str, str, str], ...]
-    "What, its value, and what it means."
+    "Share of the variance along either axis."
+    statistics: tuple[tuple[str, str, str], ...]
+    "Name, value and meaning."
 
 
-def scatter(gap: Mapping[str, Any], beside: EvaluationResults | None = None) -> Scatter:
-    """One row of view_gap.json; its figures with those of another evaluation, where that has them.
-    Both axes have one scale, as distances in the embedding have."""
-    query_view, gallery_view = gap["task"].split("->")
-    figures = _figures(gap)
-    for other in beside.gaps if beside else ():
-        if other["task"] == gap["task"] and beside:
-            pairs = zip(figures, _figures(other), strict=True)
-            figures = [
-                (what, value, f"{meaning}; {beside.name}: {theirs[1]}")
-                for (what, value, meaning), theirs in pairs
-            ]
-    at_S2 = np.array(
-        [(point["x"], -point["y"]) for point in gap["points"]]
-    )  # SVG's y grows downwards
-    low, high = at_S2.min(0), at_S2.max(0)
-    room = np.array([WIDTH, HEIGHT]) - 2 * MARGIN
-    scale = float((room / np.maximum(high - low, 1e-9)).min())
-    xy = [
-        (round(x, 1), round(y, 1))
-        for x, y in (np.array([WIDTH, HEIGHT]) / 2 + (at_S2 - (low + high) / 2) * scale).tolist()
-    ]
-    sides = [point["side"] for point in gap["points"]]
-    corners = [at for at, side in zip(xy, sides, strict=True) if side == "gallery"]
-    return Scatter(
-        title=f"{query_view} and {gallery_view} images",
-        summary=f"{sides.count('query')} {query_view} and {sides.count('gallery')} {gallery_view} images in two dimensions: "
-        + "; ".join(f"{what} {value}" for what, value, _ in figures),
-        query_view=query_view,
-        gallery_view=gallery_view,
-        dots="".join(
-            f"M{x} {y}h0" for (x, y), side in zip(xy, sides, strict=True) if side == "query"
-        ),
-        triangles="".join(f"M{x} {y - 4.2:.1f}l4.2 7h-8.4z" for x, y in corners),
-        joins="".join(f"M{xy[i][0]} {xy[i][1]}L{xy[j][0]} {xy[j][1]}" for i, j in gap["joined"]),
-        shares=(gap["shares"][0], gap["shares"][1]),
-        figures=tuple(figures),
+def nice_ticks(low: float, high: float, most: int = 4) -> list[float]:
+    """At most `most` + 1 round numbers, equally spaced, that enclose [low, high]."""
+    if high <= low:
+        pad = abs(low) * 0.1 or 1.0
+        low, high = low - pad, high + pad
+    for exponent in range(math.floor(math.log10((high - low) / most)), 400):
+        for unit in (1, 2, 5):
+            step = unit * 10.0**exponent
+            first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+            if last - first <= most:
+                return [float(f"{i * step:.12g}") for i in range(first, last + 1)]
+    raise AssertionError("unreachable: some step spans the whole range")
+
+
+def share_axis(label: str) -> Axis:
+    """A y axis from 0 to 100 %."""
+    ticks = tuple(Tick(at=y, label=f"{100 * y:g} %") for y in (0, 0.25, 0.5, 0.75, 1))
+    return Axis(label=label, low=0, high=1, ticks=ticks, percent=True)
+
+
+def recall_chart(
+    title: str, note: str, first_Q: Ints, gallery: int, beside_Q: Ints | None, beside_name: str
+) -> Chart:
+    """Recall@K over K on a logarithmic axis, with dots at K = 1, 5, 10 and the top 1 %."""
+    ks = sorted({min(gallery, round(k)) for k in np.geomspace(1, max(gallery, 1), CURVE_POINTS)})
+    named = {k for k in (1, 5, 10, one_percent_k(gallery)) if k <= gallery}
+
+    def curve(first: Ints, among: Iterable[int]) -> tuple[Point, ...]:
+        return tuple((k, recall_at(k, first)) for k in among)
+
+    dots = tuple((k, y, f"R@{k:.0f}: {100 * y:.2f} %") for k, y in curve(first_Q, sorted(named)))
+    series = [Series(name="this network", points=curve(first_Q, ks), dots=dots)]
+    if beside_Q is not None:
+        series.insert(0, Series(name=beside_name, role="beside", points=curve(beside_Q, ks)))
+    decades = [10**i for i in range(int(math.log10(gallery)) + 1)]
+    ticks = tuple(Tick(at=k, label=f"{k:,}") for k in decades)
+    return Chart(
+        title=title,
+        note=note,
+        summary=f"{title}: " + ", ".join(text for _, _, text in dots),
+        series=tuple(series),
+        x=Axis(label="K", low=1, high=max(gallery, 2), ticks=ticks, log=True),
+        y=share_axis("Recall@K"),
     )
 
 
-def _figures(gap: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def views_chart(title: str, rows: Sequence[Row]) -> Chart | None:
+    """R@1 over the number of views per query, with its 95 % interval; None without rows."""
+    if not rows:
+        return None
+    dots = tuple(
+        (row["views"], row["r1"], f"{row['views']} views: {100 * row['r1']:.2f} %") for row in rows
+    )
+    curve = Series(
+        name="R@1",
+        points=tuple((x, y) for x, y, _ in dots),
+        dots=dots,
+        interval=tuple((row["views"], row["r1_low"], row["r1_high"]) for row in rows),
+    )
+    views = [row["views"] for row in rows]
+    ticks = tuple(Tick(at=x, label=str(x)) for x in views)
+    return Chart(
+        title=title,
+        note=f"from {rows[0]['queries']:,} queries of one view; dashed: 95 % intervals",
+        summary=f"{title}: " + ", ".join(text for _, _, text in dots),
+        series=(curve,),
+        x=Axis(label="views per query, averaged", low=1, high=max(views), ticks=ticks, log=True),
+        y=share_axis("R@1"),
+    )
+
+
+def scores_chart(title: str, rows: Sequence[Row]) -> Chart | None:
+    """Shares of the queries by the score of their best true match and of their best wrong answer;
+    None if either is missing everywhere.
+
+    A wrong answer outside the top ten scores less than these, and is left out.
+    """
+    right, wrong = best_scores(rows)
+    if not right or not wrong:
+        return None
+    x_ticks = nice_ticks(min(*right, *wrong), max(*right, *wrong))
+    edges = np.linspace(x_ticks[0], x_ticks[-1], SCORE_BINS + 1)
+    middles = ((edges[:-1] + edges[1:]) / 2).tolist()
+
+    def histogram(name: str, role: Literal["main", "beside"], scores: Sequence[float]) -> Series:
+        shares = (np.histogram(scores, edges)[0] / len(scores)).tolist()
+        points = tuple(zip(middles, shares, strict=True))
+        return Series(name=name, role=role, points=points, bin_edges=tuple(edges.tolist()))
+
+    series = (
+        histogram("best wrong answer", "beside", wrong),
+        histogram("best right answer", "main", right),
+    )
+    y_ticks = nice_ticks(0, max(y for each in series for _, y in each.points))
+    return Chart(
+        title=title,
+        note="queries by the score of their best true match; dashed: of their best wrong answer",
+        summary=f"{title}: median score {np.median(right):.3f} of true matches, "
+        f"{np.median(wrong):.3f} of wrong answers",
+        series=series,
+        x=Axis(
+            label="cosine of the best answer",
+            low=x_ticks[0],
+            high=x_ticks[-1],
+            ticks=tuple(Tick(at=x, label=f"{x:g}") for x in x_ticks),
+        ),
+        y=Axis(
+            label="queries",
+            low=0,
+            high=y_ticks[-1],
+            ticks=tuple(Tick(at=y, label=f"{100 * y:g} %") for y in y_ticks),
+            percent=True,
+        ),
+    )
+
+
+def best_scores(rows: Sequence[Row]) -> tuple[list[float], list[float]]:
+    """Scores of the best true match and of the best wrong answer, each over the queries that have
+    one."""
+    right = [row["first_match_score"] for row in rows if row["first_match_score"] is not None]
+    return right, [score for row in rows if (score := _best_wrong(row)) is not None]
+
+
+def _best_wrong(row: Row) -> float | None:
+    answers = zip(row["top_locations"], row["top_scores"], strict=True)
+    return next((score for location, score in answers if location != row["location"]), None)
+
+
+def scatter(gap: Row, beside: EvaluationResults | None = None) -> Scatter:
+    """One row of view_gap.json. If another evaluation has the same task, its statistics are quoted
+    beside."""
+    query_view, gallery_view = gap["task"].split("->")
+    statistics = _gap_statistics(gap)
+    for other in beside.gaps if beside else ():
+        if other["task"] == gap["task"] and beside:
+            pairs = zip(statistics, _gap_statistics(other), strict=True)
+            statistics = [
+                (name, value, f"{meaning}; {beside.name}: {theirs[1]}")
+                for (name, value, meaning), theirs in pairs
+            ]
+    at = [(point["x"], point["y"]) for point in gap["points"]]
+    by_side: dict[str, list[Point]] = {"query": [], "gallery": []}
+    for point, xy in zip(gap["points"], at, strict=True):
+        by_side[point["side"]].append(xy)
+    return Scatter(
+        title=f"{query_view} and {gallery_view} images",
+        summary=f"{len(by_side['query'])} {query_view} and {len(by_side['gallery'])} {gallery_view} "
+        "images in two dimensions: "
+        + "; ".join(f"{name} {value}" for name, value, _ in statistics),
+        query_view=query_view,
+        gallery_view=gallery_view,
+        query_points=tuple(by_side["query"]),
+        gallery_points=tuple(by_side["gallery"]),
+        pairs=tuple((at[i], at[j]) for i, j in gap["joined"]),
+        shares=(gap["shares"][0], gap["shares"][1]),
+        statistics=tuple(statistics),
+    )
+
+
+def _gap_statistics(gap: Row) -> list[tuple[str, str, str]]:
     true, other = gap["true"], gap["other"]
-    of_both = " with ".join(gap["task"].split("->"))
+    both = " with ".join(gap["task"].split("->"))
     return [
         (
             "Cosine of true pairs",
             _cosine(true),
-            f"{of_both} image of one place, {true['pairs']:,} pairs",
+            f"{both} image of one place, {true['pairs']:,} pairs",
         ),
         (
             "of other pairs",
@@ -182,5 +275,5 @@ def _figures(gap: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     ]
 
 
-def _cosine(said: Mapping[str, float]) -> str:
-    return f"{said['mean']:.3f} ({said['low']:.2f} to {said['high']:.2f})"
+def _cosine(summary: Mapping[str, float]) -> str:
+    return f"{summary['mean']:.3f} ({summary['low']:.2f} to {summary['high']:.2f})"

@@ -1,32 +1,28 @@
-"""A map of errors: per-query rows with positions in, a picture's geometry, the farthest answers and
-their distances out.
-"""
+"""The map of errors and the curve of distances: per-query rows with positions in, a map in sheet
+coordinates, the farthest answers and a chart out. Page and papers draw the same map."""
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from pipeline.report.charts import Axis, Chart, Row, Series, Tick, share_axis
 from pipeline.report.map_sheet import MapSheet, format_metres
-from pipeline.report.svg import Chart, Frame, Tick
 
 MAX_LINES = 300
 MAX_WORST = 5
 
-Row = Mapping[str, Any]
-
 
 @dataclass(frozen=True, kw_only=True)
 class MapLocation:
-    """A place that was asked for."""
+    """A place that was queried."""
 
     x: float
     y: float
     found: bool
-    "Whether at least half of its queries have it first."
+    "At least half of its queries have it first."
     text: str
 
 
@@ -37,34 +33,34 @@ class ErrorMap:
     summary: str
     places: tuple[MapLocation, ...]
     lines: tuple[tuple[float, float, float, float, str], ...]
-    "From a place to where a wrong first answer lies, and what to say of it."
+    "From a place to the position of a wrong first answer: x, y, x, y and the text."
     bar: tuple[float, str]
-    "Length of the scale bar and what it stands for."
+    "Length of the scale bar and its label."
     meridians: tuple[Tick, ...]
     parallels: tuple[Tick, ...]
     worst: tuple[Row, ...]
-    "Of different places the queries whose first answer lies farthest off."
+    "The queries whose first answer lies farthest off, one per place."
 
     @property
     def opacity(self) -> float:
-        """Of the lines: many are drawn fainter."""
+        """Opacity of the lines: the more there are, the fainter."""
         return min(0.65, 4 / math.sqrt(max(len(self.lines), 1)))
 
 
 def with_positions(rows: Sequence[Row]) -> list[Row]:
-    """The queries whose place and whose best answer have positions."""
+    """The queries whose place and best answer both have positions."""
     return [row for row in rows if row.get("distance_m") is not None]
 
 
 def error_map(title: str, rows: Sequence[Row]) -> ErrorMap | None:
-    """None where no positions are known."""
+    """The map of one task; None if no positions are known."""
     known = with_positions(rows)
     if not known:
         return None
-    of_place: dict[str, list[Row]] = {}
+    by_place: dict[str, list[Row]] = {}
     for row in known:
-        of_place.setdefault(row["location"], []).append(row)
-    asked_L2 = np.array([(each[0]["lat"], each[0]["lon"]) for each in of_place.values()])
+        by_place.setdefault(row["location"], []).append(row)
+    asked_L2 = np.array([(each[0]["lat"], each[0]["lon"]) for each in by_place.values()])
     wrong = Counter(
         (row["location"], row["top_locations"][0], row["answer_lat"], row["answer_lon"])
         for row in known if row["first_match_rank"] != 1
@@ -76,25 +72,30 @@ def error_map(title: str, rows: Sequence[Row]) -> ErrorMap | None:
     drawn = sorted(wrong, key=lambda line: (-far[line[:2]], line))[:MAX_LINES]
     answers_N2 = np.array([line[2:] for line in drawn]).reshape(-1, 2)
     sheet = MapSheet.around(np.concatenate([asked_L2, answers_N2]))
-    at = dict(zip(of_place, sheet.xy(asked_L2), strict=True))
+    at = dict(zip(by_place, sheet.xy(asked_L2), strict=True))
     lines = []
     for line, end in zip(drawn, sheet.xy(answers_N2), strict=True):
         place, answer = line[:2]
-        said = f"{place} taken for {answer}, {format_metres(far[place, answer])} off, {wrong[line]} of {len(of_place[place])}"
-        lines.append((*at[place], *end, said))
+        text = (
+            f"{place} taken for {answer}, {format_metres(far[place, answer])} off, "
+            f"{wrong[line]} of {len(by_place[place])}"
+        )
+        lines.append((*at[place], *end, text))
     places = []
-    for name, each in of_place.items():
+    for name, each in by_place.items():
         hits = sum(row["first_match_rank"] == 1 for row in each)
-        said = f"{name}: {hits} of {len(each)} queries right"
+        text = f"{name}: {hits} of {len(each)} queries right"
         places.append(
-            MapLocation(x=at[name][0], y=at[name][1], found=2 * hits >= len(each), text=said)
+            MapLocation(x=at[name][0], y=at[name][1], found=2 * hits >= len(each), text=text)
         )
     misses = sum(wrong.values())
     cut = f"; of {len(wrong):,} lines the {MAX_LINES} longest" if len(wrong) > MAX_LINES else ""
     return ErrorMap(
         title=title,
-        note=f"{len(places):,} places; a line leads from a place to where a wrong first answer lies{cut}",
-        summary=f"Map of {len(places):,} places: {misses:,} of {len(known):,} first answers are wrong",
+        note=f"{len(places):,} places; "
+        f"a line leads from a place to where a wrong first answer lies{cut}",
+        summary=f"Map of {len(places):,} places: "
+        f"{misses:,} of {len(known):,} first answers are wrong",
         places=tuple(places),
         lines=tuple(lines),
         bar=sheet.bar(),
@@ -112,19 +113,19 @@ def distance_chart(title: str, rows: Sequence[Row]) -> Chart | None:
     if not len(off_N):
         return None
     top = math.ceil(math.log10(max(off_N[-1], 10.0)))
-    frame = Frame(0, top, 0, 1)
-    at = np.linspace(0, top, 121)
-    shares = np.searchsorted(off_N, 10**at, side="right") / len(off_N)
+    within = 10.0 ** np.linspace(0, top, 121)
+    shares = np.searchsorted(off_N, within, side="right") / len(off_N)
+    decades = [10.0**i for i in range(0, top + 1, 1 if top < 6 else 2)]
+    ticks = tuple(Tick(at=each, label=format_metres(each)) for each in decades)
+    points = tuple(zip(within.tolist(), shares.tolist(), strict=True))
     return Chart(
         title=title,
         note="share of the queries whose best answer lies within so far of the place",
-        summary=f"{title}: half within {format_metres(float(np.median(off_N)))}, the farthest {format_metres(float(off_N[-1]))} off",
-        lines=(frame.line("within", "main", list(zip(at.tolist(), shares.tolist(), strict=True))),),
-        x_ticks=tuple(
-            Tick(at=frame.x(i), label=format_metres(10.0**i))
-            for i in range(0, top + 1, 1 if top < 6 else 2)
-        ),
-        y_ticks=tuple(Tick(at=frame.y(y), label=f"{100 * y:g} %") for y in (0, 0.25, 0.5, 0.75, 1)),
+        summary=f"{title}: half within {format_metres(float(np.median(off_N)))}, "
+        f"the farthest {format_metres(float(off_N[-1]))} off",
+        series=(Series(name="within", points=points),),
+        x=Axis(label="distance (m)", low=1, high=10.0**top, ticks=ticks, log=True),
+        y=share_axis("queries"),
     )
 
 

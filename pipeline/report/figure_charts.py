@@ -1,138 +1,81 @@
-"""The curves, scatters and maps of a paper's figures: findings in, matplotlib figures out."""
+"""Charts of a paper: descriptions of `charts`, `tables` and `error_map` in, matplotlib figures out."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.report import map_sheet
-from pipeline.report.charts import SCORE_BINS, best_scores
+from pipeline.report.charts import Axis, Chart, Point, Scatter, Series
 from pipeline.report.error_map import ErrorMap
-from pipeline.report.svg import CURVE_POINTS
-from pipeline.report.tasks import TaskView, first_ranks
-from pipeline.retrieval.metrics import recall_at
+from pipeline.report.tables import WhiskerTable
 
-COLUMN = 3.4  # inches: one column of a paper of two
+COLUMN = 3.4  # inches: one column of a two-column paper
 BLUE, ORANGE, GREEN, RED, GREY = "#0072b2", "#d55e00", "#16803c", "#c8322b", "#777777"
-STYLES = ((BLUE, "-"), (ORANGE, "--"), (GREEN, "-."), (GREY, ":"))  # told apart without colour too
+STYLES = ((BLUE, "-"), (ORANGE, "--"), (GREEN, "-."), (GREY, ":"))  # distinct without colour too
+ROLE_STYLES = {"main": STYLES[0], "beside": STYLES[1]}
 
-Row = Mapping[str, Any]
 
-
-def recall_figure(tasks: Sequence[TaskView]) -> Figure:
-    """Recall@K of every task over K."""
-    figure, [axes] = _sheet(1)
-    for i, task in enumerate(tasks):
-        colour, dashes = STYLES[i % len(STYLES)]
-        ks = sorted({round(k) for k in np.geomspace(1, task.row["gallery"], CURVE_POINTS)})
-        shares = [100 * recall_at(k, first_ranks(task.rows)) for k in ks]
-        axes.plot(ks, shares, color=colour, linestyle=dashes, label=task.name)
-    axes.set(xscale="log", xlabel="K", ylabel="Recall@K (%)", ylim=(0, 101))
+def recall_figure(charts: Sequence[Chart]) -> Figure:
+    """The recall curves of all tasks in one set of axes."""
+    figure, [axes] = _figure(1)
+    for i, chart in enumerate(charts):
+        [series] = [each for each in chart.series if each.role == "main"]
+        _draw_curve(axes, series, STYLES[i % len(STYLES)], chart.title)
+    _label_axis(axes, "x", charts[0].x)
+    _label_axis(axes, "y", charts[0].y)
+    axes.set(ylim=(0, 1.01))
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.legend(loc="lower right")
     return figure
 
 
-def scores_figure(tasks: Sequence[TaskView]) -> Figure:
-    """How the scores of best true matches and best wrong answers spread."""
-    figure, sheets = _sheet(len(tasks))
-    for axes, task in zip(sheets, tasks, strict=True):
-        both = best_scores(task.rows)
-        edges = np.histogram_bin_edges(np.concatenate(both), SCORE_BINS).tolist()
-        for scores, name, (colour, dashes) in zip(both, ("true", "wrong"), STYLES, strict=False):
-            if scores:
-                weights = np.full(len(scores), 100 / len(scores))
-                axes.hist(
-                    scores,
-                    edges,
-                    weights=weights,
-                    histtype="step",
-                    color=colour,
-                    linestyle=dashes,
-                    label=name,
-                )
-        axes.set(title=task.name, xlabel="cosine of the best answer", ylabel="queries (%)")
+def charts_figure(charts: Sequence[Chart]) -> Figure:
+    """Charts side by side, each with its series, intervals and legend."""
+    figure, sheets = _figure(len(charts))
+    for axes, chart in zip(sheets, charts, strict=True):
+        for series in sorted(chart.series, key=lambda each: each.role, reverse=True):
+            _draw_curve(axes, series, ROLE_STYLES[series.role], series.name)
+        _label_axis(axes, "x", chart.x)
+        _label_axis(axes, "y", chart.y)
+        if chart.x.log:
+            axes.set_xticks([tick.at for tick in chart.x.ticks], [t.label for t in chart.x.ticks])
+            axes.minorticks_off()
+        axes.set(title=chart.title)
         axes.legend()
     return figure
 
 
-def views_figure(rows: Sequence[Row]) -> Figure:
-    """R@1 by the number of views, with 95 % intervals."""
-    figure, [axes] = _sheet(1)
-    views, r1, low, high = (
-        np.array([row[name] for row in rows]) for name in ("views", "r1", "r1_low", "r1_high")
-    )
-    axes.fill_between(
-        views, 100 * low, 100 * high, color=BLUE, alpha=0.18, linewidth=0, label="95 % interval"
-    )
-    axes.plot(views, 100 * r1, color=BLUE, marker="o", markersize=3, label="R@1")
-    axes.set(xscale="log", xlabel="views a query is the mean of", ylabel="R@1 (%)")
-    axes.set_xticks(views, [str(each) for each in views])
-    axes.minorticks_off()
-    axes.legend()
-    return figure
-
-
-def whiskers_figure(
-    tasks: Sequence[TaskView], rows: Sequence[Row], of: str, label: Callable[[Row], str]
-) -> Figure:
-    """R@1 of each row with its 95 % interval, by task; dashed: the whole task. `of`: what the rows'
-    labels are of.
-    """
-    of_task = [(task, [row for row in rows if row["task"] == task.row["task"]]) for task in tasks]
-    shown = [(task, own) for task, own in of_task if len(own) > 1] or of_task[:1]
-    figure, sheets = _sheet(len(shown), 0.5 + 0.17 * max(len(own) for _, own in shown))
-    for axes, (task, own) in zip(sheets, shown, strict=True):
+def whiskers_figure(tables: Sequence[WhiskerTable]) -> Figure:
+    """R@1 of each row with its 95 % interval, a table in each set of axes; dashed: the whole
+    task."""
+    figure, sheets = _figure(len(tables), 0.5 + 0.17 * max(len(table.rows) for table in tables))
+    for axes, table in zip(sheets, tables, strict=True):
         r1, low, high = (
-            100 * np.array([row[name] for row in own]) for name in ("r1", "r1_low", "r1_high")
+            100 * np.array(column)
+            for column in zip(*((row.r1, row.low, row.high) for row in table.rows), strict=True)
         )
-        at = np.arange(len(own))[::-1]
+        at = np.arange(len(r1))[::-1]
         axes.errorbar(
             r1, at, xerr=[r1 - low, high - r1], fmt="o", color=BLUE, markersize=3, elinewidth=1
         )
-        axes.axvline(100 * task.row["r1"], color=GREY, linestyle="--", linewidth=0.8)
-        axes.set_yticks(at, [label(row) for row in own])
-        axes.set(title=task.name, xlabel="R@1 (%)", ylabel=of, ylim=(-0.6, len(own) - 0.4))
+        axes.axvline(100 * table.overall, color=GREY, linestyle="--", linewidth=0.8)
+        axes.set_yticks(at, [row.label for row in table.rows])
+        axes.set(title=table.title, xlabel="R@1 (%)", ylabel=table.heading)
+        axes.set(ylim=(-0.6, len(r1) - 0.4))
         axes.grid(visible=False, axis="y")
     return figure
 
 
-def group_label(row: Row) -> str:
-    return str(row["value"])
-
-
-def gap_figure(gap: Row) -> Figure:
-    """Both views on the two directions of greatest variance, some true pairs joined."""
-    figure, [axes] = _sheet(1, 2.8)
-    at = np.array([(point["x"], point["y"]) for point in gap["points"]])
-    asked = np.array([point["side"] == "query" for point in gap["points"]])
-    names = gap["task"].split("->")
-    for i, j in gap["joined"]:
-        axes.plot(*at[[i, j]].T, color=GREY, linewidth=0.4, zorder=1)
-    axes.scatter(
-        at[asked, 0],
-        at[asked, 1],
-        s=7,
-        color=BLUE,
-        marker="o",
-        linewidths=0,
-        alpha=0.75,
-        label=names[0],
-        zorder=2,
-    )
-    axes.scatter(
-        at[~asked, 0],
-        at[~asked, 1],
-        s=11,
-        color=ORANGE,
-        marker="^",
-        linewidths=0,
-        label=names[1],
-        zorder=3,
-    )
-    first, second = (100 * share for share in gap["shares"])
+def scatter_figure(scatter: Scatter) -> Figure:
+    """Both views on the two directions of greatest variance, with some true pairs joined."""
+    figure, [axes] = _figure(1, 2.8)
+    for pair in scatter.pairs:
+        axes.plot(*zip(*pair, strict=True), color=GREY, linewidth=0.4, zorder=1)
+    _draw_points(axes, scatter.query_points, scatter.query_view, BLUE, "o", 7, 2)
+    _draw_points(axes, scatter.gallery_points, scatter.gallery_view, ORANGE, "^", 11, 3)
+    first, second = (100 * share for share in scatter.shares)
     axes.set(
         xlabel=f"1st component ({first:.0f} % of the variance)",
         ylabel=f"2nd ({second:.0f} %)",
@@ -144,7 +87,7 @@ def gap_figure(gap: Row) -> Figure:
 
 def map_figure(drawn: ErrorMap) -> Figure:
     """The page's map of errors."""
-    figure, [axes] = _sheet(1, COLUMN * map_sheet.MAP_HEIGHT / map_sheet.MAP_WIDTH)
+    figure, [axes] = _figure(1, COLUMN * map_sheet.MAP_HEIGHT / map_sheet.MAP_WIDTH)
     for x1, y1, x2, y2, _ in drawn.lines:
         axes.plot([x1, x2], [y1, y2], color=RED, linewidth=0.4, alpha=drawn.opacity, zorder=1)
         axes.plot(x2, y2, "o", color=RED, markersize=1.2, zorder=1)
@@ -183,7 +126,48 @@ def map_figure(drawn: ErrorMap) -> Figure:
     return figure
 
 
-def _sheet(count: int, height: float = 2.2) -> tuple[Figure, list[Axes]]:
-    """Axes side by side, one column of a paper wide each."""
+def _figure(count: int, height: float = 2.2) -> tuple[Figure, list[Axes]]:
+    """Axes side by side, each one paper column wide."""
     figure = Figure(figsize=(COLUMN * count, height), layout="constrained")
     return figure, list(np.atleast_1d(figure.subplots(1, count)))
+
+
+def _draw_curve(axes: Axes, series: Series, style: tuple[str, str], label: str) -> None:
+    colour, dashes = style
+    x, y = zip(*series.points, strict=True)
+    if series.interval:
+        at, low, high = zip(*series.interval, strict=True)
+        axes.fill_between(
+            at, low, high, color=colour, alpha=0.18, linewidth=0, label="95 % interval"
+        )
+    if series.bin_edges:
+        axes.stairs(y, series.bin_edges, color=colour, linestyle=dashes, label=label)
+    else:
+        marker = "o" if len(series.dots) == len(series.points) else None
+        axes.plot(x, y, color=colour, linestyle=dashes, marker=marker, markersize=3, label=label)
+
+
+def _label_axis(axes: Axes, which: str, axis: Axis) -> None:
+    target = axes.xaxis if which == "x" else axes.yaxis
+    target.set_label_text(axis.label + (" (%)" if axis.percent else ""))
+    if axis.log:
+        axes.set(**{f"{which}scale": "log"})
+    if axis.percent:
+        target.set_major_formatter(lambda value, _: f"{100 * value:g}")
+
+
+def _draw_points(
+    axes: Axes, points: Sequence[Point], label: str, colour: str, marker: str, area: int, layer: int
+) -> None:
+    x, y = zip(*points, strict=True)
+    axes.scatter(
+        x,
+        y,
+        s=area,
+        color=colour,
+        marker=marker,
+        linewidths=0,
+        alpha=0.75,
+        label=label,
+        zorder=layer,
+    )

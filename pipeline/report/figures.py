@@ -1,7 +1,8 @@
-"""Figures for a paper: an evaluation in, PNG and PDF files out.
+"""Figures of a paper: an evaluation in, PNG and PDF files out.
 
-Drawn by matplotlib without its global state. Fonts are embedded as TrueType (type 42), which
-publishers ask for, files hold no date, and the same evaluation gives the same bytes.
+Drawn by matplotlib without its global state, from the descriptions that the page draws too. Fonts
+are embedded as TrueType (type 42), which publishers require, files hold no date, and the same
+evaluation gives the same bytes.
 """
 
 import io
@@ -19,14 +20,14 @@ from pipeline.core import storage
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.thumbnails import ImageLoader
 from pipeline.report import figure_charts
-from pipeline.report.error_map import error_map
+from pipeline.report.charts import Row, scatter
 from pipeline.report.inputs import EvaluationResults, ReportContext
 from pipeline.report.options import FigureFormat
 from pipeline.report.panels import MAX_ANSWERS, is_hit
-from pipeline.report.tasks import PanelChoice, choose_panels, task_view
-from pipeline.retrieval.parts import part_label
+from pipeline.report.tables import group_tables, part_tables
+from pipeline.report.tasks import PanelChoice, TaskView, choose_panels, task_views
 
-ROWS = 3  # hits, misses and places of a figure with pictures: what fits a page beside its caption
+MAX_ROWS = 3  # hits, misses and places of a figure with pictures: what fits a page and a caption
 DPI = 300  # of PNG, and of pictures in PDF
 STYLE: Any = {
     "font.family": "DejaVu Sans",
@@ -44,69 +45,72 @@ STYLE: Any = {
     "grid.color": "#dddddd",
     "axes.axisbelow": True,
 }
+CELL = 0.78  # inches: the side of a picture
+CAPTION = 0.16  # inches, below it
+PAIR_GAP = 0.25  # between the two halves of a row of pairs, in pictures
+PIXELS = 256  # of a picture's longer side: more than 300 dots an inch
+FRAME = 2.0  # points
+RIGHT_COLOUR, WRONG_COLOUR = "#16803c", "#c8322b"
 NO_DATES = {"png": {"Software": None}, "pdf": {"CreationDate": None}}
+
+Images = Mapping[str, bytes]
+"Encoded images by key."
 
 
 def write_figures(
-    findings: EvaluationResults,
-    pictures: ImageLoader,
-    folder: str,
-    formats: tuple[FigureFormat, ...],
+    results: EvaluationResults, images: ImageLoader, folder: str, formats: tuple[FigureFormat, ...]
 ) -> list[str]:
     """Write every figure that the evaluation has data for into `folder`; returns their names
     without endings.
 
-    Without pictures at hand there are no figures of hits and misses.
+    Without images there are no figures of hits and misses.
     """
-    tasks = [
-        task_view(row, findings.results_of(row), ReportContext(title=""))
-        for row in findings.metrics
-    ]
-    single = [task for task in tasks if not task.row["multi_query"]]
-    makers: dict[str, Callable[[], Figure]] = {
-        "recall": partial(figure_charts.recall_figure, tasks)
-    }
-    if single:
-        makers["scores"] = partial(figure_charts.scores_figure, single)
-    if findings.views:
-        makers["views"] = partial(figure_charts.views_figure, findings.views)
-    if findings.parts:
-        makers["parts"] = partial(
-            figure_charts.whiskers_figure, single, findings.parts, "part", part_label
-        )
-    for column in dict.fromkeys(row["by"] for row in findings.groups):
-        rows = [row for row in findings.groups if row["by"] == column]
-        makers[f"groups-{column}"] = partial(
-            figure_charts.whiskers_figure,
-            single,
-            rows,
-            column.replace("_", " "),
-            figure_charts.group_label,
-        )
-    for gap in findings.gaps:
-        makers[f"view-gap-{gap['task'].replace('->', '-')}"] = partial(
-            figure_charts.gap_figure, gap
-        )
-    for task in single:
-        if drawn := error_map(task.name, task.rows):
-            makers[f"map-{task.anchor}"] = partial(figure_charts.map_figure, drawn)
-    choices = choose_panels(tasks, ROWS)
-    images = pictures(sorted(set[str]().union(*(choice.keys for choice in choices))))
-    for choice in choices if images else ():
+    tasks = task_views(results, ReportContext(title=""))
+    figures = _chart_figures(results, tasks)
+    choices = choose_panels(tasks, MAX_ROWS)
+    pictures = images(sorted(set[str]().union(*(choice.keys for choice in choices))))
+    for choice in choices if pictures else ():
         name = choice.task.anchor
-        makers[f"retrieval-{name}"] = partial(panels_figure, choice, images)
+        figures[f"retrieval-{name}"] = partial(panels_figure, choice, pictures)
         if choice.pairs.shown:
-            makers[f"multi-query-{name}"] = partial(pairs_figure, choice, images)
-    for name, make in makers.items():
+            figures[f"multi-query-{name}"] = partial(pairs_figure, choice, pictures)
+    for name, draw in figures.items():
         for kind in formats:
-            with matplotlib.rc_context(
-                STYLE
-            ):  # drawn anew for each format: drawing moves what the layout has placed
-                storage.write_bytes(storage.join(folder, f"{name}.{kind}"), _saved(make(), kind))
-    return list(makers)
+            with matplotlib.rc_context(STYLE):
+                # Drawn again for each format: drawing moves what the layout has placed.
+                data = _encode(draw(), kind)
+            storage.write_bytes(storage.join(folder, f"{name}.{kind}"), data)
+    return list(figures)
 
 
-def _saved(figure: Figure, kind: FigureFormat) -> bytes:
+def _chart_figures(
+    results: EvaluationResults, tasks: Sequence[TaskView]
+) -> dict[str, Callable[[], Figure]]:
+    """What draws each figure without pictures, by its name."""
+    single = [task for task in tasks if not task.merged]
+    names = {task.row["task"]: task.name for task in single}
+    r1 = {task.row["task"]: task.row["r1"] for task in single}
+    figures = {"recall": partial(figure_charts.recall_figure, [task.recall for task in tasks])}
+    if scores := [task.scores for task in single if task.scores]:
+        figures["scores"] = partial(figure_charts.charts_figure, scores)
+    if views := [task.views for task in single if task.views]:
+        figures["views"] = partial(figure_charts.charts_figure, views)
+    if parts := part_tables(results.parts, names, r1):
+        figures["parts"] = partial(figure_charts.whiskers_figure, parts)
+    groups = group_tables(results.groups, names, r1)
+    for column in dict.fromkeys(table.column for table in groups):
+        own = [table for table in groups if table.column == column]
+        figures[f"groups-{column}"] = partial(figure_charts.whiskers_figure, own)
+    for gap in results.gaps:
+        name = f"view-gap-{gap['task'].replace('->', '-')}"
+        figures[name] = partial(figure_charts.scatter_figure, scatter(gap))
+    for task in single:
+        if task.errors:
+            figures[f"map-{task.anchor}"] = partial(figure_charts.map_figure, task.errors)
+    return dict(figures)
+
+
+def _encode(figure: Figure, kind: FigureFormat) -> bytes:
     stream = io.BytesIO()
     figure.savefig(
         stream, format=kind, bbox_inches="tight", pad_inches=0.03, metadata=NO_DATES[kind]
@@ -114,23 +118,12 @@ def _saved(figure: Figure, kind: FigureFormat) -> bytes:
     return stream.getvalue()
 
 
-CELL = 0.78  # inches of a picture
-CAPTION = 0.16  # below it
-GAP = 0.25  # between the halves of a line of pairs, in pictures
-PIXELS = 256  # of a picture's longer side: more than 300 dots an inch
-FRAME = 2.0  # points
-
-Row = Mapping[str, Any]
-Images = Mapping[str, bytes]
-RIGHT, WRONG = "#16803c", "#c8322b"
-
-
 def panels_figure(choice: PanelChoice, images: Images) -> Figure:
-    """A query a row with its best answers, framed green where right and red where wrong: hits, then
+    """One query per row with its best answers, framed green if right and red if wrong: hits, then
     misses.
     """
     rows = [*choice.hits, *choice.misses]
-    figure, cells = _sheet(max(len(rows), 1), 1 + MAX_ANSWERS)
+    figure, cells = _grid(max(len(rows), 1), 1 + MAX_ANSWERS)
     for line, row in zip(cells, rows, strict=False):
         _picture(line[0], _image(images.get(row["query"])), "hit" if is_hit(row) else "miss")
         _answers(line[1:], row, images)
@@ -138,12 +131,12 @@ def panels_figure(choice: PanelChoice, images: Images) -> Figure:
 
 
 def pairs_figure(choice: PanelChoice, images: Images) -> Figure:
-    """A place a row: one image and its best answers on the left, all images and theirs on the
-    right.
+    """One place per row: on the left one image and its best answers, on the right all images merged
+    and theirs.
     """
     pairs = choice.pairs.shown
     half = 1 + MAX_ANSWERS
-    figure, cells = _sheet(len(pairs), 2 * half + 1, [1.0] * half + [GAP] + [1.0] * half)
+    figure, cells = _grid(len(pairs), 2 * half + 1, [1.0] * half + [PAIR_GAP] + [1.0] * half)
     for line, pair in zip(cells, pairs, strict=True):
         _picture(line[0], _image(images.get(pair.single["query"])), "one image")
         _answers(line[1:half], pair.single, images)
@@ -159,7 +152,7 @@ def _answers(cells: Sequence[Axes], row: Row, images: Images) -> None:
             cell,
             _image(images.get(key)),
             f"{score:.3f}",
-            RIGHT if location == row["location"] else WRONG,
+            RIGHT_COLOUR if location == row["location"] else WRONG_COLOUR,
         )
 
 
@@ -175,16 +168,16 @@ def _picture(cell: Axes, image: Image.Image | None, caption: str, frame: str | N
 
 
 def _image(data: bytes | None) -> Image.Image | None:
-    """A square cut from the middle; None without a picture that can be read."""
+    """The central square of an encoded image; None if it cannot be decoded."""
     if data is None:
         return None
     try:
-        whole = Image.fromarray(decode(data))
+        full = Image.fromarray(decode(data))
     except DecodeError:
         return None
-    side = min(whole.size)
-    left, top = (whole.width - side) // 2, (whole.height - side) // 2
-    square = whole.crop((left, top, left + side, top + side))
+    side = min(full.size)
+    left, top = (full.width - side) // 2, (full.height - side) // 2
+    square = full.crop((left, top, left + side, top + side))
     square.thumbnail((PIXELS, PIXELS), Image.Resampling.LANCZOS)
     return square
 
@@ -199,8 +192,8 @@ def _mosaic(found: Sequence[bytes | None]) -> Image.Image:
     return sheet
 
 
-def _sheet(rows: int, columns: int, widths: Sequence[float] | None = None) -> tuple[Figure, Any]:
-    """Cells for pictures, all empty and unseen. `widths`: of the columns, in pictures."""
+def _grid(rows: int, columns: int, widths: Sequence[float] | None = None) -> tuple[Figure, Any]:
+    """A grid of invisible cells for pictures. `widths`: of the columns, in pictures."""
     figure = Figure(figsize=(CELL * sum(widths or [columns]), (CELL + CAPTION) * rows))
     cells = figure.subplots(rows, columns, squeeze=False, width_ratios=widths)
     figure.subplots_adjust(0, 0, 1, 1, wspace=0.1, hspace=0.1 + CAPTION / CELL)

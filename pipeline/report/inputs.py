@@ -1,5 +1,6 @@
-"""What the report shows, read from finished folders: an evaluation, the one beside it, the training
-run's curves.
+"""Reads what the report shows: an evaluation, the one beside it, the curves of a training run.
+
+In: finished folders. Out: an `EvaluationResults`, and a `ReportContext` with the rest.
 """
 
 import hashlib
@@ -12,8 +13,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline.core import parquet, storage
+from pipeline.core.arrays import Floats
 from pipeline.core.errors import InputError
-from pipeline.features.table import Floats
 from pipeline.retrieval.results import (
     GAP_FILE,
     GROUPS_FILE,
@@ -25,52 +26,54 @@ from pipeline.retrieval.results import (
 )
 
 VectorLoader = Callable[[Iterable[str]], dict[str, Floats]]
-"Embeddings (D,) by key; keys that are not known are absent."
+"Embeddings (D,) by key; unknown keys are absent."
 REQUIRED_COLUMNS = frozenset({"query", "task", "protocol", "multi_query", "first_match_rank", "ap"})
-"Columns of a result that are always there."
+"Columns that the per-query rows always have."
 EXTRA_FILES = {"views": VIEWS_FILE, "groups": GROUPS_FILE, "parts": PARTS_FILE, "gaps": GAP_FILE}
+"Optional files of an evaluation, by the field of `EvaluationResults` that holds their rows."
 
 
 def no_vectors(keys: Iterable[str]) -> dict[str, Floats]:
+    """A vector loader that finds none."""
     return {}
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationResults:
-    """One evaluation."""
+    """One finished evaluation."""
 
     name: str
     metrics: list[dict[str, Any]]
-    "Rows of retrieval.METRICS_SCHEMA."
+    "Rows of tasks.METRICS_SCHEMA."
     results: pa.Table
-    "Rows of retrieval.RESULTS_SCHEMA, of all tasks."
+    "Rows of tasks.RESULTS_SCHEMA, of all tasks."
     views: tuple[dict[str, Any], ...] = ()
-    "Rows of view_curve.VIEWS_SCHEMA."
+    "Rows of views.VIEWS_SCHEMA."
     groups: tuple[dict[str, Any], ...] = ()
     "Rows of breakdowns.break_down."
     parts: tuple[dict[str, Any], ...] = ()
-    "Rows of part_measures.measure_parts."
+    "Rows of parts.measure_parts."
     gaps: tuple[dict[str, Any], ...] = ()
-    "Of each pair of views view_gap.describe."
+    "One view_gap.describe_gap for each pair of views."
 
-    def of(self, row: dict[str, Any]) -> dict[str, Any] | None:
-        """This evaluation's metric row for the task of another's row; None where it has none.
+    def metrics_for(self, row: dict[str, Any]) -> dict[str, Any] | None:
+        """This evaluation's metric row for the task of another's row; None if it has none.
 
-        Raises InputError when the two ranked different numbers of images, which no difference of
-        figures survives.
+        Raises InputError if the two ranked different numbers of images: their figures cannot be
+        compared.
         """
         for own in self.metrics:
             if task_key(own) == task_key(row):
                 if (own["queries"], own["gallery"]) != (row["queries"], row["gallery"]):
                     raise InputError(
-                        f"{self.name} ranked {own['queries']} queries in {own['gallery']} rows for {own['task']}, this "
-                        f"evaluation {row['queries']} in {row['gallery']}; expected the same images; embed and evaluate "
-                        "both on the same shards"
+                        f"{self.name} ranked {own['queries']} queries in {own['gallery']} rows for "
+                        f"{own['task']}, this evaluation {row['queries']} in {row['gallery']}; "
+                        "expected the same images; embed and evaluate both on the same shards"
                     )
                 return own
         return None
 
-    def results_of(self, row: dict[str, Any]) -> list[dict[str, Any]]:
+    def rows_for(self, row: dict[str, Any]) -> list[dict[str, Any]]:
         """The per-query rows of a metric row's task."""
         mask = pc.equal(self.results["multi_query"], row["multi_query"])
         for name in ("task", "protocol"):
@@ -80,33 +83,34 @@ class EvaluationResults:
 
 
 def task_key(row: dict[str, Any]) -> tuple[str, str, bool]:
+    """What identifies a task among the metric rows of an evaluation."""
     return row["task"], row["protocol"], row["multi_query"]
 
 
 def read_evaluation(folder: str) -> EvaluationResults:
-    """A finished evaluation.
+    """Read a finished evaluation.
 
-    Raises InputError when there is none.
+    Raises InputError if there is none, or its files are damaged.
     """
     if not storage.exists(storage.join(folder, METRICS_FILE)):
         raise InputError(
-            f"no finished evaluation at {folder}: found no metrics.json; make one with jobs/evaluate.py"
+            f"no finished evaluation at {folder}: found no metrics.json; "
+            "make one with jobs/evaluate.py"
         )
     path = storage.join(folder, RESULTS_FILE)
     try:
         results = parquet.read_table(path)
     except parquet.DAMAGE_ERRORS as error:
         raise InputError(
-            f"{path} cannot be read ({error}), expected the rows of a finished evaluation; delete {folder} and evaluate again "
-            "with jobs/evaluate.py"
+            f"{path} cannot be read ({error}), expected the rows of a finished evaluation; "
+            f"delete {folder} and evaluate again with jobs/evaluate.py"
         ) from None
     metrics = read_result_rows(folder, METRICS_FILE)
-    if not set(results.column_names) >= REQUIRED_COLUMNS or not all(
-        _is_measured(row) for row in metrics
-    ):
+    columns = set(results.column_names)
+    if not columns >= REQUIRED_COLUMNS or not all(_is_metric_row(row) for row in metrics):
         raise InputError(
-            f"the evaluation at {folder} holds rows or columns that jobs/evaluate.py does not write; delete {folder} and "
-            "evaluate again with jobs/evaluate.py"
+            f"the evaluation at {folder} holds rows or columns that jobs/evaluate.py does not "
+            f"write; delete {folder} and evaluate again with jobs/evaluate.py"
         )
     return EvaluationResults(
         name=folder.rstrip("/").rsplit("/", 1)[-1],
@@ -116,8 +120,8 @@ def read_evaluation(folder: str) -> EvaluationResults:
     )
 
 
-def _is_measured(row: dict[str, Any]) -> bool:
-    """Whether this is a row of metrics.json as whoever compares and shows them needs it."""
+def _is_metric_row(row: dict[str, Any]) -> bool:
+    """Whether a row of metrics.json has every field that is compared and shown, with its type."""
     return (
         all(isinstance(row.get(name), str) for name in ("task", "protocol"))
         and all(type(row.get(name)) is int for name in ("queries", "gallery"))
@@ -127,17 +131,17 @@ def _is_measured(row: dict[str, Any]) -> bool:
 
 
 def read_extras(folder: str) -> dict[str, tuple[dict[str, Any], ...]]:
-    """What an evaluation holds besides its measures, by the names of Findings' fields; empty where
-    it was not taken.
+    """The optional files of an evaluation, by `EvaluationResults`' fields; empty if a file was not
+    written.
 
-    Raises InputError where a file is not what was written.
+    Raises InputError if a file is damaged.
     """
     return {name: tuple(read_result_rows(folder, file)) for name, file in EXTRA_FILES.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportContext:
-    """What the report shows besides the evaluation itself."""
+    """What the report shows in addition to the evaluation itself."""
 
     title: str
     beside: EvaluationResults | None = None
@@ -146,7 +150,7 @@ class ReportContext:
 
     @property
     def sha256(self) -> str:
-        """Hash of all of it: the same extras give the same page."""
+        """SHA-256 of all of it: the same context gives the same page."""
         other = self.beside
         beside = (
             [other.name, other.metrics, other.results.to_pydict(), other.gaps] if other else None
@@ -155,9 +159,9 @@ class ReportContext:
 
 
 def read_report_context(title: str, run: str | None, beside: str | None) -> ReportContext:
-    """Read what was named.
+    """Read the folders of a training run and of another evaluation, where they are given.
 
-    Raises InputError when a folder does not hold what it should.
+    Raises InputError if a folder does not hold what it should.
     """
     return ReportContext(
         title=title,
@@ -170,12 +174,13 @@ def read_training(run: str) -> list[dict[str, Any]]:
     """A training run's rows by epoch; of an epoch that was trained twice (after a restart) the
     later one.
 
-    Raises InputError when there are none.
+    Raises InputError if there are none.
     """
     path = storage.join(run, "metrics.jsonl")
     if not storage.exists(path):
         raise InputError(
-            f"no training curves at {run}: found no metrics.jsonl; expected the --out of jobs/train.py"
+            f"no training curves at {run}: found no metrics.jsonl; "
+            "expected the --out of jobs/train.py"
         )
     lines = storage.read_bytes(path).decode(errors="replace").splitlines()
     by_epoch: dict[int, dict[str, Any]] = {}
@@ -185,8 +190,9 @@ def read_training(run: str) -> list[dict[str, Any]]:
             by_epoch[int(row["epoch"])] = row
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             if number == len(lines):
-                break  # a run that is still writing, or was killed while it wrote
+                break  # the run is still writing, or was killed while it wrote
             raise InputError(
-                f"line {number} of {path} is {line[:60]!r}; expected a JSON object with its epoch; mend or delete the line"
+                f"line {number} of {path} is {line[:60]!r}; expected a JSON object with its epoch; "
+                "correct or delete the line"
             ) from None
     return [by_epoch[epoch] for epoch in sorted(by_epoch)]

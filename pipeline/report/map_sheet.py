@@ -1,7 +1,7 @@
-"""A sheet of paper for a map: positions in, coordinates, scale bar, meridians and parallels out.
+"""The projection of a map: positions in, map coordinates, scale bar, meridians and parallels out.
 
 Equirectangular, true to scale at its middle latitude: right for places some hundred metres apart,
-whichever meridian they lie at, and a plain world map for places all over the world.
+at any meridian, and a plain world map for places all over the world.
 """
 
 import math
@@ -11,22 +11,22 @@ import numpy as np
 
 from pipeline.core.arrays import Doubles
 from pipeline.core.geo import EARTH_RADIUS_M
-from pipeline.report.svg import Tick, nice_ticks
+from pipeline.report.charts import Tick, nice_ticks
 
 MAP_WIDTH, MAP_HEIGHT, MAP_MARGIN = 520, 360, 22
-MIN_SPAN_M = 100.0  # across: a single place gets a map too
-GRID_MIN_SPAN_M = 50_000.0  # meridians and parallels mean something from here on
+MIN_SPAN_M = 100.0  # across, so that a single place gets a map too
+GRID_MIN_SPAN_M = 50_000.0  # below, meridians and parallels tell nothing
 METRES_PER_DEGREE = EARTH_RADIUS_M * math.pi / 180
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapSheet:
-    """From positions to the map's coordinates."""
+    """Projects positions to map coordinates."""
 
     south: float
     north: float
     west: float
-    "The meridian that the map starts at; longitudes are counted eastwards from it."
+    "The map's western edge; longitudes are counted eastwards from it."
     wide: float
     "Degrees of longitude across."
     scale: float
@@ -34,13 +34,13 @@ class MapSheet:
 
     @classmethod
     def around(cls, at_N2: Doubles) -> "MapSheet":
-        """A map that holds these positions (latitude, longitude)."""
+        """The smallest map of these positions (latitude, longitude)."""
         south, north = float(at_N2[:, 0].min()), float(at_N2[:, 0].max())
         meridians = np.unique(at_N2[:, 1] % 360)
         gaps = np.diff(meridians, append=meridians[0] + 360)
         widest = int(np.argmax(gaps))
         west, wide = float(meridians[(widest + 1) % len(meridians)]), float(360 - gaps[widest])
-        if wide > 180:  # all over the world: as world maps are
+        if wide > 180:  # places all over the world: an ordinary world map
             west, wide = -180.0, 360.0
         shrink = math.cos(math.radians((south + north) / 2))
         tall_m, wide_m = ((north - south) * METRES_PER_DEGREE, wide * METRES_PER_DEGREE * shrink)
@@ -56,9 +56,8 @@ class MapSheet:
 
     def x(self, lon: float) -> float:
         east = (lon - self.west) % 360
-        east = (
-            east - 360 if east > (360 + self.wide) / 2 else east
-        )  # rounding may put the first meridian behind the last
+        if east > (360 + self.wide) / 2:  # rounding may put the first meridian behind the last
+            east -= 360
         return round(
             MAP_WIDTH / 2 + (east - self.wide / 2) * METRES_PER_DEGREE * self._shrink * self.scale,
             1,
@@ -74,7 +73,8 @@ class MapSheet:
         return [(self.x(lon), self.y(lat)) for lat, lon in at_N2.tolist()]
 
     def bar(self) -> tuple[float, str]:
-        """The longest round distance that takes at most a third of the map."""
+        """The longest round distance that takes at most a third of the map: its length on the map, and
+        its label."""
         most = MAP_WIDTH / 3 / self.scale
         unit = 10.0 ** math.floor(math.log10(most))
         length = max(step * unit for step in (1, 2, 5) if step * unit <= most)
@@ -102,7 +102,7 @@ def _degrees(value: float, letters: str) -> str:
 
 
 def format_metres(value: float) -> str:
-    """As people say it: 12 m, 1.2 km, 3,400 km."""
+    """A distance to two digits, with its unit: 12 m, 1.2 km, 3,400 km."""
     if value < 999.5:
         return f"{value:.0f} m"
     return f"{value / 1000:.2g} km" if value < 9_950 else f"{value / 1000:,.0f} km"

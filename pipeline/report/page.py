@@ -1,121 +1,115 @@
-"""Results -> one self-contained HTML page: measures, curves, and hits and misses with their
-pictures.
+"""The report: an evaluation -> one self-contained HTML page.
 
-In: an evaluation, what is shown beside it, and a way to fetch pictures by key. Out: the page as
-text; the same input gives the same page. Nothing on it runs or leaves it: no script, no font, no
-request (its Content-Security-Policy says so), and every name in it is escaped, as location names
-are whatever a folder was called.
+In: an evaluation, its context, and loaders of images and embeddings by key. Out: the page as text:
+measures, curves, hits and misses with their pictures; the same input gives the same page. The page
+runs no script and loads nothing (no font, no request: its Content-Security-Policy forbids them),
+and every name on it is escaped, since location names come from folder names.
 """
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.core.arrays import Floats
 from pipeline.core.templates import template_environment
-from pipeline.features.table import Floats
 from pipeline.images.thumbnails import ImageLoader, ThumbnailCache
-from pipeline.report import charts, map_sheet, svg
-from pipeline.report.charts import scatter, scores_chart, views_chart
-from pipeline.report.error_map import distance_chart, error_map
+from pipeline.report import map_sheet, svg
+from pipeline.report.charts import scatter
 from pipeline.report.inputs import EvaluationResults, ReportContext, VectorLoader, no_vectors
 from pipeline.report.options import DEFAULT_PANELS
 from pipeline.report.panels import make_panel
 from pipeline.report.tables import group_tables, part_tables
-from pipeline.report.tasks import METRIC_LABELS, PanelChoice, choose_panels, task_view
+from pipeline.report.tasks import METRIC_LABELS, PanelChoice, choose_panels, task_views
+from pipeline.report.training_charts import training_charts
 from pipeline.retrieval.subsets import evenly_spaced
 
 PROTOCOL_TEXTS = {
     "full": "the official protocol: the whole gallery is ranked, with its distractors",
-    "queried-only": "the reduced protocol: gallery images of places that are not queried are left out, so its figures do "
-    "not compare with those of the official one",
+    "queried-only": "the reduced protocol: gallery images of places that are not queried are left "
+    "out, so its figures do not compare with those of the official one",
 }
-OPEN_PANELS = (
-    6  # panels of a kind that are open from the start, spread over all of them; the others unfold
-)
+OPEN_PANELS = 6  # of a kind, spread over all of them; the others unfold on a click
 
 
 def render_report(
-    findings: EvaluationResults,
-    extras: ReportContext,
-    pictures: ImageLoader,
+    results: EvaluationResults,
+    context: ReportContext,
+    images: ImageLoader,
     vectors: VectorLoader = no_vectors,
     panels: int = DEFAULT_PANELS,
 ) -> str:
-    """The page, with at most `panels` hits and as many misses of each task, and as many places
-    asked for in both ways.
+    """Render the page, with at most `panels` hits, misses and multi-query pairs of each task.
 
-    Raises InputError when the evaluation beside ranked other images.
+    Raises InputError if the evaluation beside ranked other images.
     """
+    tasks = task_views(results, context)
+    single = [task for task in tasks if not task.merged]
+    names = {task.row["task"]: task.name for task in single}
+    r1 = {task.row["task"]: task.row["r1"] for task in single}
+    evidence = [
+        *(task.views for task in single),
+        *(task.scores for task in single),
+        *(task.distances for task in single),
+    ]
+    choices = choose_panels(tasks, panels)
+    keys = sorted(set[str]().union(*(choice.keys for choice in choices)))
+    parts = {row["task"]: row["parts"] for row in results.parts}
+    thumbnails, known = ThumbnailCache(images(keys)), vectors(keys) if parts else {}
     environment = template_environment(Path(__file__).parent / "templates")
     environment.filters |= {
         "percent": lambda value: f"{100 * value:.2f}",
         "points": lambda value: f"{100 * value:+.2f}",
         "metres": map_sheet.format_metres,
-        "opened": lambda items: [(i + 1, items[i]) for i in evenly_spaced(len(items), OPEN_PANELS)],
-        "folded": lambda items: [
-            (i + 1, items[i])
-            for i in range(len(items))
-            if i not in evenly_spaced(len(items), OPEN_PANELS)
-        ],
+        "svg": svg.layout_chart,
+        "opened": lambda items: _numbered(items, opened=True),
+        "folded": lambda items: _numbered(items, opened=False),
     }
-    tasks = [task_view(row, findings.results_of(row), extras) for row in findings.metrics]
-    single = [task for task in tasks if not task.row["multi_query"]]
-    names = {task.row["task"]: task.name for task in single}
-    r1 = {task.row["task"]: task.row["r1"] for task in single}
-    evidence = [
-        *(
-            views_chart(
-                f"{task.name}, R@1 by views a query",
-                [row for row in findings.views if row["task"] == task.row["task"]],
-            )
-            for task in single
-        ),
-        *(scores_chart(f"{task.name}, scores", task.rows) for task in single),
-        *(distance_chart(f"{task.name}, distance", task.rows) for task in single),
-    ]
-    choices = choose_panels(tasks, panels)
-    keys = sorted(set[str]().union(*(choice.keys for choice in choices)))
-    parts = {row["task"]: row["parts"] for row in findings.parts}
-    album, known = ThumbnailCache(pictures(keys)), vectors(keys) if parts else {}
-    maps = [error_map(task.name, task.rows) for task in single]
     return environment.get_template("report.html").render(
-        title=extras.title,
-        fingerprint=findings.metrics[0]["fingerprint"],
-        protocol=PROTOCOL_TEXTS[findings.metrics[0]["protocol"]],
+        title=context.title,
+        fingerprint=results.metrics[0]["fingerprint"],
+        protocol=PROTOCOL_TEXTS[results.metrics[0]["protocol"]],
         measures=METRIC_LABELS,
         tasks=tasks,
-        beside=extras.beside.name if extras.beside else None,
+        beside=context.beside.name if context.beside else None,
         evidence=[chart for chart in evidence if chart],
-        groups=group_tables(findings.groups, names, r1),
-        parts=part_tables(findings.parts, names, r1),
-        gaps=[scatter(gap, extras.beside) for gap in findings.gaps],
-        maps=[each for each in maps if each],
-        training=svg.training_charts(extras.training),
+        groups=group_tables(results.groups, names, r1),
+        parts=part_tables(results.parts, names, r1),
+        gaps=[svg.layout_scatter(scatter(gap, context.beside)) for gap in results.gaps],
+        maps=[task.errors for task in single if task.errors],
+        training=training_charts(context.training),
         sections=[
-            _section(choice, album, known, parts.get(choice.task.row["task"], 1))
+            _section(choice, thumbnails, known, parts.get(choice.task.row["task"], 1))
             for choice in choices
         ],
-        charts=svg,
-        scatters=charts,
+        geometry=svg,
         map_size=map_sheet,
     )
 
 
+def _numbered(items: list[Any], opened: bool) -> list[tuple[int, Any]]:
+    """The panels that are open from the start, or the others, with their numbers from 1."""
+    shown = set(evenly_spaced(len(items), OPEN_PANELS).tolist())
+    return [(i + 1, item) for i, item in enumerate(items) if (i in shown) == opened]
+
+
 def _section(
-    choice: PanelChoice, album: ThumbnailCache, known: Mapping[str, Floats], parts: int
+    choice: PanelChoice, thumbnails: ThumbnailCache, known: Mapping[str, Floats], parts: int
 ) -> dict[str, Any]:
-    """A task's panels."""
+    """The panels of one task, as the template takes them."""
     hits, misses = (
-        [make_panel(row, album, known, parts) for row in rows]
+        [make_panel(row, thumbnails, known, parts) for row in rows]
         for rows in (choice.hits, choice.misses)
     )
     pairs = [
-        (make_panel(pair.single, album), make_panel(pair.merged, album, merged=pair.images))
+        (
+            make_panel(pair.single, thumbnails),
+            make_panel(pair.merged, thumbnails, merged=pair.images),
+        )
         for pair in choice.pairs.shown
     ]
     return {
         "task": choice.task,
-        "pictures": bool(album),
+        "pictures": bool(thumbnails),
         "parts": parts,
         "hits": hits,
         "misses": misses,

@@ -1,5 +1,7 @@
-"""A task as the page shows it: a metric row and its queries in, a line of the table and the recall
-curve out.
+"""A task as page and papers show it: its metric row, its charts, and the queries with pictures.
+
+In: a metric row of an evaluation. Out: a `TaskView`, and of every task of single queries a
+`PanelChoice`: hits, misses, and places whose single images are compared with all of them merged.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.core.arrays import Ints
-from pipeline.report.inputs import ReportContext
+from pipeline.report.charts import Chart, Row, recall_chart, scores_chart, views_chart
+from pipeline.report.error_map import ErrorMap, distance_chart, error_map
+from pipeline.report.inputs import EvaluationResults, ReportContext
 from pipeline.report.panels import (
     MOSAIC_IMAGES,
     confidence_order,
@@ -18,7 +22,6 @@ from pipeline.report.panels import (
     panel_keys,
     spread_over_locations,
 )
-from pipeline.report.svg import Chart, recall_chart
 from pipeline.retrieval import metrics
 from pipeline.retrieval.subsets import evenly_spaced
 
@@ -29,41 +32,60 @@ METRIC_LABELS = {"r1": "R@1", "r5": "R@5", "r10": "R@10", "r1p": "R@1%", "ap": "
 class TaskView:
     """One task."""
 
-    row: Mapping[str, Any]
-    "Of retrieval.METRICS_SCHEMA."
+    row: Row
+    "Of tasks.METRICS_SCHEMA."
     rows: list[dict[str, Any]]
-    "Its queries, rows of retrieval.RESULTS_SCHEMA."
+    "Its queries, rows of tasks.RESULTS_SCHEMA."
     name: str
     anchor: str
     query_view: str
     gallery_view: str
-    other: Mapping[str, Any] | None
+    other: Row | None
     "The metric row of the evaluation beside."
     first: int
     "Queries that have a true match first."
     unmatched: int
     "Queries without a true match in the gallery."
     chance: float
+    "R@1 of a random ranking."
     one_percent: int
-    sure: Mapping[str, tuple[float, float]]
+    "The K of the top 1 %."
+    intervals: Mapping[str, tuple[float, float]]
     "95 % interval of each measure that has one."
-    geo: Mapping[str, Any] | None
-    "The metric row, where it knows distances."
-    chart: Chart
+    geo: Row | None
+    "The metric row, if it has distances."
+    recall: Chart
+    views: Chart | None
+    "R@1 by views per query; None if it was not measured."
+    scores: Chart | None
+    distances: Chart | None
+    errors: ErrorMap | None
+    "These three are None for merged queries, and where there is nothing to draw."
+
+    @property
+    def merged(self) -> bool:
+        """Whether a query is all images of a location."""
+        return bool(self.row["multi_query"])
 
 
-def task_view(
-    row: Mapping[str, Any], rows: list[dict[str, Any]], extras: ReportContext
+def task_views(results: EvaluationResults, context: ReportContext) -> list[TaskView]:
+    """Raises InputError if the evaluation beside ranked other images."""
+    return [_task_view(row, results, context.beside) for row in results.metrics]
+
+
+def _task_view(
+    row: dict[str, Any], results: EvaluationResults, beside: EvaluationResults | None
 ) -> TaskView:
-    """Raises InputError when the evaluation beside ranked other images."""
+    rows, merged = results.rows_for(row), row["multi_query"]
     query_view, gallery_view = row["task"].split("->")
-    other = extras.beside.of(dict(row)) if extras.beside else None
+    name = f"{query_view} → {gallery_view}" + (", multi-query" if merged else "")
+    other = beside.metrics_for(row) if beside else None
     matches_Q = np.array([each["matches"] for each in rows], np.int64)
-    name = f"{query_view} → {gallery_view}" + (", multi-query" if row["multi_query"] else "")
     bounds = {
         measure: (row.get(f"{measure}_low"), row.get(f"{measure}_high"))
         for measure in METRIC_LABELS
     }
+    views = [each for each in results.views if each["task"] == row["task"]]
     return TaskView(
         row=row,
         rows=rows,
@@ -76,44 +98,41 @@ def task_view(
         unmatched=int(np.count_nonzero(matches_Q == 0)),
         chance=metrics.chance_recall(matches_Q, row["gallery"]),
         one_percent=metrics.one_percent_k(row["gallery"]),
-        sure={
+        intervals={
             measure: (low, high)
             for measure, (low, high) in bounds.items()
             if low is not None and high is not None
         },
         geo=row if row.get("geo_queries") else None,
-        chart=_recall_chart(name, row, rows, extras if other else None),
-    )
-
-
-def _recall_chart(
-    name: str, row: Mapping[str, Any], rows: list[dict[str, Any]], extras: ReportContext | None
-) -> Chart:
-    beside = extras.beside if extras else None
-    beside_Q = first_ranks(beside.results_of(dict(row))) if beside else None
-    note = f"{row['queries']:,} queries, {row['gallery']:,} in the gallery"
-    return recall_chart(
-        name, note, first_ranks(rows), row["gallery"], beside_Q, beside.name if beside else ""
+        recall=recall_chart(
+            name,
+            f"{row['queries']:,} queries, {row['gallery']:,} in the gallery",
+            first_ranks(rows),
+            row["gallery"],
+            first_ranks(beside.rows_for(row)) if beside and other else None,
+            beside.name if beside else "",
+        ),
+        views=None if merged else views_chart(f"{name}, R@1 by views a query", views),
+        scores=None if merged else scores_chart(f"{name}, scores", rows),
+        distances=None if merged else distance_chart(f"{name}, distance", rows),
+        errors=None if merged else error_map(name, rows),
     )
 
 
 def first_ranks(rows: list[dict[str, Any]]) -> Ints:
-    """Rank of each query's best true match (Q,); 0 where it has none."""
+    """Rank of each query's best true match (Q,); 0 if it has none."""
     return np.array([row["first_match_rank"] or 0 for row in rows], np.int64)
-
-
-Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
 class QueryPair:
-    """A place asked for by one image and by all."""
+    """A place queried by one image and by all."""
 
     single: Row
-    "Of the place's images the one whose true match ranks worst."
+    "The image of the place whose true match ranks worst."
     merged: Row
     images: tuple[str, ...]
-    "Keys of up to nine of its images, evenly chosen."
+    "Keys of up to nine of its images, evenly spaced."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +140,7 @@ class QueryPairs:
     shown: tuple[QueryPair, ...]
     places: int
     "With at least one image that misses."
-    mended: int
+    fixed: int
     "Of these, found first by all images together."
     lost: int
     "Places that every image alone finds first, and all together do not."
@@ -129,18 +148,18 @@ class QueryPairs:
 
 @dataclass(frozen=True, kw_only=True)
 class PanelChoice:
-    """Of one task."""
+    """The queries of one task that are shown with pictures."""
 
     task: TaskView
     hits: list[Row]
-    "From the surest to the least sure."
+    "From the highest best score to the lowest."
     misses: list[Row]
-    "From the farthest off to the nearly right."
+    "From the worst first rank to the best."
     pairs: QueryPairs
 
     @property
     def keys(self) -> set[str]:
-        """Of all images that its panels show."""
+        """Keys of all images on its panels."""
         rows = [
             *self.hits,
             *self.misses,
@@ -151,8 +170,7 @@ class PanelChoice:
 
 def choose_panels(tasks: Sequence[TaskView], count: int) -> list[PanelChoice]:
     """At most `count` hits, misses and pairs of each task of single queries."""
-    single = [task for task in tasks if not task.row["multi_query"]]
-    merged = {task.row["task"]: task.rows for task in tasks if task.row["multi_query"]}
+    merged = {task.row["task"]: task.rows for task in tasks if task.merged}
     return [
         PanelChoice(
             task=task,
@@ -164,13 +182,14 @@ def choose_panels(tasks: Sequence[TaskView], count: int) -> list[PanelChoice]:
             ),
             pairs=pair_queries(task.rows, merged.get(task.row["task"], []), count),
         )
-        for task in single
+        for task in tasks
+        if not task.merged
     ]
 
 
 def pair_queries(single: Sequence[Row], merged: Sequence[Row], count: int) -> QueryPairs:
-    """At most `count` of the places with an image that misses, from the one that merging leaves
-    farthest off to those that it finds first; evenly spaced in that order."""
+    """At most `count` of the places with an image that misses, ordered by the merged query's rank
+    from the worst to the best, and evenly spaced in that order."""
     images: dict[str, list[Row]] = {}
     for row in sorted(single, key=lambda row: str(row["query"])):
         images.setdefault(row["location"], []).append(row)
@@ -178,12 +197,12 @@ def pair_queries(single: Sequence[Row], merged: Sequence[Row], count: int) -> Qu
     missed = [row for row in known if not all(is_hit(each) for each in images[row["location"]])]
     pairs = []
     for row in spread_over_locations(missed, count, error_order):
-        of_place = images[row["location"]]
-        keys = tuple(of_place[i]["query"] for i in evenly_spaced(len(of_place), MOSAIC_IMAGES))
-        pairs.append(QueryPair(single=min(of_place, key=error_order), merged=row, images=keys))
+        own = images[row["location"]]
+        keys = tuple(own[i]["query"] for i in evenly_spaced(len(own), MOSAIC_IMAGES))
+        pairs.append(QueryPair(single=min(own, key=error_order), merged=row, images=keys))
     return QueryPairs(
         shown=tuple(pairs),
         places=len(missed),
-        mended=sum(map(is_hit, missed)),
+        fixed=sum(map(is_hit, missed)),
         lost=sum(not is_hit(row) for row in known if row not in missed),
     )

@@ -1,6 +1,4 @@
-"""The report in a real browser: it opens without a word on the console, sends nothing, and fits a
-phone.
-"""
+"""The report in a real browser: no console message, no request, and a layout that fits a phone."""
 
 import io
 import shutil
@@ -47,7 +45,7 @@ LONG = "a-location-with-a-name-that-does-not-end-" * 4
 
 
 def result(location: str, first: int | None, multi: bool = False) -> dict[str, Any]:
-    """A query whose true match stands at this rank; of all of a place's images, with `multi`."""
+    """A query whose true match has this rank; `multi`: all images of a place as one query."""
     tops = [location if rank == first else f"other{rank}" for rank in range(1, 6)]
     return {
         "query": location if multi else f"query-{location}",
@@ -71,7 +69,7 @@ def result(location: str, first: int | None, multi: bool = False) -> dict[str, A
     }
 
 
-def findings(rows: list[dict[str, Any]], name: str) -> EvaluationResults:
+def evaluation(rows: list[dict[str, Any]], name: str) -> EvaluationResults:
     counts = {
         "task": "drone->satellite",
         "protocol": "full",
@@ -125,7 +123,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A page with every section, and a name that is far too long."""
+    """A page with every section, and a name of 160 characters."""
     stream = io.BytesIO()
     Image.new("RGB", (300, 300), "olive").save(stream, "JPEG")
     rows = [
@@ -140,11 +138,11 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> str:
         {"epoch": e, "location_loss": 9 / e, "view_loss": 0.7, "alpha": 0.9 + e // 5}
         for e in range(1, 9)
     )
-    extras = ReportContext(title="A town", beside=findings(rows, LONG), training=training)
+    extras = ReportContext(title="A town", beside=evaluation(rows, LONG), training=training)
     path: Path = tmp_path_factory.mktemp("page") / "report.html"
     vector = np.full(4, 0.5, np.float32)
     path.write_text(report.render_report(
-        findings(rows, "out"), extras, lambda keys: dict.fromkeys(keys, stream.getvalue()),
+        evaluation(rows, "out"), extras, lambda keys: dict.fromkeys(keys, stream.getvalue()),
         lambda keys: dict.fromkeys(keys, vector), panels=12,
     ))  # fmt: skip
     return path.as_uri()
@@ -153,31 +151,32 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.mark.parametrize(
     ("width", "scheme"), [(375, "light"), (768, "light"), (1024, "dark"), (1600, "dark")]
 )
-def test_the_page_opens_in_silence_and_fits(
+def test_page_fits_without_messages_or_requests(
     browser: Any, address: str, width: int, scheme: str
 ) -> None:
     page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
-    said: list[str] = []
-    asked: list[str] = []
-    page.on("console", lambda message: said.append(message.text))
-    page.on("pageerror", lambda error: said.append(str(error)))
-    page.on("request", lambda request: asked.append(request.url))
+    messages: list[str] = []
+    requests: list[str] = []
+    page.on("console", lambda message: messages.append(message.text))
+    page.on("pageerror", lambda error: messages.append(str(error)))
+    page.on("request", lambda request: requests.append(request.url))
     page.goto(address)
     page.evaluate("document.querySelectorAll('details').forEach(each => each.open = true)")
     page.evaluate("document.querySelectorAll('img').forEach(image => image.loading = 'eager')")
     page.wait_for_function(
         "[...document.images].every(image => image.complete && image.naturalWidth > 0)"
     )
-    assert said == []
-    assert [url for url in asked if not url.startswith("data:")] == [address]
+    assert messages == []
+    assert [url for url in requests if not url.startswith("data:")] == [address]
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     outside = """[...document.querySelectorAll('table, .panel *, .tile *, .chart *')].filter(e => {
-        const box = e.getBoundingClientRect(); return box.width && box.right > innerWidth + 0.5 }).length"""
+        const box = e.getBoundingClientRect();
+        return box.width && box.right > innerWidth + 0.5 }).length"""
     assert page.evaluate(outside) == 0
     page.close()
 
 
-def test_true_matches_are_framed_green_and_wrong_ones_red(browser: Any, address: str) -> None:
+def test_page_frames_true_matches_green_and_wrong_ones_red(browser: Any, address: str) -> None:
     page = browser.new_page()
     page.goto(address)
     colours = {
@@ -195,8 +194,8 @@ def test_true_matches_are_framed_green_and_wrong_ones_red(browser: Any, address:
     page.close()
 
 
-def test_sections_and_panels_are_reached_by_keyboard(browser: Any, address: str) -> None:
-    page = browser.new_page(reduced_motion="reduce")  # a page that scrolls smoothly arrives later
+def test_page_sections_and_panels_are_reached_by_keyboard(browser: Any, address: str) -> None:
+    page = browser.new_page(reduced_motion="reduce")  # smooth scrolling takes time
     page.goto(address)
     focused = "document.activeElement.getAttribute('href') || document.activeElement.tagName"
     page.keyboard.press("Tab")
@@ -204,17 +203,10 @@ def test_sections_and_panels_are_reached_by_keyboard(browser: Any, address: str)
     page.keyboard.press("Tab")
     assert page.evaluate(focused) == "#measures"
     page.keyboard.press("Enter")
-    page.wait_for_url(
-        "**#measures"
-    )  # the browser goes there when it gets to it, and so with what is scrolled to below
-    for number in (
-        1,
-        3,
-        5,
-        7,
-        9,
-        11,
-    ):  # of eleven hits six are open, from the first to the last; the others unfold
+    # The browser follows the link, and scrolls below, in its own time.
+    page.wait_for_url("**#measures")
+    # Of eleven hits six are open, from the first to the last; the others unfold.
+    for number in (1, 3, 5, 7, 9, 11):
         page.locator(f"a[href='#drone-satellite-hit-{number}']").focus()
         page.keyboard.press("Tab")
     assert page.evaluate(focused) == "SUMMARY"
@@ -229,7 +221,7 @@ def test_sections_and_panels_are_reached_by_keyboard(browser: Any, address: str)
     page.close()
 
 
-def test_in_print_what_is_open_is_all_there(browser: Any, address: str) -> None:
+def test_page_in_print_shows_all_open_panels(browser: Any, address: str) -> None:
     page = browser.new_page()
     page.goto(address)
     page.emulate_media(media="print")

@@ -1,6 +1,4 @@
-"""The map of errors: true to scale near and far, cut where it hurts least, and the farthest answers
-by name.
-"""
+"""The map of errors: its scale near and far, the lines it keeps, and the list of farthest answers."""
 
 import math
 from typing import Any
@@ -36,7 +34,7 @@ def query(
 A, B, C = (30.0, 120.0), (30.0, 120.01), (30.005, 120.0)
 
 
-def test_a_line_leads_from_a_place_to_where_its_wrong_answer_lies() -> None:
+def test_error_map_joins_a_place_with_its_wrong_answer() -> None:
     rows = [
         query("a", A, "a", A, 1),
         query("a", A, "b", B, 2),
@@ -54,24 +52,24 @@ def test_a_line_leads_from_a_place_to_where_its_wrong_answer_lies() -> None:
     assert at["c"][1] < at["a"][1] == at["b"][1]  # north is up
 
 
-def test_the_scale_bar_is_a_round_distance_at_the_maps_scale() -> None:
+def test_map_sheet_bar_is_a_round_distance_to_scale() -> None:
     sheet = MapSheet.around(np.array([A, B, C]))
-    length, said = sheet.bar()
+    length, label = sheet.bar()
     metres_across = (sheet.x(B[1]) - sheet.x(A[1])) / sheet.scale
     assert metres_across == pytest.approx(float(haversine_m(np.array(A), np.array(B))), rel=2e-3)
-    assert said == "200 m"
+    assert label == "200 m"
     assert length / sheet.scale == pytest.approx(200, rel=1e-2)
-    assert sheet.meridians() == ()  # a grid of degrees says nothing at this size
+    assert sheet.meridians() == ()  # too small for a grid of degrees
 
 
-def test_places_on_both_sides_of_the_180th_meridian_are_neighbours() -> None:
+def test_map_sheet_joins_both_sides_of_the_180th_meridian() -> None:
     sheet = MapSheet.around(np.array([(-17.0, 179.0), (-18.0, -179.0), (-17.5, 178.0)]))
     assert sheet.wide == pytest.approx(3)
     assert sheet.x(178.0) < sheet.x(179.0) < sheet.x(-179.0)
 
 
 @given(at=st.lists(st.tuples(st.floats(-89, 89), st.floats(-180, 180)), min_size=1, max_size=8))
-def test_every_place_lies_on_the_sheet_wherever_on_earth(at: list[Position]) -> None:
+def test_map_sheet_holds_every_place_on_earth(at: list[Position]) -> None:
     sheet = MapSheet.around(np.array(at))
     for x, y in sheet.xy(np.array(at)):
         assert -0.2 <= x <= MAP_WIDTH + 0.2
@@ -80,14 +78,14 @@ def test_every_place_lies_on_the_sheet_wherever_on_earth(at: list[Position]) -> 
     assert 0 < sheet.bar()[0] <= MAP_WIDTH / 3 + 0.1
 
 
-def test_a_world_map_has_meridians_and_parallels() -> None:
+def test_map_sheet_of_the_world_has_meridians_and_parallels() -> None:
     sheet = MapSheet.around(np.array([(51.5, -0.1), (40.7, -74.0), (-33.9, 151.2)]))
     assert {"0°", "50° N"} <= {tick.label for tick in sheet.parallels()}
     assert [tick.label for tick in sheet.meridians()] == ["100° W", "0°", "100° E"]
     assert sheet.x(-74.0) < sheet.x(-0.1) < sheet.x(151.2)
 
 
-def test_the_farthest_answers_are_named_one_for_each_place() -> None:
+def test_error_map_lists_the_worst_answer_of_each_place() -> None:
     far = [query("a", A, "b", (30 + k, 120.0), k) for k in range(1, 4)]
     drawn = error_map(
         "t",
@@ -101,27 +99,23 @@ def test_the_farthest_answers_are_named_one_for_each_place() -> None:
     assert [row["query"] for row in drawn.worst] == ["a-3", "p8-0", "p7-0", "p6-0", "p5-0"]
 
 
-def test_without_positions_there_is_no_map() -> None:
+def test_error_map_without_positions_is_none() -> None:
     unknown = query("a", A, "b", B) | {"distance_m": None}
     assert error_map("t", [unknown]) is None
     assert distance_chart("t", [unknown]) is None
-    assert (
-        error_map("t", [{"location": "a"}]) is None
-    )  # rows of an evaluation that is older than positions in it
+    assert error_map("t", [{"location": "a"}]) is None
 
 
-def test_distances_are_drawn_as_the_share_within_so_many_metres() -> None:
+def test_distance_chart_shows_the_share_within_a_distance() -> None:
     chart = distance_chart("t", [query("a", A, "a", A), query("a", A, "b", B)])
     assert chart
     assert chart.summary == "t: half within 481 m, the farthest 963 m off"
-    heights = [float(point.split(",")[1]) for point in chart.lines[0].runs[0].split()]
-    assert heights[0] == pytest.approx(
-        (heights[-1] + 164) / 2
-    )  # a half at 1 m, all at the end; 164 is 0 %
+    shares = [y for _, y in chart.series[0].points]
+    assert (shares[0], shares[-1]) == (0.5, 1.0)  # at 1 m and at the end
 
 
 @pytest.mark.parametrize(
-    ("value", "said"),
+    ("value", "text"),
     [
         (0, "0 m"),
         (12.4, "12 m"),
@@ -131,5 +125,5 @@ def test_distances_are_drawn_as_the_share_within_so_many_metres() -> None:
         (3.4e6, "3,400 km"),
     ],
 )
-def test_distances_are_said_as_people_say_them(value: float, said: str) -> None:
-    assert format_metres(value) == said
+def test_format_metres_rounds_to_two_digits(value: float, text: str) -> None:
+    assert format_metres(value) == text

@@ -1,4 +1,4 @@
-"""Figures for a paper: every one that there is data for, embedded fonts, the same bytes each time."""
+"""Figures of a paper: one for all data there is, embedded fonts, the same bytes each time."""
 
 import re
 from dataclasses import replace
@@ -10,7 +10,14 @@ from tests.report.test_page import TOWN, jpeg
 from tests.report.test_sections import full, merged
 
 VIEWS = tuple(
-    {"task": "drone->satellite", "views": n, "r1": 0.5, "r1_low": 0.25, "r1_high": 0.75}
+    {
+        "task": "drone->satellite",
+        "views": n,
+        "queries": 4,
+        "r1": 0.5,
+        "r1_low": 0.25,
+        "r1_high": 0.75,
+    }
     for n in (1, 2)
 )
 NAMES = {
@@ -26,18 +33,18 @@ NAMES = {
 }
 
 
-FOUND = full(TOWN, [merged(row["location"], 1) for row in TOWN])
+RESULTS = full(TOWN, [merged(row["location"], 1) for row in TOWN])
 
 
-def test_every_figure_is_written_in_both_formats_with_embedded_fonts_and_no_date(
+def test_write_figures_embeds_fonts_and_no_date(
     tmp_path: Path,
 ) -> None:
-    placed = {
+    positions = {
         name: query("a", A, "b", B)[name]
         for name in ("lat", "lon", "answer_lat", "answer_lon", "distance_m")
     }
     found = full(
-        [row | placed for row in TOWN[:3]], [merged(row["location"], 1) for row in TOWN[:3]]
+        [row | positions for row in TOWN[:3]], [merged(row["location"], 1) for row in TOWN[:3]]
     )
     picture = jpeg("olive")
     names = write_figures(
@@ -56,17 +63,17 @@ def test_every_figure_is_written_in_both_formats_with_embedded_fonts_and_no_date
     assert not re.search(rb"/(Creation|Mod)Date", data)
 
 
-def test_the_same_evaluation_gives_the_same_bytes_whatever_formats_are_asked_for(
+def test_write_figures_gives_the_same_bytes_in_any_formats(
     tmp_path: Path,
 ) -> None:
-    """Without pictures there are none of hits and misses."""
-    names = write_figures(FOUND, lambda keys: {}, str(tmp_path / "both"), ("png", "pdf"))
+    """Without images there are no figures of hits and misses."""
+    names = write_figures(RESULTS, lambda keys: {}, str(tmp_path / "both"), ("png", "pdf"))
     assert names == ["recall", "scores", "parts", "groups-altitude_m", "view-gap-drone-satellite"]
-    assert write_figures(FOUND, lambda keys: {}, str(tmp_path / "one"), ("pdf",)) == names
+    assert write_figures(RESULTS, lambda keys: {}, str(tmp_path / "one"), ("pdf",)) == names
     for path in (tmp_path / "one").iterdir():
         assert (tmp_path / "both" / path.name).read_bytes() == path.read_bytes(), path.name
 
 
-def test_merged_queries_alone_have_a_recall_curve(tmp_path: Path) -> None:
-    alone = replace(FOUND, metrics=FOUND.metrics[1:], groups=(), parts=(), gaps=())
+def test_write_figures_of_merged_queries_has_a_recall_curve(tmp_path: Path) -> None:
+    alone = replace(RESULTS, metrics=RESULTS.metrics[1:], groups=(), parts=(), gaps=())
     assert write_figures(alone, lambda keys: {}, str(tmp_path), ("pdf",)) == ["recall"]

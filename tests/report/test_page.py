@@ -1,4 +1,4 @@
-"""The report page as text: what it shows, what it chooses, and that hostile names stay names."""
+"""The report page as text: what it shows, which queries it chooses, and that it escapes names."""
 
 import io
 import json
@@ -15,7 +15,7 @@ from PIL import Image
 from pipeline.core.errors import InputError
 from pipeline.images.thumbnails import ThumbnailCache, no_images, thumbnail
 from pipeline.report import page as report
-from pipeline.report.charts import scores_chart, views_chart
+from pipeline.report.charts import nice_ticks, recall_chart, scores_chart, views_chart
 from pipeline.report.inputs import EvaluationResults, ReportContext, read_training
 from pipeline.report.panels import (
     confidence_order,
@@ -24,14 +24,15 @@ from pipeline.report.panels import (
     panel_keys,
     spread_over_locations,
 )
-from pipeline.report.svg import nice_ticks, recall_chart, training_charts
+from pipeline.report.svg import layout_chart
+from pipeline.report.training_charts import training_charts
 from pipeline.retrieval.tasks import RESULTS_SCHEMA
 
 
 def result(
     location: str, first: int | None, score: float = 0.9, task: str = "drone->satellite"
 ) -> dict[str, Any]:
-    """A query whose true match stands at this rank among ten."""
+    """A query whose true match has this rank among ten."""
     tops = [location if rank == first else f"other{rank}" for rank in range(1, 11)]
     return {
         "query": f"query-drone-{location}-{score}",
@@ -50,7 +51,7 @@ def result(
     }
 
 
-def findings(rows: list[dict[str, Any]], name: str = "out", r1: float = 0.5) -> EvaluationResults:
+def evaluation(rows: list[dict[str, Any]], name: str = "out", r1: float = 0.5) -> EvaluationResults:
     metrics = {
         "task": "drone->satellite",
         "protocol": "full",
@@ -81,13 +82,13 @@ TOWN = [result("0001", 1), result("0002", 3), result("0003", 40), result("0004",
 def page(rows: list[dict[str, Any]] = TOWN, extras: ReportContext | None = None) -> str:
     pictures = {key: jpeg("olive") for key in panel_keys(rows)}
     return report.render_report(
-        findings(rows),
+        evaluation(rows),
         extras or ReportContext(title="Town"),
         lambda keys: {key: pictures[key] for key in keys},
     )
 
 
-def test_the_page_shows_measures_in_percent_and_chance() -> None:
+def test_page_shows_measures_in_percent_and_chance() -> None:
     text = page()
     assert all(
         figure in text
@@ -96,29 +97,28 @@ def test_the_page_shows_measures_in_percent_and_chance() -> None:
     assert "1 queries have no true match and count as missed" in text
 
 
-def test_the_same_results_give_the_same_page() -> None:
+def test_page_of_the_same_results_is_the_same() -> None:
     assert page() == page()
 
 
-def test_panels_frame_right_and_wrong_and_say_so_in_words() -> None:
+def test_page_frames_and_names_right_and_wrong_answers() -> None:
     text = page()
-    assert (
-        len(re.findall(r'class="answer right ', text)) == 3
-    )  # rank 1, rank 3, and the one at rank 40 set apart
+    # Ranks 1 and 3, and the true match at rank 40, which is shown apart.
+    assert len(re.findall(r'class="answer right ', text)) == 3
     assert len(re.findall(r'class="answer wrong ', text)) == 4 * 5 - 2
     assert 'alt="Rank 1, location 0001, a true match"' in text
     assert "first true match at rank&nbsp;40" in text
     assert "no true match in the gallery" in text
 
 
-def test_the_best_true_match_is_shown_where_it_is_not_among_the_five() -> None:
+def test_make_panel_adds_the_true_match_outside_the_top_five() -> None:
     panel = make_panel(TOWN[2], ThumbnailCache({}))
     assert panel.truth
     assert (panel.truth.rank, panel.truth.key, panel.truth.right) == (40, "gallery-0003", True)
     assert make_panel(TOWN[1], ThumbnailCache({})).truth is None
 
 
-def test_hostile_names_stay_names() -> None:
+def test_page_escapes_hostile_names() -> None:
     evil = "<script>alert(1)</script>\"'"
     text = page(
         [result(evil, 1), result(evil, 2, 0.8)],
@@ -128,7 +128,7 @@ def test_hostile_names_stay_names() -> None:
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
 
 
-def test_the_page_needs_nothing_but_itself() -> None:
+def test_page_loads_nothing() -> None:
     text = page()
     assert "default-src 'none'" in text
     assert not re.search(r'(?:src|href)="(?!data:|#)', text)
@@ -136,34 +136,34 @@ def test_the_page_needs_nothing_but_itself() -> None:
     assert "@import" not in text
 
 
-def test_without_pictures_the_page_says_how_to_get_them() -> None:
-    text = report.render_report(findings(TOWN), ReportContext(title="Town"), no_images)
+def test_page_without_images_says_how_to_get_them() -> None:
+    text = report.render_report(evaluation(TOWN), ReportContext(title="Town"), no_images)
     assert "evaluate again with <code>--shards</code>" in text
     assert "<img" not in text
 
 
-def test_another_evaluation_stands_beside_with_the_difference() -> None:
+def test_page_compares_with_another_evaluation() -> None:
     text = page(
-        extras=ReportContext(title="Town", beside=findings(TOWN, name="untrained", r1=0.125))
+        extras=ReportContext(title="Town", beside=evaluation(TOWN, name="untrained", r1=0.125))
     )
     assert "12.50" in text
     assert "+37.50" in text
     assert "untrained" in text
 
 
-def test_an_evaluation_of_other_images_does_not_stand_beside() -> None:
+def test_page_refuses_to_compare_with_other_images() -> None:
     with pytest.raises(
         InputError, match=r"untrained ranked 3 queries in 951 rows .* this evaluation 4 in 951"
     ):
-        page(extras=ReportContext(title="Town", beside=findings(TOWN[:3], name="untrained")))
+        page(extras=ReportContext(title="Town", beside=evaluation(TOWN[:3], name="untrained")))
 
 
-def test_no_hits_and_no_misses_are_said_in_words() -> None:
+def test_page_without_hits_or_misses_says_so() -> None:
     assert "No query has a true match first." in page(TOWN[1:])
     assert "Every query has a true match first." in page(TOWN[:1])
 
 
-def test_panels_are_spread_over_the_range_and_over_locations() -> None:
+def test_spread_covers_the_range_and_many_locations() -> None:
     rows = [result(f"{i % 10:04d}", 1, 0.5 + 0.001 * i) for i in range(100)]
     chosen = spread_over_locations(rows, 4, confidence_order)
     assert [row["location"] for row in chosen] == ["0009", "0006", "0003", "0000"]
@@ -184,7 +184,7 @@ def test_panels_are_spread_over_the_range_and_over_locations() -> None:
     )
 
 
-def test_thumbnails_are_small_and_damaged_pictures_are_left_out() -> None:
+def test_thumbnail_is_small_and_none_if_damaged() -> None:
     source = thumbnail(jpeg("teal", (900, 450)), 180)
     assert source
     assert source.startswith("data:image/webp;base64,")
@@ -193,50 +193,53 @@ def test_thumbnails_are_small_and_damaged_pictures_are_left_out() -> None:
     assert thumbnail(None, 180) is None
 
 
-def test_training_charts_show_what_the_rows_hold() -> None:
+def test_training_charts_cover_the_measures_in_the_rows() -> None:
     rows = [
         {"epoch": e, "location_loss": 9.0 / e, "alpha": 0.9 if e < 3 else 1.0} for e in range(1, 5)
     ]
     loss, alpha = training_charts(rows)
     assert (loss.title, alpha.title) == ("Location loss", "α")
-    assert len(loss.lines[0].runs[0].split()) == 4
+    assert len(layout_chart(loss).curves[0].runs[0].split()) == 4
     assert len(loss.marks) == 1  # alpha grew once
     assert loss.summary == "Location loss over 4 epochs, from 9 to 2.25"
 
 
-def test_a_loss_that_is_not_a_number_leaves_a_gap() -> None:
+def test_layout_chart_leaves_a_gap_at_nan() -> None:
     rows = [{"epoch": e, "view_loss": math.nan if e == 3 else 1.0} for e in range(1, 6)]
     [chart] = training_charts(rows)
-    assert [len(run.split()) for run in chart.lines[0].runs] == [2, 2]
+    assert [len(run.split()) for run in layout_chart(chart).curves[0].runs] == [2, 2]
     assert training_charts([{"epoch": 1, "view_loss": math.nan}]) == []
 
 
-def test_one_epoch_is_a_dot() -> None:
+def test_training_charts_draw_one_epoch_as_a_dot() -> None:
     [chart] = training_charts([{"epoch": 1, "alpha": 0.9}])
-    assert len(chart.lines[0].dots) == 1
-    assert all(math.isfinite(tick.at) for tick in (*chart.x_ticks, *chart.y_ticks))
+    assert len(chart.series[0].dots) == 1
+    drawn = layout_chart(chart)
+    assert all(math.isfinite(tick.at) for tick in (*drawn.x_ticks, *drawn.y_ticks))
 
 
 @pytest.mark.parametrize(
     ("low", "high", "ticks"),
     [(0, 1, [0, 0.5, 1]), (0.9, 1.2, [0.9, 1.0, 1.1, 1.2]), (0, 41, [0, 20, 40, 60])],
 )
-def test_ticks_are_round_and_enclose_the_range(low: float, high: float, ticks: list[float]) -> None:
+def test_nice_ticks_are_round_and_enclose_the_range(
+    low: float, high: float, ticks: list[float]
+) -> None:
     assert nice_ticks(low, high) == ticks
 
 
 @pytest.mark.parametrize("value", [0.0, 0.9, -3.0, 1e-12, 1e12])
-def test_ticks_of_a_constant_enclose_it(value: float) -> None:
+def test_nice_ticks_enclose_a_constant(value: float) -> None:
     ticks = nice_ticks(value, value)
     assert ticks[0] < value < ticks[-1]
 
 
 @pytest.mark.parametrize("gallery", [1, 2, 9, 951, 51_355])
-def test_the_recall_curve_spans_the_gallery(gallery: int) -> None:
+def test_recall_chart_spans_the_gallery(gallery: int) -> None:
     chart = recall_chart("t", "", np.array([1, 2, 0]), gallery, np.array([0, 0, 1]), "other")
-    assert [line.name for line in chart.lines] == ["other", "this network"]
-    assert chart.lines[1].dots[0][2] == "R@1: 33.33 %"
-    assert chart.x_ticks[0].label == "1"
+    assert [series.name for series in chart.series] == ["other", "this network"]
+    assert chart.series[1].dots[0][2] == "R@1: 33.33 %"
+    assert chart.x.ticks[0].label == "1"
 
 
 def write_lines(run: Path, *lines: str) -> str:
@@ -244,7 +247,7 @@ def write_lines(run: Path, *lines: str) -> str:
     return str(run)
 
 
-def test_training_rows_are_read_by_epoch_and_the_later_of_two_counts(tmp_path: Path) -> None:
+def test_read_training_keeps_the_later_row_of_an_epoch(tmp_path: Path) -> None:
     lines = [
         json.dumps({"epoch": epoch, "alpha": alpha})
         for epoch, alpha in ((1, 0.9), (2, 0.9), (2, 1.0), (3, 1.0))
@@ -254,14 +257,14 @@ def test_training_rows_are_read_by_epoch_and_the_later_of_two_counts(tmp_path: P
     ] == [0.9, 1.0, 1.0]
 
 
-def test_training_rows_that_are_none_are_refused(tmp_path: Path) -> None:
+def test_read_training_refuses_other_content(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"found no metrics.jsonl"):
         read_training(str(tmp_path))
     with pytest.raises(InputError, match=r"line 1 of .* expected a JSON object with its epoch"):
         read_training(write_lines(tmp_path, "[]", '{"epoch": 1}'))
 
 
-SURE = {"r1_low": 0.4, "r1_high": 0.6, "ap_low": 0.5, "ap_high": 0.75}
+INTERVALS = {"r1_low": 0.4, "r1_high": 0.6, "ap_low": 0.5, "ap_high": 0.75}
 CURVE = tuple(
     {
         "task": "drone->satellite",
@@ -275,7 +278,7 @@ CURVE = tuple(
 )
 
 
-def test_the_page_shows_intervals_distances_and_what_more_views_bring() -> None:
+def test_page_shows_intervals_distances_and_views() -> None:
     geo = {
         "geo_queries": 4,
         "distance_median_m": 12.4,
@@ -283,9 +286,9 @@ def test_the_page_shows_intervals_distances_and_what_more_views_bring() -> None:
         "within_50m": 0.75,
         "within_100m": 1.0,
     }
-    plain = findings(TOWN)
+    plain = evaluation(TOWN)
     full = EvaluationResults(
-        name="out", metrics=[plain.metrics[0] | SURE | geo], results=plain.results, views=CURVE
+        name="out", metrics=[plain.metrics[0] | INTERVALS | geo], results=plain.results, views=CURVE
     )
     text = report.render_report(full, ReportContext(title="Town"), lambda keys: {})
     assert "40.0 to 60.0" in text
@@ -297,10 +300,10 @@ def test_the_page_shows_intervals_distances_and_what_more_views_bring() -> None:
     assert "95 % interval" not in before
 
 
-def test_scores_of_right_and_wrong_answers_are_drawn_apart() -> None:
+def test_scores_chart_has_a_series_of_each_kind() -> None:
     chart = scores_chart("t", TOWN)
     assert chart
     assert chart.summary == "t: median score 0.870 of true matches, 0.890 of wrong answers"
-    assert [line.style for line in chart.lines] == ["beside", "main"]
+    assert [series.role for series in chart.series] == ["beside", "main"]
     assert scores_chart("t", [TOWN[3]]) is None
     assert views_chart("t", []) is None
