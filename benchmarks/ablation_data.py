@@ -13,8 +13,9 @@ from model.inference.embed import embed
 from model.training import Training
 from pipeline.batches.ordered import decode_samples
 from pipeline.core.records import Split, View
+from pipeline.retrieval.embedding_set import EmbeddingSet, embedding_set_from_array
 from pipeline.retrieval.metrics import summarise
-from pipeline.retrieval.ranking import EmbeddingSet, embedding_set_from_array, rank
+from pipeline.retrieval.ranking import rank
 from pipeline.shards.pack import pack
 from pipeline.shards.settings import PackingSettings
 from pipeline.shards.shard_set import ShardSet

@@ -17,8 +17,12 @@ import numpy as np
 
 from pipeline.core.arrays import Ints
 from pipeline.features.table import Floats, PartFooter, PartRows, open_table, write_part
-from pipeline.retrieval.ranking import BlockSizes, EmbeddingSet, embedding_set_from_array, rank
-from pipeline.retrieval.tasks import embedding_set_from_table
+from pipeline.retrieval.embedding_set import (
+    EmbeddingSet,
+    embedding_set_from_array,
+    embedding_set_from_table,
+)
+from pipeline.retrieval.ranking import BlockSizes, rank
 
 DIMENSION = 2048
 TASKS = {"drone->satellite": (701, 54, 951, 1), "satellite->drone": (701, 1, 951, 54)}

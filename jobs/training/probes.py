@@ -22,8 +22,9 @@ from pipeline.batches.training import TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.features.table import Floats
+from pipeline.retrieval.embedding_set import EmbeddingSet, embedding_set_from_array
 from pipeline.retrieval.metrics import summarise
-from pipeline.retrieval.ranking import EmbeddingSet, embedding_set_from_array, rank
+from pipeline.retrieval.ranking import rank
 
 GAP_IMAGES = 256
 "Of each view, for the view gap; half of them fit the probe, the other half is asked."

@@ -30,6 +30,7 @@ from pipeline.report.inputs import (
     read_report_context,
 )
 from pipeline.report.page import render_report
+from pipeline.retrieval.embedding_set import embedding_set_from_table
 from pipeline.retrieval.results import (
     INPUTS_FILE,
     METRICS_FILE,
@@ -40,13 +41,7 @@ from pipeline.retrieval.results import (
     write_inputs,
 )
 from pipeline.retrieval.subsets import vectors_by_key
-from pipeline.retrieval.tasks import (
-    METRICS_SCHEMA,
-    Task,
-    embedding_set_from_table,
-    possible_tasks,
-    retrieve,
-)
+from pipeline.retrieval.tasks import METRICS_SCHEMA, Task, possible_tasks, retrieve
 from pipeline.shards.shard_set import ShardSet, open_shards
 from pipeline.shards.verify import require_intact
 

@@ -235,8 +235,8 @@ def scatter(gap: Row, beside: EvaluationResults | None = None) -> Scatter:
         by_side[point["side"]].append(xy)
     return Scatter(
         title=f"{query_view} and {gallery_view} images",
-        summary=f"{len(by_side['query'])} {query_view} and {len(by_side['gallery'])} {gallery_view} "
-        "images in two dimensions: "
+        summary=f"{len(by_side['query'])} {query_view} and {len(by_side['gallery'])} "
+        f"{gallery_view} images in two dimensions: "
         + "; ".join(f"{name} {value}" for name, value, _ in statistics),
         query_view=query_view,
         gallery_view=gallery_view,

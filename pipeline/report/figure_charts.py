@@ -1,4 +1,5 @@
-"""Charts of a paper: descriptions of `charts`, `tables` and `error_map` in, matplotlib figures out."""
+"""Charts of a paper: descriptions of `charts`, `tables` and `error_map` in, matplotlib figures
+out."""
 
 from collections.abc import Sequence
 

@@ -43,7 +43,8 @@ class MapSheet:
         if wide > 180:  # places all over the world: an ordinary world map
             west, wide = -180.0, 360.0
         shrink = math.cos(math.radians((south + north) / 2))
-        tall_m, wide_m = ((north - south) * METRES_PER_DEGREE, wide * METRES_PER_DEGREE * shrink)
+        tall_m = (north - south) * METRES_PER_DEGREE
+        wide_m = wide * METRES_PER_DEGREE * shrink
         scale = min(
             (MAP_WIDTH - 2 * MAP_MARGIN) / max(wide_m, MIN_SPAN_M),
             (MAP_HEIGHT - 2 * MAP_MARGIN) / max(tall_m, MIN_SPAN_M),
@@ -73,8 +74,7 @@ class MapSheet:
         return [(self.x(lon), self.y(lat)) for lat, lon in at_N2.tolist()]
 
     def bar(self) -> tuple[float, str]:
-        """The longest round distance that takes at most a third of the map: its length on the map, and
-        its label."""
+        """The longest round distance within a third of the map: its length there, and its label."""
         most = MAP_WIDTH / 3 / self.scale
         unit = 10.0 ** math.floor(math.log10(most))
         length = max(step * unit for step in (1, 2, 5) if step * unit <= most)

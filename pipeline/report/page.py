@@ -6,7 +6,7 @@ runs no script and loads nothing (no font, no request: its Content-Security-Poli
 and every name on it is escaped, since location names come from folder names.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,7 @@ def render_report(
     parts = {row["task"]: row["parts"] for row in results.parts}
     thumbnails, known = ThumbnailCache(images(keys)), vectors(keys) if parts else {}
     environment = template_environment(Path(__file__).parent / "templates")
-    environment.filters |= {
+    filters: dict[str, Callable[..., Any]] = {
         "percent": lambda value: f"{100 * value:.2f}",
         "points": lambda value: f"{100 * value:+.2f}",
         "metres": map_sheet.format_metres,
@@ -64,6 +64,7 @@ def render_report(
         "opened": lambda items: _numbered(items, opened=True),
         "folded": lambda items: _numbered(items, opened=False),
     }
+    environment.filters |= filters
     return environment.get_template("report.html").render(
         title=context.title,
         fingerprint=results.metrics[0]["fingerprint"],
@@ -86,7 +87,7 @@ def render_report(
     )
 
 
-def _numbered(items: list[Any], opened: bool) -> list[tuple[int, Any]]:
+def _numbered(items: Sequence[Any], opened: bool) -> list[tuple[int, Any]]:
     """The panels that are open from the start, or the others, with their numbers from 1."""
     shown = set(evenly_spaced(len(items), OPEN_PANELS).tolist())
     return [(i + 1, item) for i, item in enumerate(items) if (i in shown) == opened]

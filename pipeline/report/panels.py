@@ -88,9 +88,12 @@ def panel_keys(rows: Iterable[Row]) -> set[str]:
 
 
 def make_panel(
-    row: Row, thumbnails: ThumbnailCache, vectors: Mapping[str, Floats] | None = None, parts: int = 1,
+    row: Row,
+    thumbnails: ThumbnailCache,
+    vectors: Mapping[str, Floats] | None = None,
+    parts: int = 1,
     merged: Sequence[str] = (),
-) -> Panel:  # fmt: skip
+) -> Panel:
     """One query's panel. `vectors`: embeddings (D,) by key, of `parts` parts; `merged`: keys of the
     images that the query is the mean of."""
 

@@ -1,5 +1,5 @@
-"""How sure a mean is: per-query values with their locations in, 95 % bootstrap intervals and paired
-differences out.
+"""Bootstrap: per-query values with their locations in, 95 % intervals of their means and paired
+differences of two runs out.
 
 Images of one location resemble each other, so locations are resampled, not queries (a cluster
 bootstrap: Davison and Hinkley, Bootstrap Methods and their Application, 1997, section 3.8). NumPy
@@ -14,30 +14,10 @@ import numpy as np
 from pipeline.core.arrays import Doubles, Ints, Strings
 from pipeline.retrieval import metrics
 
-
-def metrics_with_intervals(first_Q: Ints, ap_Q: Doubles, locations_Q: Strings) -> dict[str, Any]:
-    """R@1, R@5 and AP of some queries, the first and the last with 95 % intervals; how many they
-    are, of how many places.
-    """
-    hit_Q = metrics.hits_at(1, first_Q)
-    low, high = confidence_intervals(np.stack([hit_Q, ap_Q], axis=1), locations_Q)
-    return {
-        "queries": len(first_Q),
-        "locations": len(np.unique(locations_Q)),
-        "r1": float(hit_Q.mean()),
-        "r5": metrics.recall_at(5, first_Q),
-        "ap": float(ap_Q.mean()),
-        "r1_low": float(low[0]),
-        "r1_high": float(high[0]),
-        "ap_low": float(low[1]),
-        "ap_high": float(high[1]),
-    }
-
-
 BOOTSTRAP_SAMPLES = 2_000
 BOOTSTRAP_SEED = 0
 CONFIDENCE_LEVEL = 0.95
-WEIGHTS_PER_BLOCK = 4_000_000  # weights drawn at once: 32 MB
+WEIGHTS_PER_BLOCK = 4_000_000  # drawn at a time: 32 MB
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +29,8 @@ class Difference:
     low: float
     high: float
     p: float
-    """Two-sided: how often a resampled difference falls on the other side of zero, doubled; at
-    least 2 / (samples + 1)."""
+    """Two-sided: the share of resampled differences on the other side of zero, doubled; at least
+    2 / (samples + 1)."""
 
 
 def resampled_means(
@@ -61,7 +41,7 @@ def resampled_means(
 ) -> Doubles:
     """Means (S, M) over queries of locations drawn with replacement, as many as there are.
 
-    The draws depend on the locations' number and the seed alone, so two runs on the same queries
+    The draws depend on the number of locations and the seed alone, so two runs on the same queries
     are resampled alike.
     """
     names, location_Q = np.unique(locations_Q, return_inverse=True)
@@ -85,7 +65,8 @@ def confidence_intervals(
     samples: int = BOOTSTRAP_SAMPLES,
     seed: int = BOOTSTRAP_SEED,
 ) -> Doubles:
-    """The 95 % percentile interval of each measure's mean, (2, M): low, high. NaN without queries."""
+    """The 95 % percentile interval of each measure's mean, (2, M): low, high. NaN without
+    queries."""
     if not len(values_QM):
         return np.full((2, values_QM.shape[1]), np.nan)
     means_SM = resampled_means(values_QM, locations_Q, samples, seed)
@@ -110,3 +91,22 @@ def paired_difference(
         high=float(high),
         p=min(1.0, 2 * (beyond + 1) / (samples + 1)),
     )
+
+
+def metrics_with_intervals(first_Q: Ints, ap_Q: Doubles, locations_Q: Strings) -> dict[str, Any]:
+    """R@1, R@5 and AP of some queries, R@1 and AP with 95 % intervals; the numbers of queries and
+    of their locations.
+    """
+    hit_Q = metrics.hits_at(1, first_Q)
+    low, high = confidence_intervals(np.stack([hit_Q, ap_Q], axis=1), locations_Q)
+    return {
+        "queries": len(first_Q),
+        "locations": len(np.unique(locations_Q)),
+        "r1": float(hit_Q.mean()),
+        "r5": metrics.recall_at(5, first_Q),
+        "ap": float(ap_Q.mean()),
+        "r1_low": float(low[0]),
+        "r1_high": float(high[0]),
+        "ap_low": float(low[1]),
+        "ap_high": float(high[1]),
+    }

@@ -1,14 +1,14 @@
-"""What retrieval is scored by: ranks of the true matches in, Recall@K and average precision out.
-NumPy only, no I/O.
+"""Measures of retrieval: ranks of the true matches in, Recall@K and average precision out. NumPy
+only, no I/O.
 
-Ranks are 1-based: the row that scores highest has rank 1. Ties are settled against the query
+Ranks are 1-based: the row that scores highest has rank 1. Ties are broken against the query
 (pessimistically): a true match ranks behind every other gallery row of equal score, so a network
 that gives all images one vector finds nothing. A query without a true match has no rank (0 in
 arrays here, null in files), counts as zero in every mean and stays in the denominator:
 University-1652's official evaluate_gpu.py (github.com/layumi/University1652-Baseline) skips it in
 its sums and divides by the number of all queries. All means are fractions from 0 to 1.
 
-Shapes: Q queries, P true matches of all queries together. `owner_P` says which query each match
+Shapes: Q queries, P true matches of all queries together. `owner_P` is the query that each match
 belongs to; both arrays are ordered by query, then by rank.
 """
 
@@ -32,13 +32,13 @@ class RetrievalMetrics:
     r5: float
     r10: float
     r1p: float
-    "Recall at the top 1 %, under the field's definition: see `one_percent`."
+    "Recall at the top 1 %, by the field's definition: see `one_percent_k`."
     ap: float
     "Mean average precision."
 
 
 def first_match_ranks(ranks_P: Ints, owner_P: Ints, queries: int) -> Ints:
-    """Best rank of a true match, for each query (Q,); 0 where it has none."""
+    """Best rank of a true match, for each query (Q,); 0 if it has none."""
     best_Q = np.full(queries, np.iinfo(np.int64).max, np.int64)
     np.minimum.at(best_Q, owner_P, ranks_P)
     best_Q[best_Q == np.iinfo(np.int64).max] = 0
@@ -85,15 +85,13 @@ def average_precisions(ranks_P: Ints, owner_P: Ints, queries: int) -> Doubles:
 
 
 def chance_recall(matches_Q: Ints, gallery: int) -> float:
-    """R@1 of a ranking drawn by lot: the share of the gallery that is right, averaged over the
-    queries.
-    """
+    """R@1 of a random ranking: the share of the gallery that matches, averaged over the queries."""
     return float(np.mean(matches_Q / gallery)) if len(matches_Q) and gallery else 0.0
 
 
 def per_query_values(first_Q: Ints, ap_Q: Doubles, gallery: int) -> Doubles:
-    """What `summarise` takes the means of: hits at 1, 5, 10 and the top 1 %, and average precision
-    (Q, 5).
+    """The values whose means `summarise` takes: hits at 1, 5, 10 and the top 1 %, and average
+    precision (Q, 5).
     """
     return np.stack(
         [*(hits_at(k, first_Q) for k in (1, 5, 10, one_percent_k(gallery))), ap_Q], axis=1

@@ -1,11 +1,11 @@
-"""Exact retrieval: queries and a gallery in, the rank of every true match, average precision and
-the top k out.
+"""Exact ranking: queries and a gallery in, the rank of every true match, average precision and the
+top k out. In this process (`rank`) or on Ray workers (`rank_distributed`), with the same result.
 
 The full score matrix never exists: the gallery is read twice in blocks. The first pass scores the
-true matches alone, the second counts what ranks ahead of each of them and keeps the k best. Both
-rest on one total order of gallery rows, the same whatever the blocks: higher score first; at equal
-score the wrong rows before the true matches (see pipeline/retrieval/metrics.py on ties); then the
-gallery's order. How scores are exact and fast at once: pipeline/retrieval/exact_scores.py.
+true matches alone, the second counts the rows ahead of each of them and keeps the k best. Both use
+one total order of gallery rows, the same for any blocks: higher score first; at equal score the
+wrong rows before the true matches (see metrics.py on ties); then the gallery's order. How scores
+are both exact and fast: exact_scores.py.
 
 Shapes: B gallery rows of a block, Q queries, P pairs of a query and a true match, D dimensions, K
 rows kept at the top.
@@ -20,65 +20,42 @@ import numpy as np
 import ray
 
 from pipeline.core import cluster
-from pipeline.core.arrays import Doubles, Ints, Strings
+from pipeline.core.arrays import Doubles, Floats, Ints
 from pipeline.core.prefetch import prefetch
-from pipeline.features.table import Floats
 from pipeline.retrieval import exact_scores, metrics
+from pipeline.retrieval.embedding_set import EmbeddingSet, slice_rows
 from pipeline.retrieval.exact_scores import LAST_ROW, NO_KEY, WRONG_BIT, round_to_grid
 
-PREFETCH_BLOCKS = 1  # read while another is ranked; each takes 34 MB at 2,048 dimensions
-
-
-@dataclass(frozen=True, kw_only=True)
-class EmbeddingSet:
-    """The queries or the gallery: names in memory, unit vectors in blocks."""
-
-    keys: Strings
-    locations: Strings
-    blocks: Callable[[int], Iterator[Floats]]
-    "Vectors of at most so many rows at a time, float32 (B, D), in the order of `keys`."
-    positions: Doubles | None = None
-    """Latitude and longitude of each row (rows, 2), degrees, NaN where unknown; None where of no
-    interest."""
+PREFETCH_BLOCKS = 1  # gallery blocks read ahead; each takes 34 MB at 2,048 dimensions
 
 
 @dataclass(frozen=True, kw_only=True)
 class BlockSizes:
-    """How the work is cut. Changes memory and speed, never a result."""
+    """How the work is divided. Changes memory and speed, never a result."""
 
     queries_in_memory: int = 65_536
-    """Queries in memory at once; the gallery is read twice for each such group. 0.5 GB at 2,048
-    dimensions."""
+    """The gallery is read twice for each group of so many. 0.5 GB at 2,048 dimensions."""
     query_rows: int = 2_048
-    "Queries of one product."
+    "Queries per matrix product."
     gallery_rows: int = 4_096
-    "Gallery rows of one product; 2,048 x 4,096 scores take 33 MB."
+    "Gallery rows per matrix product; 2,048 x 4,096 scores take 33 MB."
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ranking:
-    """What came of each query, in the queries' order. Rows point into the gallery."""
+    """The result for each query, in the queries' order. Rows index the gallery."""
 
     matches_Q: Ints
-    "How many true matches the gallery holds."
+    "Number of true matches in the gallery."
     first_rank_Q: Ints
-    "Rank of the best true match, from 1; 0 where there is none."
+    "Rank of the best true match, from 1; 0 if there is none."
     first_row_Q: Ints
-    "Its row; -1 where there is none."
+    "Its row; -1 if there is none."
     first_score_Q: Floats
-    "Its score; NaN where there is none."
+    "Its score; NaN if there is none."
     ap_Q: Doubles
     top_rows_QK: Ints
     top_scores_QK: Floats
-
-
-def embedding_set_from_array(keys: Strings, locations: Strings, vectors_QD: Floats) -> EmbeddingSet:
-    """Vectors that are in memory."""
-
-    def blocks(rows: int) -> Iterator[Floats]:
-        return (vectors_QD[begin : begin + rows] for begin in range(0, len(vectors_QD), rows))
-
-    return EmbeddingSet(keys=keys, locations=locations, blocks=blocks)
 
 
 def rank(
@@ -88,12 +65,12 @@ def rank(
     blocks: BlockSizes | None = None,
     advance: Callable[[int], None] = lambda scores: None,
 ) -> Ranking:
-    """Rank the gallery for every query, exactly. `advance` is told how many scores have been
-    settled.
+    """Rank the gallery for every query, exactly. `advance` receives the number of scores computed
+    since its last call.
 
-    Raises InputError when a vector is not of unit length.
+    Raises InputError if a vector is not of unit length.
     """
-    cut = blocks or BlockSizes()
+    sizes = blocks or BlockSizes()
     names, code = np.unique(
         np.concatenate([queries.locations, gallery.locations]), return_inverse=True
     )
@@ -102,15 +79,15 @@ def rank(
     count_by_code = np.bincount(gallery_code, minlength=len(names))
     begin_by_code = np.cumsum(count_by_code) - count_by_code
     groups, begin = [], 0
-    for group_QD in _rechunk(queries.blocks(cut.queries_in_memory), cut.queries_in_memory):
+    for group_QD in _rechunk(queries.blocks(sizes.queries_in_memory), sizes.queries_in_memory):
         code_Q = query_code[begin : begin + len(group_QD)]
         matches_Q = count_by_code[code_Q]
         owner_P = np.repeat(np.arange(len(group_QD)), matches_Q)
-        nth_P = np.arange(len(owner_P)) - np.repeat(np.cumsum(matches_Q) - matches_Q, matches_Q)
-        row_P = rows_by_code[np.repeat(begin_by_code[code_Q], matches_Q) + nth_P]
+        index_P = np.arange(len(owner_P)) - np.repeat(np.cumsum(matches_Q) - matches_Q, matches_Q)
+        row_P = rows_by_code[np.repeat(begin_by_code[code_Q], matches_Q) + index_P]
         groups.append(
             _rank_group(
-                group_QD, gallery, owner_P, row_P, min(top, len(gallery.keys)), cut, advance
+                group_QD, gallery, owner_P, row_P, min(top, len(gallery.keys)), sizes, advance
             )
         )
         begin += len(group_QD)
@@ -131,34 +108,33 @@ def _rank_group(
     owner_P: Ints,
     row_P: Ints,
     top: int,
-    cut: BlockSizes,
+    sizes: BlockSizes,
     advance: Callable[[int], None],
 ) -> Ranking:
     queries = len(group_QD)
     bound = exact_scores.error_bound(group_QD.shape[1])
-    score_P = _match_scores(group_QD, gallery, owner_P, row_P, cut)
+    score_P = _match_scores(group_QD, gallery, owner_P, row_P, sizes)
     low_P, high_P = (
         exact_scores.lower_bound(score_P, bound),
         exact_scores.upper_bound(score_P, bound),
     )
     ahead_P = np.zeros(len(owner_P), np.int64)
     best_QK = np.full((queries, top), NO_KEY)
-    room = np.empty(cut.query_rows * cut.gallery_rows, np.float32)
+    buffer = np.empty(sizes.query_rows * sizes.gallery_rows, np.float32)
     begin = 0
     for block_BD in prefetch(
-        _rechunk(gallery.blocks(cut.gallery_rows), cut.gallery_rows), PREFETCH_BLOCKS
+        _rechunk(gallery.blocks(sizes.gallery_rows), sizes.gallery_rows), PREFETCH_BLOCKS
     ):
         end = begin + len(block_BD)
-        for first in range(0, queries, cut.query_rows):
-            part = slice(first, min(first + cut.query_rows, queries))
+        for first in range(0, queries, sizes.query_rows):
+            part = slice(first, min(first + sizes.query_rows, queries))
             part_QD = group_QD[part]
-            scores_QB = room[: len(part_QD) * len(block_BD)].reshape(len(part_QD), len(block_BD))
+            scores_QB = buffer[: len(part_QD) * len(block_BD)].reshape(len(part_QD), len(block_BD))
             np.matmul(part_QD, block_BD.T, out=scores_QB)
             pairs = slice(*np.searchsorted(owner_P, [part.start, part.stop]))
             owner, here = owner_P[pairs] - first, (row_P[pairs] >= begin) & (row_P[pairs] < end)
-            scores_QB[
-                owner[here], row_P[pairs][here] - begin
-            ] = -np.inf  # true matches are known: wrong rows are counted
+            # The true matches' scores are known; only wrong rows are counted.
+            scores_QB[owner[here], row_P[pairs][here] - begin] = -np.inf
             flat_N, exact_N, ahead = exact_scores.resolve_scores(
                 scores_QB,
                 owner,
@@ -178,8 +154,8 @@ def _rank_group(
 
 
 def _top_k_floors(scores_QB: Floats, best_QK: Ints, bound: float) -> Floats:
-    """For each query what a float32 product must reach to be one of the best K: K of this block, or
-    of those before, are surely no worse. Never minus infinity, which marks true matches."""
+    """For each query the lowest float32 product that may be among the best K, given the best so far
+    and this block's K-th product. Never minus infinity, which marks true matches."""
     top = best_QK.shape[1]
     if not top:
         return np.full(len(best_QK), np.inf, np.float32)
@@ -191,12 +167,12 @@ def _top_k_floors(scores_QB: Floats, best_QK: Ints, bound: float) -> Floats:
 
 
 def _match_scores(
-    group_QD: Floats, gallery: EmbeddingSet, owner_P: Ints, row_P: Ints, cut: BlockSizes
+    group_QD: Floats, gallery: EmbeddingSet, owner_P: Ints, row_P: Ints, sizes: BlockSizes
 ) -> Floats:
     """Scores of the true matches alone."""
     by_row = np.argsort(row_P, kind="stable")
     sorted_P, score_P, begin = row_P[by_row], np.zeros(len(row_P), np.float32), 0
-    for block_BD in _rechunk(gallery.blocks(cut.gallery_rows), cut.gallery_rows):
+    for block_BD in _rechunk(gallery.blocks(sizes.gallery_rows), sizes.gallery_rows):
         low, high = np.searchsorted(sorted_P, [begin, begin + len(block_BD)])
         for first in range(low, high, exact_scores.PAIR_BLOCK_ROWS):
             pairs = by_row[first : min(first + exact_scores.PAIR_BLOCK_ROWS, high)]
@@ -210,8 +186,8 @@ def _match_scores(
 def _make_ranking(
     best_QK: Ints, owner_P: Ints, row_P: Ints, score_P: Floats, ahead_P: Ints
 ) -> Ranking:
-    """`ahead_P`: wrong rows ahead of each match; to these come the matches of the same query that
-    rank before it.
+    """`ahead_P`: the wrong rows ahead of each match, to which the better matches of the same query
+    are added here.
     """
     queries = len(best_QK)
     key_P = exact_scores.order_keys(score_P) | (LAST_ROW - row_P)
@@ -237,23 +213,23 @@ def _make_ranking(
 
 
 def _rechunk(blocks: Iterator[Floats], rows: int) -> Iterator[Floats]:
-    """On the grid, in blocks of `rows` rows (the last one fewer): tables come in parts of any size."""
-    waiting: list[Floats] = []
+    """Blocks of any size as blocks of `rows` rows (the last one fewer), rounded to the grid."""
+    buffered: list[Floats] = []
     count = 0
     for block_BD in blocks:
-        waiting.append(round_to_grid(block_BD))
+        buffered.append(round_to_grid(block_BD))
         count += len(block_BD)
         while count >= rows:
-            whole_BD = _concatenate(waiting)
-            yield whole_BD[:rows]
-            waiting, count = [whole_BD[rows:]], count - rows
+            joined_BD = _concatenate(buffered)
+            yield joined_BD[:rows]
+            buffered, count = [joined_BD[rows:]], count - rows
     if count:
-        yield _concatenate(waiting)
+        yield _concatenate(buffered)
 
 
 def _concatenate(blocks: list[Floats]) -> Floats:
-    some = [block_BD for block_BD in blocks if len(block_BD)]
-    return some[0] if len(some) == 1 else np.concatenate(some)
+    filled = [block_BD for block_BD in blocks if len(block_BD)]
+    return filled[0] if len(filled) == 1 else np.concatenate(filled)
 
 
 def rank_distributed(
@@ -264,49 +240,31 @@ def rank_distributed(
     advance: Callable[[int], None],
     blocks: BlockSizes | None = None,
 ) -> Ranking:
-    """As `ranking.rank`, with `workers` Ray tasks of one core each; 0 ranks in this process.
+    """`rank` by `workers` Ray tasks of one core each; 0 ranks in this process.
 
-    Each worker reads the gallery from its storage by itself, twice: where tables lie on one
-    machine's disk, they must be reachable under the same path from the others.
+    Each worker reads the gallery from storage by itself, twice: tables on one machine's disk must
+    be reachable under the same path from the others.
     """
     count = len(queries.keys)
     if workers < 1 or count < 2:
         return rank(queries, gallery, top, blocks, advance)
     cluster.connect()
-    cut = blocks or BlockSizes()
-    rows = max(1, min(cut.queries_in_memory, -(-count // workers)))
+    sizes = blocks or BlockSizes()
+    rows = max(1, min(sizes.queries_in_memory, -(-count // workers)))
     parts = [(begin, min(begin + rows, count)) for begin in range(0, count, rows)]
-    sides = ray.put((queries, gallery))
-    found: dict[tuple[int, int], Ranking] = {}
+    shared = ray.put((queries, gallery))
+    ranked: dict[tuple[int, int], Ranking] = {}
     for part, ranking in cluster.bounded_map(
-        lambda part: _rank_part.remote(sides, part, top, cut), parts, workers
+        lambda part: _rank_part.remote(shared, part, top, sizes), parts, workers
     ):
-        found[part] = ranking
+        ranked[part] = ranking
         advance((part[1] - part[0]) * len(gallery.keys))
-    return concat_rankings([found[part] for part in parts])
-
-
-def slice_rows(side: EmbeddingSet, begin: int, end: int) -> EmbeddingSet:
-    """Some consecutive rows of a side."""
-
-    def blocks(rows: int) -> Iterator[Floats]:
-        first = 0
-        for block_BD in side.blocks(rows):
-            if first >= end:
-                return
-            kept_BD = block_BD[max(begin - first, 0) : max(end - first, 0)]
-            first += len(block_BD)
-            if len(kept_BD):
-                yield kept_BD
-
-    return EmbeddingSet(
-        keys=side.keys[begin:end], locations=side.locations[begin:end], blocks=blocks
-    )
+    return concat_rankings([ranked[part] for part in parts])
 
 
 @ray.remote(num_cpus=1)
 def _rank_part(
-    sides: tuple[EmbeddingSet, EmbeddingSet], part: tuple[int, int], top: int, cut: BlockSizes
+    shared: tuple[EmbeddingSet, EmbeddingSet], part: tuple[int, int], top: int, sizes: BlockSizes
 ) -> Any:
-    queries, gallery = sides
-    return rank(slice_rows(queries, *part), gallery, top, cut)
+    queries, gallery = shared
+    return rank(slice_rows(queries, *part), gallery, top, sizes)

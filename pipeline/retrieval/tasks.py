@@ -1,26 +1,31 @@
-"""Query table x gallery table -> one row per query and one row of measures per task.
+"""Retrieval tasks: a query table and a gallery table -> one row per query and one row of metrics.
 
-In: selections of feature tables. Out: a task's result rows (Arrow) and its metric row (a dict),
-named by task, protocol and whether a location's queries were merged into one. Shapes: B rows of a
-block, Q queries, L locations, D dimensions.
+In: selections of feature tables. Out: a task's per-query rows (Arrow) and its metric row (a dict),
+labelled with the task, the protocol and whether a location's queries were merged. Shapes: Q
+queries, K answers of each.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from pipeline.core.arrays import Doubles, Ints, Strings
+from pipeline.core.arrays import Doubles, Floats, Ints, Strings
 from pipeline.core.errors import InputError
 from pipeline.core.geo import haversine_m
 from pipeline.core.records import Split, View
-from pipeline.features.table import FeatureTable, Floats
+from pipeline.features.table import FeatureTable
 from pipeline.retrieval import geo_metrics, metrics
 from pipeline.retrieval.bootstrap import confidence_intervals
+from pipeline.retrieval.embedding_set import (
+    EmbeddingSet,
+    embedding_set_from_table,
+    filter_locations,
+)
 from pipeline.retrieval.metrics import Protocol
-from pipeline.retrieval.ranking import BlockSizes, EmbeddingSet, Ranking, rank_distributed
+from pipeline.retrieval.ranking import BlockSizes, Ranking, rank_distributed
 from pipeline.retrieval.subsets import mean_by_location
 
 TOP_K = 10
@@ -41,7 +46,7 @@ METRICS_SCHEMA = pa.schema(
         ("fingerprint", pa.string()),
         # 95 % bootstrap over locations
         *((f"{name}_{end}", pa.float64()) for name in METRIC_NAMES for end in ("low", "high")),
-        # queries with a position; 0 where distances cannot be told, and then they are null
+        # queries with a position; 0 if distances are unknown, and then they are null
         ("geo_queries", pa.int64()),
         ("distance_median_m", pa.float64()),
         *((f"within_{metres}m", pa.float64()) for metres in geo_metrics.WITHIN_M),
@@ -50,13 +55,13 @@ METRICS_SCHEMA = pa.schema(
 )
 RESULTS_SCHEMA = pa.schema(
     [
-        ("query", pa.string()),  # the key; of merged queries, the location
+        ("query", pa.string()),  # the key; for merged queries, the location
         ("location", pa.string()),
         ("task", pa.string()),
         ("protocol", pa.string()),
         ("multi_query", pa.bool_()),
         ("matches", pa.int64()),  # true matches in the gallery
-        # from 1; null where there is no match, and so are its key and score
+        # from 1; null if there is no match, as are its key and score
         ("first_match_rank", pa.int64()),
         ("first_match_key", pa.string()),
         ("first_match_score", pa.float32()),
@@ -64,8 +69,8 @@ RESULTS_SCHEMA = pa.schema(
         ("top_keys", pa.list_(pa.string())),
         ("top_scores", pa.list_(pa.float32())),
         ("top_locations", pa.list_(pa.string())),
-        # Where the query's place and the best answer lie, WGS84, and how far apart; null where unknown,
-        # as of merged queries.
+        # Positions of the query and of the best answer, WGS84, and their distance; null if
+        # unknown, and for merged queries.
         *(
             (name, pa.float64())
             for name in ("lat", "lon", "answer_lat", "answer_lon", "distance_m")
@@ -76,7 +81,7 @@ RESULTS_SCHEMA = pa.schema(
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What is looked for in what."""
+    """Which view is queried against which."""
 
     query_view: View
     gallery_view: View
@@ -92,9 +97,7 @@ class Task:
 
 
 def possible_tasks(queries: FeatureTable, gallery: FeatureTable) -> list[Task]:
-    """Every pair of two different views of which there are query rows and gallery rows,
-    drone->satellite first.
-    """
+    """Every pair of different views with query and gallery rows, drone->satellite first."""
     query_views = [view for view in View if queries.counts.get((Split.QUERY, view))]
     gallery_views = [view for view in View if gallery.counts.get((Split.GALLERY, view))]
     return [
@@ -102,36 +105,9 @@ def possible_tasks(queries: FeatureTable, gallery: FeatureTable) -> list[Task]:
     ]
 
 
-def embedding_set_from_table(table: FeatureTable) -> EmbeddingSet:
-    """The selected rows of a feature table."""
-    labels = table.labels()
-    places = np.stack([labels.lats, labels.lons], axis=1)
-    return EmbeddingSet(
-        keys=labels.keys, locations=labels.locations, blocks=table.blocks, positions=places
-    )
-
-
-def filter_locations(side: EmbeddingSet, locations: Strings) -> EmbeddingSet:
-    """The rows that show one of these locations: the gallery of the protocol `queried-only`."""
-    keep = np.isin(side.locations, locations)
-
-    def blocks(rows: int) -> Iterator[Floats]:
-        begin = 0
-        for block_BD in side.blocks(rows):
-            kept_BD = block_BD[keep[begin : begin + len(block_BD)]]
-            begin += len(block_BD)
-            if len(kept_BD):
-                yield kept_BD
-
-    places = None if side.positions is None else side.positions[keep]
-    return EmbeddingSet(
-        keys=side.keys[keep], locations=side.locations[keep], blocks=blocks, positions=places
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
 class TaskResults:
-    """What came of one task."""
+    """The results of one task."""
 
     metrics: dict[str, Any]
     "One row of METRICS_SCHEMA."
@@ -148,38 +124,40 @@ def retrieve(
     advance: Callable[[int], None] = lambda scores: None,
     workers: int = 0,
 ) -> TaskResults:
-    """Rank and measure one task. `advance` is told how many scores have been settled; `workers` as
-    in `rank_spread`.
+    """Rank and measure one task. `advance` receives the number of scores computed since its last
+    call; `workers` as in `rank_distributed`.
 
-    Raises InputError when no gallery row is left, or a feature is not of unit length.
+    Raises InputError if there are no queries or no gallery rows, or a feature is not of unit
+    length.
     """
-    query_side, gallery_side = task_embedding_sets(task, queries, gallery, protocol)
-    found = rank_distributed(query_side, gallery_side, TOP_K, workers, advance, blocks)
+    query_set, gallery_set = task_embedding_sets(task, queries, gallery, protocol)
+    ranking = rank_distributed(query_set, gallery_set, TOP_K, workers, advance, blocks)
     return TaskResults(
-        metrics=_metric_row(task, protocol, query_side, gallery_side, found, queries.fingerprint),
-        queries=_result_rows(task, protocol, query_side, gallery_side, found),
+        metrics=_metric_row(task, protocol, query_set, gallery_set, ranking, queries.fingerprint),
+        queries=_result_rows(task, protocol, query_set, gallery_set, ranking),
     )
 
 
 def task_embedding_sets(
     task: Task, queries: FeatureTable, gallery: FeatureTable, protocol: Protocol
 ) -> tuple[EmbeddingSet, EmbeddingSet]:
-    """What is ranked for what.
+    """The queries and the gallery of a task.
 
-    Raises InputError when nothing is left of either.
+    Raises InputError if either has no rows.
     """
-    query_side = embedding_set_from_table(queries.select(Split.QUERY, task.query_view))
-    gallery_side = embedding_set_from_table(gallery.select(Split.GALLERY, task.gallery_view))
+    query_set = embedding_set_from_table(queries.select(Split.QUERY, task.query_view))
+    gallery_set = embedding_set_from_table(gallery.select(Split.GALLERY, task.gallery_view))
     if task.multi_query:
-        query_side = mean_by_location(query_side)
+        query_set = mean_by_location(query_set)
     if protocol == "queried-only":
-        gallery_side = filter_locations(gallery_side, query_side.locations)
-    if not len(gallery_side.keys) or not len(query_side.keys):
+        gallery_set = filter_locations(gallery_set, query_set.locations)
+    if not len(gallery_set.keys) or not len(query_set.keys):
         raise InputError(
-            f"{task} has {len(query_side.keys)} queries and {len(gallery_side.keys)} gallery rows under the protocol "
-            f"{protocol}; expected some of both, with location names in common; check the tables' splits and locations"
+            f"{task} has {len(query_set.keys)} queries and {len(gallery_set.keys)} gallery rows "
+            f"under the protocol {protocol}; expected some of both, with location names in common; "
+            "check the tables' splits and locations"
         )
-    return query_side, gallery_side
+    return query_set, gallery_set
 
 
 def _metric_row(
@@ -187,10 +165,10 @@ def _metric_row(
     protocol: Protocol,
     queries: EmbeddingSet,
     gallery: EmbeddingSet,
-    found: Ranking,
+    ranking: Ranking,
     fingerprint: str,
 ) -> dict[str, Any]:
-    scores = metrics.summarise(found.first_rank_Q, found.ap_Q, len(gallery.keys))
+    scores = metrics.summarise(ranking.first_rank_Q, ranking.ap_Q, len(gallery.keys))
     row: dict[str, Any] = {
         "task": task.name,
         "protocol": protocol,
@@ -201,29 +179,34 @@ def _metric_row(
         "fingerprint": fingerprint,
     }
     bounds = confidence_intervals(
-        metrics.per_query_values(found.first_rank_Q, found.ap_Q, len(gallery.keys)),
+        metrics.per_query_values(ranking.first_rank_Q, ranking.ap_Q, len(gallery.keys)),
         queries.locations,
     )
     for name, (low, high) in zip(METRIC_NAMES, bounds.T.tolist(), strict=True):
         row |= {f"{name}_low": low, f"{name}_high": high}
-    unknown = np.full((len(queries.keys), 2), np.nan)
-    given = _positions(gallery)
-    asked = unknown if np.isnan(given).any() else _positions(queries)
-    return row | geo_metrics.distance_metrics(asked, given[found.top_rows_QK])
+    answers_N2 = _positions(gallery)
+    # With positions for a part of the gallery only, no distance is measured at all.
+    unknown = bool(np.isnan(answers_N2).any())
+    queries_Q2 = np.full((len(queries.keys), 2), np.nan) if unknown else _positions(queries)
+    return row | geo_metrics.distance_metrics(queries_Q2, answers_N2[ranking.top_rows_QK])
 
 
-def _positions(side: EmbeddingSet) -> Doubles:
-    return np.full((len(side.keys), 2), np.nan) if side.positions is None else side.positions
+def _positions(embeddings: EmbeddingSet) -> Doubles:
+    return (
+        np.full((len(embeddings.keys), 2), np.nan)
+        if embeddings.positions is None
+        else embeddings.positions
+    )
 
 
 def _result_rows(
-    task: Task, protocol: Protocol, queries: EmbeddingSet, gallery: EmbeddingSet, found: Ranking
+    task: Task, protocol: Protocol, queries: EmbeddingSet, gallery: EmbeddingSet, ranking: Ranking
 ) -> pa.Table:
-    unmatched_Q = found.first_rank_Q == 0
-    count, kept = found.top_rows_QK.shape
-    asked_Q2, answer_Q2 = _positions(queries), _positions(gallery)[found.top_rows_QK[:, 0]]
-    places_5Q = [*asked_Q2.T, *answer_Q2.T, haversine_m(asked_Q2, answer_Q2)]
-    ends = pa.array(np.arange(count + 1) * kept, pa.int32())
+    unmatched_Q = ranking.first_rank_Q == 0
+    count, top = ranking.top_rows_QK.shape
+    query_Q2, answer_Q2 = _positions(queries), _positions(gallery)[ranking.top_rows_QK[:, 0]]
+    positions_5Q = [*query_Q2.T, *answer_Q2.T, haversine_m(query_Q2, answer_Q2)]
+    ends = pa.array(np.arange(count + 1) * top, pa.int32())
 
     def lists(values_QK: Ints | Strings | Floats, kind: pa.DataType) -> pa.ListArray:
         return pa.ListArray.from_arrays(ends, pa.array(values_QK.ravel().tolist(), kind))
@@ -234,15 +217,15 @@ def _result_rows(
         pa.array([task.name] * count),
         pa.array([str(protocol)] * count),
         pa.array([task.multi_query] * count),
-        pa.array(found.matches_Q),
-        pa.array(found.first_rank_Q, mask=unmatched_Q),
-        pa.array(gallery.keys[found.first_row_Q].tolist(), pa.string(), mask=unmatched_Q),
-        pa.array(found.first_score_Q, mask=unmatched_Q),
-        pa.array(found.ap_Q),
-        lists(gallery.keys[found.top_rows_QK], pa.string()),
-        lists(found.top_scores_QK, pa.float32()),
-        lists(gallery.locations[found.top_rows_QK], pa.string()),
+        pa.array(ranking.matches_Q),
+        pa.array(ranking.first_rank_Q, mask=unmatched_Q),
+        pa.array(gallery.keys[ranking.first_row_Q].tolist(), pa.string(), mask=unmatched_Q),
+        pa.array(ranking.first_score_Q, mask=unmatched_Q),
+        pa.array(ranking.ap_Q),
+        lists(gallery.keys[ranking.top_rows_QK], pa.string()),
+        lists(ranking.top_scores_QK, pa.float32()),
+        lists(gallery.locations[ranking.top_rows_QK], pa.string()),
         # NaN becomes null
-        *(pa.array(place_Q, pa.float64(), from_pandas=True) for place_Q in places_5Q),
+        *(pa.array(values_Q, pa.float64(), from_pandas=True) for values_Q in positions_5Q),
     ]
     return pa.Table.from_arrays(columns, schema=RESULTS_SCHEMA)

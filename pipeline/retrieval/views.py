@@ -1,7 +1,6 @@
-"""Retrieval by the number of views: how R@1 grows when a query is the mean of n images of its
-place.
+"""Retrieval by number of views: R@1 and AP of queries that are the mean of n images of a location.
 
-In: feature tables. Out: one row per n, for as many n of view_groups.VIEWS as every queried location
+In: feature tables. Out: one row per n, for those of subsets.VIEW_COUNTS that every queried location
 has images for.
 """
 
@@ -39,24 +38,33 @@ def measure_views(
     advance: Callable[[int], None] = lambda scores: None,
     blocks: BlockSizes | None = None,
 ) -> list[dict[str, Any]]:
-    """R@1 and AP with their 95 % intervals for each number of views a query; empty where no
-    location has two.
+    """R@1 and AP with 95 % intervals for each number of views per query; empty if some location has
+    a single image.
 
-    Raises InputError as `retrieval.retrieve` does.
+    Raises InputError as `tasks.retrieve` does.
     """
-    query_side, gallery_side = task_embedding_sets(task, queries, gallery, protocol)
-    numbers = possible_view_counts(query_side)
+    query_set, gallery_set = task_embedding_sets(task, queries, gallery, protocol)
+    numbers = possible_view_counts(query_set)
     rows = []
     for views in numbers if len(numbers) > 1 else []:
-        grouped = mean_by_views(query_side, views)
-        found = rank_distributed(grouped, gallery_side, 0, workers, advance, blocks)
-        hit_Q = metrics.hits_at(1, found.first_rank_Q)
+        grouped = mean_by_views(query_set, views)
+        ranking = rank_distributed(grouped, gallery_set, 0, workers, advance, blocks)
+        hit_Q = metrics.hits_at(1, ranking.first_rank_Q)
         low, high = confidence_intervals(
-            np.stack([hit_Q, found.ap_Q], axis=1), grouped.locations
+            np.stack([hit_Q, ranking.ap_Q], axis=1), grouped.locations
         ).tolist()
-        rows.append({
-            "task": task.name, "protocol": protocol, "views": views, "queries": len(grouped.keys),
-            "r1": float(hit_Q.mean()), "r1_low": low[0], "r1_high": high[0],
-            "ap": float(found.ap_Q.mean()), "ap_low": low[1], "ap_high": high[1],
-        })  # fmt: skip
+        rows.append(
+            {
+                "task": task.name,
+                "protocol": protocol,
+                "views": views,
+                "queries": len(grouped.keys),
+                "r1": float(hit_Q.mean()),
+                "r1_low": low[0],
+                "r1_high": high[0],
+                "ap": float(ranking.ap_Q.mean()),
+                "ap_low": low[1],
+                "ap_high": high[1],
+            }
+        )
     return rows

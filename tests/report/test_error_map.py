@@ -1,4 +1,4 @@
-"""The map of errors: its scale near and far, the lines it keeps, and the list of farthest answers."""
+"""The map of errors: its scale near and far, its lines, and the list of farthest answers."""
 
 import math
 from typing import Any

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.core.records import View
 from pipeline.features.table import Floats, PartFooter, PartRows, open_table, write_part
+from pipeline.retrieval.embedding_set import embedding_set_from_array
 from pipeline.retrieval.parts import (
     cosines_by_part,
     count_parts,
@@ -16,7 +17,6 @@ from pipeline.retrieval.parts import (
     measure_parts,
     select_parts,
 )
-from pipeline.retrieval.ranking import embedding_set_from_array
 from pipeline.retrieval.tasks import Task
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.retrieval.ranking import EmbeddingSet, embedding_set_from_array
+from pipeline.retrieval.embedding_set import EmbeddingSet, embedding_set_from_array
 from pipeline.retrieval.subsets import mean_by_location, mean_by_views, possible_view_counts
 
 

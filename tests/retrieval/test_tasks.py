@@ -20,17 +20,15 @@ from pipeline.features.table import (
     write_part,
 )
 from pipeline.retrieval import exact_scores, metrics
-from pipeline.retrieval.exact_scores import error_bound, round_to_grid
-from pipeline.retrieval.ranking import (
-    BlockSizes,
+from pipeline.retrieval.embedding_set import (
     EmbeddingSet,
-    Ranking,
     embedding_set_from_array,
-    rank,
-    rank_distributed,
+    filter_locations,
 )
+from pipeline.retrieval.exact_scores import error_bound, round_to_grid
+from pipeline.retrieval.ranking import BlockSizes, Ranking, rank, rank_distributed
 from pipeline.retrieval.subsets import mean_by_location
-from pipeline.retrieval.tasks import Task, filter_locations, possible_tasks, retrieve
+from pipeline.retrieval.tasks import Task, possible_tasks, retrieve
 
 
 def unit(vectors: Floats) -> Floats:
