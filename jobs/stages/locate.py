@@ -15,9 +15,10 @@ from jobs.encoding.encoder import read_checkpoint_bytes
 from jobs.encoding.photo_encoder import PhotoEncoder
 from jobs.encoding.queries import Query, encode_photos, merge_by_folder
 from jobs.stages.settings import LocateSettings
-from pipeline.core import rejections, storage
+from pipeline.core import storage
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.progress import console, results
+from pipeline.core.rejections import most_common_reasons
 from pipeline.features.part import verify_part
 from pipeline.images.thumbnails import no_images
 from pipeline.index.filters import Filter
@@ -59,11 +60,11 @@ def locate_photos(
     if settings.track:
         decoded = with_times(decoded, settings)
     answers = answer_queries(decoded, index, gallery, calibration, settings)
-    answered = {
+    by_name = {
         query.name: _located(query, answer, settings.top)
         for query, answer in zip(decoded, answers, strict=True)
     }
-    located = [answered.get(query.name) or _located(query, None, 0) for query in queries]
+    located = [by_name.get(query.name) or _located(query, None, 0) for query in queries]
     if settings.track:
         located.sort(key=lambda one: (one.taken_at is None, parse_time(one.taken_at or "0")))
     context = PageContext(
@@ -204,7 +205,8 @@ def locate(settings: LocateSettings) -> None:
     results.print(written, soft_wrap=True)
     rejected = [rejection for one in located for rejection in one.rejected]
     if rejected:
+        total, reasons = sum(len(one.photos) for one in located), most_common_reasons(rejected)
         raise Incomplete(
-            f"{len(rejected)} of {sum(len(one.photos) for one in located)} photos could not be "
-            f"decoded: {rejections.most_common_reasons(rejected)}; they are listed in {settings.out}"
+            f"{len(rejected)} of {total} photos could not be decoded: {reasons}; they are listed "
+            f"in {settings.out}"
         )

@@ -94,7 +94,7 @@ def fit_calibration(
         )
     hits = [one.inside for one in examples] + [one.outside for one in examples]
     pairs = zip([*inside, *outside], hits, strict=True)
-    x_NF = np.array([confidence_features(at, consensus_scores(found)) for at, found in pairs])
+    x_NF = np.array([confidence_features(at, consensus_scores(best)) for at, best in pairs])
     yes_N = np.concatenate([right_N, np.zeros(len(examples))])
     weight_N = 2 * np.repeat([1 - criteria.outside, criteria.outside], len(examples))
     p_N = cross_validated_probabilities(x_NF, yes_N, weight_N, np.tile(locations_N, 2))

@@ -1,8 +1,8 @@
 """Answers -> one self-contained HTML page: each photo, its candidates, and a map of the gallery's
 own images.
 
-In: answers, images by key and by path, and the gallery's positions. Out: the page as text. It has no
-script and no font of its own, and loads nothing: no request, no map server.
+In: answers, images by key and by path, and the gallery's positions. Out: the page as text. It has
+no script and no font of its own, and loads nothing: no request, no map server.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -111,7 +111,8 @@ def nearby_keys(answer: Answer, gallery: GalleryMap) -> list[str]:
 def position_map(
     answer: Answer, gallery: GalleryMap, footprints: Mapping[str, Footprint]
 ) -> MapView | None:
-    """The surroundings of an answer, drawn from the gallery's own images; None without a position."""
+    """The surroundings of an answer, drawn from the gallery's own images; None without a
+    position."""
     position = answer.position
     if position is None:
         return None

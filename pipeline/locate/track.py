@@ -4,8 +4,9 @@ In: for each photo its candidates with the probability of each, and of none, fro
 Out: the most probable path that a UAV can fly through the candidates, and for each photo the
 probability of its candidates given all photos. A photo may show none of its candidates: the path
 then skips it, and the motion limit holds between the photos before and after. Exact: the Viterbi
-and the forward-backward recursions weigh all paths. NumPy only, no I/O. Shapes: K candidates of one photo, N candidates of all photos in time order, M of the photos before
-one, 2 = latitude and longitude in degrees, 3 = metres from the earth's centre.
+and the forward-backward recursions weigh all paths. NumPy only, no I/O. Shapes: K candidates of one
+photo, N candidates of all photos in time order, M of the photos before one, 2 = latitude and
+longitude in degrees, 3 = metres from the earth's centre.
 """
 
 import math

@@ -1,6 +1,5 @@
-"""What a calibration learns from made galleries: who is right, where the threshold lies, how far
-apart candidates may agree.
-"""
+"""Fitting a calibration on made-up galleries: right answers, the threshold, the agreement
+radius."""
 
 from typing import Any
 
@@ -45,9 +44,8 @@ def hit(location: str, score: float, north_m: float | None = 0.0) -> Hit:
 
 
 def made(count: int, rng: np.random.Generator) -> list[CalibrationExample]:
-    """Photos whose own place scores about 0.6, and 39 others about 0.35: right answers are those
-    with high scores.
-    """
+    """Photos whose own location scores about 0.6, and 39 others about 0.35: right answers have high
+    scores."""
     found = []
     for number in range(count):
         others = sorted(
@@ -69,23 +67,23 @@ def fitted() -> Calibration:
     return fit_calibration(made(900, np.random.default_rng(0)), CalibrationCriteria(), GALLERY)
 
 
-def test_probabilities_of_photos_never_seen_mean_what_they_say(fitted: Calibration) -> None:
+def test_calibration_holds_for_unseen_photos(fitted: Calibration) -> None:
     fresh = made(900, np.random.default_rng(1))
     for low, high in ((0, 0.2), (0.2, 0.8), (0.8, 1)):
         inside = answers_from_hits([one.inside for one in fresh], 5, fitted)
         outside = answers_from_hits([one.outside for one in fresh], 5, fitted)
-        told = [
+        pairs = [
             (a.probability or 0, a.location == one.location)
             for a, one in zip(inside, fresh, strict=True)
         ]
-        told += [(a.probability or 0, False) for a in outside]
-        here = [(said, right) for said, right in told if low <= said < high]
-        assert np.mean([said for said, _ in here]) == pytest.approx(
+        pairs += [(a.probability or 0, False) for a in outside]
+        here = [(p, right) for p, right in pairs if low <= p < high]
+        assert np.mean([p for p, _ in here]) == pytest.approx(
             np.mean([right for _, right in here]), abs=0.05
         )
 
 
-def test_photos_from_elsewhere_are_unknown_at_the_threshold_and_what_it_costs_is_told(
+def test_calibration_threshold_figures_hold_for_unseen_photos(
     fitted: Calibration,
 ) -> None:
     fresh = made(900, np.random.default_rng(2))
@@ -104,22 +102,21 @@ def test_photos_from_elsewhere_are_unknown_at_the_threshold_and_what_it_costs_is
     assert outside > 0.8
 
 
-def test_fewer_photos_from_elsewhere_make_the_same_score_surer(fitted: Calibration) -> None:
+def test_calibration_smaller_outside_share_raises_probability(fitted: Calibration) -> None:
     data = made(900, np.random.default_rng(0))
     rare = fit_calibration(data, CalibrationCriteria(outside=0.1), GALLERY)
     agreed, scores_K = consensus_of(data[0].inside, 0), consensus_scores(data[0].inside)
     assert rare.probability(agreed, scores_K) > fitted.probability(agreed, scores_K)
 
 
-def test_the_threshold_keeps_most_right_and_fewest_wrong() -> None:
-    """At 0.6 two of three right ones are kept and no wrong one; at 0.3 all right ones and both
-    wrong ones.
-    """
-    said, yes = np.array([0.9, 0.6, 0.5, 0.4, 0.3]), np.array([1.0, 1, 0, 0, 1])
-    assert youden_threshold(said, yes, np.ones(5)) == 0.6
+def test_youden_threshold_by_hand() -> None:
+    """At 0.6 two of three right answers are kept and no wrong one; at 0.3 all right ones and both
+    wrong ones."""
+    p, yes = np.array([0.9, 0.6, 0.5, 0.4, 0.3]), np.array([1.0, 1, 0, 0, 1])
+    assert youden_threshold(p, yes, np.ones(5)) == 0.6
 
 
-def test_an_answer_is_right_by_its_location_or_by_its_distance() -> None:
+def test_is_correct_by_location_or_distance() -> None:
     example = CalibrationExample(
         location="own", lat=0.0, lon=8.0, inside=(hit("other", 0.9, 20),), outside=()
     )
@@ -132,10 +129,9 @@ def test_an_answer_is_right_by_its_location_or_by_its_distance() -> None:
     assert is_correct(consensus_of(named.inside, 0), named, 25)
 
 
-def test_neighbours_agree_only_where_that_surely_places_photos_better() -> None:
-    """Tiles every 40 m that overlap: each photo lies between four, each of which is off by 28 m.
-    One photo proves nothing.
-    """
+def test_agreement_radius_grows_only_if_significantly_better() -> None:
+    """Overlapping tiles every 40 m: each photo lies between four, each of which is 28 m away. One
+    photo is not significant."""
     d = 20 * METRE
     four = [(d, d), (d, -d), (-d, d), (-d, -d)]
     tiles = [
@@ -169,21 +165,20 @@ def test_neighbours_agree_only_where_that_surely_places_photos_better() -> None:
     assert choose_agreement_radius([apart], 25, None) == 0
 
 
-def test_no_photo_is_judged_by_a_model_that_has_seen_its_location() -> None:
-    """One location's examples are all wrong where the others say right: seen, they would be
-    believed.
-    """
+def test_cross_validation_leaves_out_own_location() -> None:
+    """One location's examples are labelled against the rule of all others; a model fitted with them
+    would follow them."""
     rng = np.random.default_rng(0)
     x_NF = rng.normal(size=(200, 1))
     locations = np.array([f"place{n % 20}" for n in range(200)])
     odd = locations == "place7"
     yes = np.where(odd, x_NF[:, 0] < 0, x_NF[:, 0] > 0).astype(float)
-    said = cross_validated_probabilities(x_NF, yes, np.ones(200), locations)
-    assert ((said > 0.5) == (x_NF[:, 0] > 0))[odd].all()
+    p = cross_validated_probabilities(x_NF, yes, np.ones(200), locations)
+    assert ((p > 0.5) == (x_NF[:, 0] > 0))[odd].all()
     assert sigmoid(np.array([0.0]))[0] == 0.5
 
 
-def test_too_few_places_and_answers_that_are_all_right_are_refused() -> None:
+def test_calibration_unusable_examples_are_refused() -> None:
     few = [one for one in made(60, np.random.default_rng(0)) if one.location in {"p1", "p2"}]
     with pytest.raises(InputError, match=r"4 photos of 2 locations.*--hold-out"):
         fit_calibration(few, CalibrationCriteria(), GALLERY)
@@ -205,15 +200,14 @@ def test_too_few_places_and_answers_that_are_all_right_are_refused() -> None:
     ("given", "sentence"),
     [({"tolerance": 0}, "--tolerance is 0"), ({"outside": 1}, "--outside is 1")],
 )
-def test_judging_that_makes_no_sense_is_refused(given: dict[str, float], sentence: str) -> None:
+def test_criteria_invalid_value_is_refused(given: dict[str, float], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         CalibrationCriteria(**given)
 
 
 class Rows:
-    """An index of rows at one location each, but for `own`, which has many; row n scores 1 - n /
-    1000.
-    """
+    """An index of rows at one location each, except for `own`, which has many; row n scores 1 - n /
+    1000."""
 
     def __init__(self, own: int, others: int) -> None:
         names = ["own"] * own + [f"o{n}" for n in range(others)]
@@ -243,7 +237,7 @@ def labelled(location: str, vector: list[float], north_m: float = 0.0) -> Labell
     return LabelledImages(records=[facts], embeddings_QD=np.array([vector], np.float32))
 
 
-def test_a_place_of_many_rows_is_left_out_whole_and_others_take_their_ranks() -> None:
+def test_examples_location_of_many_rows_is_left_out() -> None:
     (example,) = make_examples(
         labelled("own", [1, 0]), labelled("x", [0, 1]), Rows(100, 60), 300.0, 25.0
     )
@@ -251,7 +245,7 @@ def test_a_place_of_many_rows_is_left_out_whole_and_others_take_their_ranks() ->
     assert [one.location for one in example.outside] == [f"o{n}" for n in range(TRACK_CANDIDATES)]
 
 
-def test_a_place_that_the_index_lacks_is_ranked_by_its_own_images() -> None:
+def test_examples_rank_own_images_of_missing_location() -> None:
     """Its image scores 0.9975, between the third and the fourth row."""
     photos, own = labelled("new", [1, 0], -9000), labelled("new", [0.9975, 0], -9000)
     (example,) = make_examples(photos, own, Rows(0, 60), 300.0, 25.0)
@@ -259,7 +253,7 @@ def test_a_place_that_the_index_lacks_is_ranked_by_its_own_images() -> None:
     assert "new" not in {one.location for one in example.outside}
 
 
-def test_images_near_a_photo_s_place_are_left_out_under_whatever_name() -> None:
+def test_examples_leave_out_images_near_the_photo() -> None:
     (example,) = make_examples(
         labelled("photo", [1, 0], 5000), labelled("x", [0, 1]), Rows(0, 60), 300.0, 25.0
     )

@@ -1,6 +1,4 @@
-"""An index calibrated by the photos of places held out: which photos count, what is left behind,
-and what is refused.
-"""
+"""The calibrate job: which photos it uses, the files it writes, and the input it refuses."""
 
 import io
 import json
@@ -28,7 +26,7 @@ from pipeline.shards.pack import pack
 from pipeline.shards.settings import PackingSettings
 from pipeline.sources.university1652 import University1652
 
-HELD, TRAINED, GALLERY = 20, 3, 40
+HELD_OUT, TRAINED, GALLERY_ROWS = 20, 3, 40
 
 
 def image(seed: int, size: int = 64) -> bytes:
@@ -40,14 +38,15 @@ def image(seed: int, size: int = 64) -> bytes:
 
 @pytest.fixture
 def world(tmp_path: Path, ray_cluster: None, lively_encoder: FeatureEncoder) -> dict[str, Any]:
-    """Shards of 23 training locations, of which three were trained on; each shows in one photo what
-    its satellite image shows, and in another something else. An index of forty other places."""
-    for place in range(HELD + TRAINED):
-        for view, seeds in (("satellite", [place]), ("drone", [place, 1000 + place])):
-            folder = tmp_path / "raw" / "train" / view / f"{place:04d}"
+    """Shards of 23 training locations, of which three were trained on; of each, one photo shows the
+    same as its satellite image, and another one something else. An index of forty other
+    locations."""
+    for number in range(HELD_OUT + TRAINED):
+        for view, seeds in (("satellite", [number]), ("drone", [number, 1000 + number])):
+            folder = tmp_path / "raw" / "train" / view / f"{number:04d}"
             folder.mkdir(parents=True)
-            for number, seed in enumerate(seeds):
-                (folder / f"{number}.jpg").write_bytes(
+            for index, seed in enumerate(seeds):
+                (folder / f"{index}.jpg").write_bytes(
                     image(seed, 64 if view == "satellite" else 70)
                 )
     pack(
@@ -56,23 +55,23 @@ def world(tmp_path: Path, ray_cluster: None, lively_encoder: FeatureEncoder) -> 
     network = PVDAConfig(backbone="resnet18", width=0.25, image_size=64, parts=2, part_dim=16)
     state = {"modules": {"encoder": lively_encoder.state_dict()}}
     plain = Checkpoint(network=network, recipe={}, locations=[], epoch=0, history=[], state=state)
-    data = dumps(replace(plain, locations=[f"{place:04d}" for place in range(TRAINED)]))
+    data = dumps(replace(plain, locations=[f"{number:04d}" for number in range(TRAINED)]))
     (tmp_path / "last.pt").write_bytes(data)
     mark = fingerprint(loads(data), f"{preprocessing_name()}, mirror True")
     rows_ND, _ = PhotoEncoder(data, "last.pt", {"fingerprint": mark}).encode(
-        [image(5000 + n) for n in range(GALLERY)]
+        [image(5000 + n) for n in range(GALLERY_ROWS)]
     )
-    names = [f"g{number}" for number in range(GALLERY)]
+    names = [f"g{number}" for number in range(GALLERY_ROWS)]
     rows = PartRows(
         keys=names,
         locations=names,
-        views=["satellite"] * GALLERY,
-        splits=["gallery"] * GALLERY,
-        lats=[None] * GALLERY,
-        lons=[None] * GALLERY,
+        views=["satellite"] * GALLERY_ROWS,
+        splits=["gallery"] * GALLERY_ROWS,
+        lats=[None] * GALLERY_ROWS,
+        lons=[None] * GALLERY_ROWS,
         embeddings_BD=rows_ND,
     )
-    footer = PartFooter(fingerprint=mark, shard_sha256="s", rows=GALLERY)
+    footer = PartFooter(fingerprint=mark, shard_sha256="s", rows=GALLERY_ROWS)
     write_part(str(tmp_path / "table" / "gallery-satellite-000000.parquet"), rows, footer)
     build_index(IndexSettings(table=str(tmp_path / "table"), out=str(tmp_path / "index")))
     return {
@@ -82,15 +81,15 @@ def world(tmp_path: Path, ray_cluster: None, lively_encoder: FeatureEncoder) -> 
     }
 
 
-def test_photos_of_places_not_trained_on_calibrate_an_index(
+def test_calibrate_job_uses_held_out_locations(
     world: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = calibrate_index(CalibrateSettings(**world))
-    assert (made.photos, made.locations) == (2 * HELD, HELD)
+    assert (made.photos, made.locations) == (2 * HELD_OUT, HELD_OUT)
     assert made.accuracy == pytest.approx(
         0.5, abs=0.1
     )  # a photo of something else may hit by chance
-    assert (made.gallery_rows, made.spacing_m, made.agreement_radius_m) == (GALLERY, None, 0)
+    assert (made.gallery_rows, made.spacing_m, made.agreement_radius_m) == (GALLERY_ROWS, None, 0)
     facts = json.loads((tmp_path / "index" / "index.json").read_text())
     assert find_calibration(world["index"], facts) == made
     assert (tmp_path / "index" / "calibration.svg").read_text().startswith("<svg")
@@ -103,9 +102,7 @@ def test_photos_of_places_not_trained_on_calibrate_an_index(
     assert calibrate_index(CalibrateSettings(**world)) == made
 
 
-def test_few_photos_are_enough_to_ask_for_but_not_few_places(
-    world: dict[str, Any], tmp_path: Path
-) -> None:
+def test_calibrate_job_too_few_locations_are_refused(world: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="5 photos of"):
         calibrate_index(CalibrateSettings(**world, photos=5))
     with pytest.raises(InputError, match="no checkpoint at nowhere"):

@@ -1,4 +1,4 @@
-"""An index's images on the map."""
+"""The positions of an index's images and their spacing."""
 
 from pathlib import Path
 
@@ -18,38 +18,37 @@ DEGREE_M = EARTH_RADIUS_M * np.pi / 180
 
 
 def on_a_grid(side: int, rows: int | None = None) -> GalleryMap:
-    """A square of positions a thousandth of a degree apart on the equator, each there twice, and
-    one without a position.
-    """
+    """A square of positions a thousandth of a degree apart on the equator, each twice, and a row
+    without a position."""
     step = np.arange(side) * 1e-3
-    places = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
-    places = np.concatenate([places, places, [[np.nan, np.nan]]])
-    names = np.array([f"{number}" for number in range(len(places))])
-    return GalleryMap(keys=names, positions_N2=places, rows=rows or len(places))
+    positions = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
+    positions = np.concatenate([positions, positions, [[np.nan, np.nan]]])
+    names = np.array([f"{number}" for number in range(len(positions))])
+    return GalleryMap(keys=names, positions_N2=positions, rows=rows or len(positions))
 
 
-def test_the_spacing_is_the_way_to_the_next_other_position() -> None:
+def test_gallery_map_spacing_of_a_grid() -> None:
     assert on_a_grid(5).spacing_m == pytest.approx(1e-3 * DEGREE_M, rel=1e-4)
 
 
-def test_a_sample_of_a_quarter_is_twice_as_far_apart_as_the_gallery() -> None:
+def test_gallery_map_spacing_of_a_sample() -> None:
     grid = on_a_grid(5)
     assert on_a_grid(5, 4 * len(grid.keys)).spacing_m == pytest.approx(0.5e-3 * DEGREE_M, rel=1e-4)
 
 
-def test_without_two_positions_there_is_no_spacing() -> None:
+def test_gallery_map_spacing_needs_two_positions() -> None:
     assert on_a_grid(1).spacing_m is None
 
 
-def test_the_nearest_are_found_across_the_meridian_of_180_degrees() -> None:
-    places = np.array([[0, 179.9], [0, -179.99], [0, 170.0], [np.nan, np.nan]])
+def test_gallery_map_nearest_across_180_degrees() -> None:
+    positions = np.array([[0, 179.9], [0, -179.99], [0, 170.0], [np.nan, np.nan]])
     names = np.array(list("abcd"))
-    gallery = GalleryMap(keys=names, positions_N2=places, rows=4)
+    gallery = GalleryMap(keys=names, positions_N2=positions, rows=4)
     assert gallery.nearest(0, 179.99, 3).tolist() == [1, 0, 2]
     assert gallery.nearest(0, 179.99, 1).tolist() == [1]
 
 
-def test_the_rows_of_an_index_are_on_its_map(tmp_path: Path) -> None:
+def test_gallery_map_has_all_rows_of_an_index(tmp_path: Path) -> None:
     table = write_gallery(tmp_path / "table", parts=2, rows=10)
     build_index(IndexSettings(table=str(table), out=str(tmp_path / "index"), view=None, split=None))
     gallery = read_gallery_map(Index(str(tmp_path / "index")))
@@ -58,7 +57,7 @@ def test_the_rows_of_an_index_are_on_its_map(tmp_path: Path) -> None:
     assert gallery.spacing_m is not None
 
 
-def test_removed_locations_are_on_the_map_no_more(tmp_path: Path) -> None:
+def test_gallery_map_without_removed_locations(tmp_path: Path) -> None:
     table = write_gallery(tmp_path / "table", parts=2, rows=10)
     out = str(tmp_path / "index")
     build_index(IndexSettings(table=str(table), out=out, split=Split.GALLERY))

@@ -1,4 +1,4 @@
-"""Answers as other programs read them: GeoJSON and CSV."""
+"""The files of answers for other programs: GeoJSON and CSV."""
 
 import csv
 import io
@@ -35,11 +35,11 @@ DAMAGED = LocatedPhoto(
 LATER = LocatedPhoto(name="d.jpg", photos=("d.jpg",), answer=answer(lat=47.0), taken_at="30")
 
 
-def test_a_known_place_is_a_point_with_its_longitude_first() -> None:
-    said = json.loads(to_geojson([FOUND], {"index": "i"}, track=False))
-    assert said["type"] == "FeatureCollection"
-    assert said["pvda"] == {"index": "i"}
-    (feature,) = said["features"]
+def test_geojson_known_answer_is_a_point() -> None:
+    collection = json.loads(to_geojson([FOUND], {"index": "i"}, track=False))
+    assert collection["type"] == "FeatureCollection"
+    assert collection["pvda"] == {"index": "i"}
+    (feature,) = collection["features"]
     assert feature["geometry"] == {"type": "Point", "coordinates": [8.0, 46.0]}
     assert feature["properties"]["radius_m"] == 20
     assert feature["properties"]["candidates"] == [
@@ -54,13 +54,13 @@ def test_a_known_place_is_a_point_with_its_longitude_first() -> None:
     ]
 
 
-def test_an_unknown_place_is_no_point_on_a_map_but_its_best_guess_is_told() -> None:
+def test_geojson_unknown_answer_has_no_geometry() -> None:
     (feature,) = json.loads(to_geojson([UNKNOWN], {}, track=False))["features"]
     assert feature["geometry"] is None
     assert (feature["properties"]["known"], feature["properties"]["lat"]) == (False, 46.0)
 
 
-def test_a_damaged_photo_is_listed_with_its_reason() -> None:
+def test_geojson_lists_rejected_photos() -> None:
     (feature,) = json.loads(to_geojson([DAMAGED], {}, track=False))["features"]
     assert feature["geometry"] is None
     assert feature["properties"]["rejected"] == [
@@ -68,19 +68,19 @@ def test_a_damaged_photo_is_listed_with_its_reason() -> None:
     ]
 
 
-def test_a_flight_is_a_line_through_the_known_places_with_their_times() -> None:
+def test_geojson_track_is_a_line_of_known_answers() -> None:
     line = json.loads(to_geojson([FOUND, UNKNOWN, LATER], {}, track=True))["features"][0]
     assert line["geometry"] == {"type": "LineString", "coordinates": [[8.0, 46.0], [8.0, 47.0]]}
     assert line["properties"]["times"] == ["10", "30"]
 
 
-def test_one_known_place_makes_no_line() -> None:
+def test_geojson_track_of_one_point_has_no_geometry() -> None:
     assert (
         json.loads(to_geojson([FOUND, UNKNOWN], {}, track=True))["features"][0]["geometry"] is None
     )
 
 
-def test_the_table_has_a_row_per_answer_and_nothing_where_nothing_is_known() -> None:
+def test_csv_has_a_row_per_answer() -> None:
     rows = list(csv.DictReader(io.StringIO(to_csv([FOUND, DAMAGED]).decode())))
     assert tuple(rows[0]) == CSV_COLUMNS
     assert (rows[0]["known"], rows[0]["lat"], rows[0]["candidate"]) == (
@@ -91,7 +91,7 @@ def test_the_table_has_a_row_per_answer_and_nothing_where_nothing_is_known() -> 
     assert (rows[1]["known"], rows[1]["lat"], rows[1]["reason"]) == ("false", "", "empty file")
 
 
-def test_names_that_are_no_unicode_are_written_as_they_are() -> None:
+def test_geojson_and_csv_keep_non_unicode_names() -> None:
     name = b"caf\xe9.jpg".decode("utf-8", "surrogateescape")
     odd = LocatedPhoto(name=name, photos=(name,), answer=answer())
     assert b"caf\xe9.jpg" in to_csv([odd])

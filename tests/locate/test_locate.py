@@ -1,4 +1,4 @@
-"""From candidates to answers: positions, radii, what is unknown, and a flight's word on it."""
+"""From candidates to answers: positions, radii, unknown answers, calibrations and flights."""
 
 from dataclasses import replace
 from typing import Any
@@ -48,7 +48,7 @@ def hit(location: str, score: float, north_m: float | None = 0.0) -> Hit:
 
 
 def calibration(**changes: Any) -> Calibration:
-    """Sure by the margin alone: 0.5 where it is 0.1."""
+    """The probability depends on the margin alone: 0.5 at a margin of 0.1."""
     model = LogisticModel(
         mean_F=(0, 0.1, 0, 0), scale_F=(1, 0.05, 1, 1), coefficient_F=(0, 2.0, 0, 0), intercept=0.0
     )
@@ -76,10 +76,10 @@ def calibration(**changes: Any) -> Calibration:
 
 
 class Gallery:
-    """An index that answers what it is told, and notes what it was asked."""
+    """An index that returns given hits and records the number of candidates requested."""
 
     def __init__(self, hits: list[Hit]) -> None:
-        self.hits, self.asked = hits, [0]
+        self.hits, self.requested_k = hits, [0]
         self.facts: dict[str, Any] = {}
         self.dimension = 4
 
@@ -89,16 +89,14 @@ class Gallery:
     def search(
         self, queries_QD: Floats, k: int = 10, where: Filter | None = None
     ) -> list[list[Hit]]:
-        self.asked.append(k)
+        self.requested_k.append(k)
         return [self.hits[:k] for _ in queries_QD]
 
 
 HITS = [hit("a", 0.9), hit("b", 0.7, 1000), hit("c", 0.5, 2000)]
 
 
-def test_an_answer_is_the_place_of_the_best_candidate_and_its_radius_reaches_half_way_to_the_next() -> (
-    None
-):
+def test_answer_position_and_radius_without_calibration() -> None:
     (found,) = answers_from_hits([HITS], 2, spacing_m=300)
     assert found.position is not None
     assert (found.location, found.position.lat, found.position.radius_m) == ("a", 46, 150)
@@ -106,7 +104,7 @@ def test_an_answer_is_the_place_of_the_best_candidate_and_its_radius_reaches_hal
     assert (found.probability, found.known) == (None, True)
 
 
-def test_a_sure_answer_is_known_and_a_doubtful_one_is_not() -> None:
+def test_answer_known_above_threshold_only() -> None:
     """Margins 0.2 and 0.05: sigmoid(2 * 2) and sigmoid(2 * -1)."""
     doubtful = [hit("a", 0.75), hit("b", 0.7, 1000), hit("c", 0.5, 2000)]
     sure, other = answers_from_hits([HITS, doubtful], 5, calibration())
@@ -115,24 +113,24 @@ def test_a_sure_answer_is_known_and_a_doubtful_one_is_not() -> None:
     assert (sure.known, other.known) == (True, False)
 
 
-def test_the_features_are_score_margin_depth_and_share() -> None:
+def test_confidence_features_by_hand() -> None:
     assert confidence_features(consensus_of(HITS, 0), consensus_scores(HITS)) == pytest.approx(
         [0.9, 0.2, 0.2, 1 / 3]
     )
 
 
-def test_nothing_found_is_unknown_and_the_others_keep_their_order() -> None:
+def test_answers_without_hits_are_no_answer() -> None:
     found = answers_from_hits([[], HITS, []], 5, calibration())
     assert found[0] == found[2] == NO_ANSWER
     assert found[1].location == "a"
 
 
-def test_candidates_without_positions_name_a_place_without_a_position() -> None:
+def test_answer_of_candidates_without_positions() -> None:
     (found,) = answers_from_hits([[hit("a", 0.9, None), hit("b", 0.2, None)]], 5)
     assert (found.location, found.position, found.known) == ("a", None, True)
 
 
-def test_as_many_candidates_decide_however_few_are_shown() -> None:
+def test_answer_does_not_depend_on_candidates_listed() -> None:
     gallery = Gallery(
         [hit(f"{number:02d}", 0.9 - number / 100, 500 * number) for number in range(20)]
     )
@@ -140,18 +138,18 @@ def test_as_many_candidates_decide_however_few_are_shown() -> None:
         locate_embeddings(gallery, np.ones((1, 4), np.float32), k, None, calibration())[0]
         for k in (1, 15)
     )
-    assert gallery.asked[1:] == [CONSENSUS_CANDIDATES, 15]
+    assert gallery.requested_k[1:] == [CONSENSUS_CANDIDATES, 15]
     assert (len(few.candidates), len(many.candidates)) == (1, 15)
     assert few.probability == many.probability
 
 
-def test_levels_are_told_from_the_last_candidate_considered() -> None:
+def test_relative_scores_by_hand() -> None:
     hits = [hit("a", 1 - number / 100) for number in range(12)]
     assert relative_scores(hits)[[0, CONSENSUS_CANDIDATES - 1]] == pytest.approx([0.09, 0])
     assert relative_scores([]).shape == (0,)
 
 
-def test_a_calibration_comes_back_as_it_was_written(tmp_path: Any) -> None:
+def test_calibration_round_trip(tmp_path: Any) -> None:
     write_calibration(str(tmp_path / "calibration.json"), calibration())
     assert find_calibration(str(tmp_path), {"fingerprint": "f" * 64}) == calibration()
     assert find_calibration(str(tmp_path / "elsewhere"), {"fingerprint": "f" * 64}) is None
@@ -165,22 +163,21 @@ def test_a_calibration_comes_back_as_it_was_written(tmp_path: Any) -> None:
         ('{"schema_version": 1}', "is not a calibration"),
     ],
 )
-def test_what_is_no_calibration_is_refused(tmp_path: Any, text: str, sentence: str) -> None:
+def test_calibration_invalid_file_is_refused(tmp_path: Any, text: str, sentence: str) -> None:
     (tmp_path / "calibration.json").write_text(text)
     with pytest.raises(InputError, match=sentence):
         read_calibration(str(tmp_path / "calibration.json"), {"fingerprint": "f" * 64})
 
 
-def test_another_network_s_calibration_is_refused(tmp_path: Any) -> None:
+def test_calibration_of_another_encoder_is_refused(tmp_path: Any) -> None:
     write_calibration(str(tmp_path / "calibration.json"), calibration())
     with pytest.raises(InputError, match="encoder ffffffffffff and the index with 000"):
         read_calibration(str(tmp_path / "calibration.json"), {"fingerprint": "0" * 64})
 
 
-def test_a_flight_settles_a_doubtful_photo_whatever_the_order_of_its_answers() -> None:
-    """In the middle of three photos 10 s apart b, 9 km off, scores best; 25 m/s leave c, beside the
-    others.
-    """
+def test_apply_track_decides_uncertain_photo_in_any_order() -> None:
+    """In the middle of three photos 10 s apart, b, 9 km away, scores best; 25 m/s leave c, near the
+    others."""
     middle = [hit("b", 0.8, 9000), hit("c", 0.75, 200), hit("z", 0.2, 50_000)]
     first, last = (
         [hit(name, 0.9, north), hit("z", 0.3, 50_000)] for name, north in (("a", 0), ("d", 400))
@@ -194,7 +191,7 @@ def test_a_flight_settles_a_doubtful_photo_whatever_the_order_of_its_answers() -
     assert found[1].known
 
 
-def test_the_fewer_photos_of_a_flight_are_expected_elsewhere_the_surer_the_others() -> None:
+def test_apply_track_share_elsewhere_lowers_probability() -> None:
     doubtful = [hit("a", 0.5), hit("z", 0.45, 50_000)]
     single = answers_from_hits([doubtful], 5, calibration())
     rare, common = (
@@ -203,7 +200,7 @@ def test_the_fewer_photos_of_a_flight_are_expected_elsewhere_the_surer_the_other
     assert (rare.known, common.known) == (True, False)
 
 
-def test_a_photo_that_the_track_passes_over_is_unknown() -> None:
+def test_apply_track_skipped_photo_is_unknown() -> None:
     far = [hit("b", 0.9, 9000), hit("z", 0.2, 50_000)]
     near = [
         [hit(name, 0.9, north), hit("z", 0.2, 50_000)]

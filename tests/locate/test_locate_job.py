@@ -1,6 +1,5 @@
-"""Photos asked of an index: alone, together, near a place, as a flight; damaged ones are told and
-stop nobody.
-"""
+"""The locate job: single photos, folders as one, near a position, flights; damaged photos are
+listed."""
 
 import csv
 import io
@@ -29,13 +28,13 @@ from pipeline.index.settings import IndexSettings
 from pipeline.locate.calibration import Calibration, write_calibration
 from pipeline.locate.logistic import LogisticModel
 
-PLACES = 12
+LOCATIONS = 12
 STEP = 1e-3  # degrees between places, about 111 m
 
 
-def photo(place: int, blur: int = 80) -> bytes:
-    """A place's own colours, and as another camera sees them where `blur` is another."""
-    cells = np.random.default_rng(place).integers(0, 256, size=(6, 6, 3), dtype=np.uint8)
+def photo(number: int, blur: int = 80) -> bytes:
+    """The colours of a location, and as another camera sees them for another `blur`."""
+    cells = np.random.default_rng(number).integers(0, 256, size=(6, 6, 3), dtype=np.uint8)
     stream = io.BytesIO()
     Image.fromarray(resize(cells, blur)).save(stream, "JPEG", quality=95)
     return stream.getvalue()
@@ -43,9 +42,8 @@ def photo(place: int, blur: int = 80) -> bytes:
 
 @pytest.fixture
 def world(tmp_path: Path, lively_encoder: FeatureEncoder) -> dict[str, str]:
-    """A checkpoint, an index of places to the north of each other, and a folder with a photo of
-    each of the first four.
-    """
+    """A checkpoint, an index of locations north of each other, and a folder with a photo of each of
+    the first four."""
     network = PVDAConfig(backbone="resnet18", width=0.25, image_size=64, parts=2, part_dim=16)
     state = {"modules": {"encoder": lively_encoder.state_dict()}}
     data = dumps(
@@ -54,24 +52,24 @@ def world(tmp_path: Path, lively_encoder: FeatureEncoder) -> dict[str, str]:
     (tmp_path / "last.pt").write_bytes(data)
     mark = fingerprint(loads(data), f"{preprocessing_name()}, mirror True")
     rows_ND, _ = PhotoEncoder(data, "last.pt", {"fingerprint": mark}).encode(
-        [photo(place) for place in range(PLACES)]
+        [photo(number) for number in range(LOCATIONS)]
     )
-    names = [f"{place:04d}" for place in range(PLACES)]
+    names = [f"{number:04d}" for number in range(LOCATIONS)]
     rows = PartRows(
         keys=[f"gallery-satellite-{name}-{name}" for name in names],
         locations=names,
-        views=["satellite"] * PLACES,
-        splits=["gallery"] * PLACES,
-        lats=[46 + STEP * place for place in range(PLACES)],
-        lons=[8.0] * PLACES,
+        views=["satellite"] * LOCATIONS,
+        splits=["gallery"] * LOCATIONS,
+        lats=[46 + STEP * number for number in range(LOCATIONS)],
+        lons=[8.0] * LOCATIONS,
         embeddings_BD=rows_ND,
     )
-    footer = PartFooter(fingerprint=mark, shard_sha256="s", rows=PLACES)
+    footer = PartFooter(fingerprint=mark, shard_sha256="s", rows=LOCATIONS)
     write_part(str(tmp_path / "table" / "gallery-satellite-000000.parquet"), rows, footer)
     build_index(IndexSettings(table=str(tmp_path / "table"), out=str(tmp_path / "index")))
     (tmp_path / "photos").mkdir()
-    for place in range(4):
-        (tmp_path / "photos" / f"{place}.jpg").write_bytes(photo(place, 96))
+    for number in range(4):
+        (tmp_path / "photos" / f"{number}.jpg").write_bytes(photo(number, 96))
     paths = {name: str(tmp_path / name) for name in ("index", "photos")}
     return paths | {
         "checkpoint": str(tmp_path / "last.pt"),
@@ -91,7 +89,7 @@ def calibrated(world: dict[str, str]) -> None:
     sure = LogisticModel(mean_F=(0,) * 4, scale_F=(1,) * 4, coefficient_F=(0,) * 4, intercept=2.0)
     confidence = Calibration(
         fingerprint=world["mark"],
-        gallery_rows=PLACES,
+        gallery_rows=LOCATIONS,
         photo_selection="",
         spacing_m=111.0,
         agreement_radius_m=50.0,
@@ -112,7 +110,7 @@ def calibrated(world: dict[str, str]) -> None:
     write_calibration(f"{world['index']}/calibration.json", confidence)
 
 
-def test_each_photo_is_placed_where_it_was_taken(world: dict[str, str], tmp_path: Path) -> None:
+def test_locate_photos_at_their_positions(world: dict[str, str], tmp_path: Path) -> None:
     located = locate_photos(
         settings(world, csv=str(tmp_path / "out.csv"), page=str(tmp_path / "out.html"))
     )
@@ -126,26 +124,26 @@ def test_each_photo_is_placed_where_it_was_taken(world: dict[str, str], tmp_path
         feature["geometry"]["coordinates"]
         for feature in json.loads(Path(world["out"]).read_text())["features"]
     ]
-    assert np.allclose(points, [[8.0, 46 + STEP * place] for place in range(4)])
+    assert np.allclose(points, [[8.0, 46 + STEP * number] for number in range(4)])
     assert len(list(csv.DictReader(io.StringIO((tmp_path / "out.csv").read_text())))) == 4
     page = (tmp_path / "out.html").read_text()
     assert "46.003000, 8.000000" in page
     assert "Not calibrated" in page
 
 
-def test_the_number_of_candidates_is_the_one_asked_for(world: dict[str, str]) -> None:
+def test_locate_top_sets_number_of_candidates(world: dict[str, str]) -> None:
     located = locate_photos(settings(world, top=3))
     assert [len(one.answer.candidates) for one in located if one.answer] == [3] * 4
 
 
-def test_photos_of_one_folder_are_one_query_together(world: dict[str, str]) -> None:
+def test_locate_together_is_one_query_per_folder(world: dict[str, str]) -> None:
     (one,) = locate_photos(settings(world, together=True))
     assert one.name == world["photos"]
     assert len(one.photos) == 4
     assert one.answer is not None
 
 
-def test_near_a_place_only_what_lies_there_answers(world: dict[str, str]) -> None:
+def test_locate_near_restricts_candidates(world: dict[str, str]) -> None:
     located = locate_photos(
         settings(world, near=Circle(lat=46 + STEP * 2, lon=8.0, radius_m=150.0))
     )
@@ -153,20 +151,24 @@ def test_near_a_place_only_what_lies_there_answers(world: dict[str, str]) -> Non
     assert found == {"0001", "0002", "0003"}
 
 
-def test_a_damaged_photo_is_told_the_others_are_answered_and_the_exit_code_is_1(
+def test_locate_damaged_photo_is_listed_and_incomplete(
     world: dict[str, str],
 ) -> None:
     (Path(world["photos"]) / "0a.jpg").write_bytes(b"\xff\xd8\xff no image")
     with pytest.raises(Incomplete, match=r"1 of 5 photos could not be decoded: .*out.geojson"):
         main(settings(world))
-    said = json.loads(Path(world["out"]).read_text())["features"]
-    assert [len(feature["properties"]["rejected"]) for feature in said] == [0, 1, 0, 0, 0]
-    assert [feature["geometry"] is None for feature in said] == [False, True, False, False, False]
+    features = json.loads(Path(world["out"]).read_text())["features"]
+    assert [len(feature["properties"]["rejected"]) for feature in features] == [0, 1, 0, 0, 0]
+    assert [feature["geometry"] is None for feature in features] == [
+        False,
+        True,
+        False,
+        False,
+        False,
+    ]
 
 
-def test_a_photo_that_cannot_be_read_is_told_like_a_damaged_one(
-    world: dict[str, str], monkeypatch: Any
-) -> None:
+def test_locate_unreadable_photo_is_rejected(world: dict[str, str], monkeypatch: Any) -> None:
     plain = storage.read_bytes
 
     def failing(path: str) -> bytes:
@@ -181,14 +183,13 @@ def test_a_photo_that_cannot_be_read_is_told_like_a_damaged_one(
     ]  # fmt: skip
 
 
-def test_a_flight_is_placed_as_one_in_the_order_of_its_times(world: dict[str, str]) -> None:
-    """100 m in 10 s are within 25 m/s, so the track is the photos' own; written from the earliest
-    on.
-    """
+def test_locate_track_in_order_of_times(world: dict[str, str]) -> None:
+    """100 m in 10 s are within 25 m/s, so the track passes through the photos' own locations; the
+    output begins with the earliest."""
     calibrated(world)
     times = Path(world["photos"]).with_name("times.csv")
     times.write_text(
-        "photo,time\n" + "".join(f"{place}.jpg,{100 - 10 * place}\n" for place in range(4))
+        "photo,time\n" + "".join(f"{number}.jpg,{100 - 10 * number}\n" for number in range(4))
     )
     located = locate_photos(settings(world, track=True, times=str(times)))
     assert [one.taken_at for one in located] == ["70", "80", "90", "100"]
@@ -203,7 +204,7 @@ def test_a_flight_is_placed_as_one_in_the_order_of_its_times(world: dict[str, st
     assert len(line["geometry"]["coordinates"]) == 4
 
 
-def test_a_flight_without_times_or_without_a_calibration_is_refused(world: dict[str, str]) -> None:
+def test_locate_track_without_times_or_calibration_is_refused(world: dict[str, str]) -> None:
     with pytest.raises(InputError, match=r"no calibration beside .*--track"):
         locate_photos(settings(world, track=True))
     calibrated(world)
@@ -222,7 +223,7 @@ def test_a_flight_without_times_or_without_a_calibration_is_refused(world: dict[
         ({"checkpoint": "nowhere.pt"}, "no checkpoint at nowhere.pt"),
     ],
 )
-def test_a_wrong_call_is_refused_before_any_work(
+def test_locate_wrong_call_is_refused_before_any_work(
     world: dict[str, str], changes: dict[str, Any], sentence: str
 ) -> None:
     with pytest.raises(InputError, match=sentence):

@@ -1,6 +1,4 @@
-"""The two models of chance: what they say, and that no nearby coefficients explain the examples
-better.
-"""
+"""The two probability models: their formulas, and that no nearby coefficients are likelier."""
 
 import numpy as np
 import pytest
@@ -15,25 +13,25 @@ from pipeline.locate.logistic import (
 )
 
 
-def test_a_model_says_what_its_formula_says() -> None:
+def test_logistic_model_by_hand() -> None:
     model = LogisticModel(mean_F=(1.0,), scale_F=(2.0,), coefficient_F=(3.0,), intercept=-1.5)
     assert model.probabilities(np.array([[1.0], [2.0]])) == pytest.approx(
         [1 / (1 + np.exp(1.5)), 0.5]
     )
 
 
-def test_the_sigmoid_does_not_overflow() -> None:
+def test_sigmoid_does_not_overflow() -> None:
     assert sigmoid(np.array([-1e4, 0.0, 1e4])).tolist() == [0, 0.5, 1]
 
 
-def test_without_information_the_probability_is_the_share() -> None:
-    """3 of 4 by weight: a feature without spread says nothing."""
+def test_fit_logistic_without_information_gives_share() -> None:
+    """3 of 4 by weight: a feature without variance carries no information."""
     model = fit_logistic(np.ones((2, 1)), np.array([1.0, 0.0]), np.array([3.0, 1.0]))
     assert model.probabilities(np.ones((1, 1))) == pytest.approx([0.75], abs=1e-5)
     assert model.coefficient_F == (0,)
 
 
-def test_no_step_from_the_fitted_coefficients_is_likelier() -> None:
+def test_fit_logistic_is_at_the_optimum() -> None:
     rng = np.random.default_rng(0)
     x_NF = rng.normal(size=(60, 2))
     yes_N = (rng.uniform(size=60) < sigmoid(2 * x_NF[:, 0] - 1)).astype(float)
@@ -54,7 +52,7 @@ def test_no_step_from_the_fitted_coefficients_is_likelier() -> None:
     )
 
 
-def test_examples_that_part_perfectly_leave_coefficients_finite() -> None:
+def test_fit_logistic_separable_examples_stay_finite() -> None:
     model = fit_logistic(np.array([[0.0], [1.0]]), np.array([0.0, 1.0]), np.ones(2))
     assert (
         0.05
@@ -65,13 +63,13 @@ def test_examples_that_part_perfectly_leave_coefficients_finite() -> None:
     )
 
 
-def test_choices_are_a_softmax_with_none_of_them_last() -> None:
+def test_choice_log_probabilities_by_hand() -> None:
     """Weights 2, 1 and 3 of six."""
-    said = np.exp(choice_log_probabilities(np.array([[np.log(2), 0.0, -np.inf]]), 1.0, np.log(3)))
-    assert said == pytest.approx(np.array([[2 / 6, 1 / 6, 0, 3 / 6]]))
+    p_NC = np.exp(choice_log_probabilities(np.array([[np.log(2), 0.0, -np.inf]]), 1.0, np.log(3)))
+    assert p_NC == pytest.approx(np.array([[2 / 6, 1 / 6, 0, 3 / 6]]))
 
 
-def test_choices_made_by_known_odds_give_the_odds_back() -> None:
+def test_fit_choice_model_recovers_known_odds() -> None:
     rng = np.random.default_rng(0)
     x_NK = rng.uniform(0, 0.4, size=(4000, 5))
     p_NC = np.exp(choice_log_probabilities(x_NK, 12.0, 2.0))
@@ -81,9 +79,9 @@ def test_choices_made_by_known_odds_give_the_odds_back() -> None:
     assert outside == pytest.approx(2, abs=0.2)
 
 
-def test_candidates_that_are_not_there_are_never_chosen() -> None:
+def test_choice_model_missing_candidates_have_probability_0() -> None:
     x_NK = np.array([[0.3, -np.inf], [0.1, -np.inf]] * 10)
     inverse_temperature, outside = fit_choice_model(x_NK, np.array([0, 2] * 10), np.ones(20))
-    said = np.exp(choice_log_probabilities(x_NK[:2], inverse_temperature, outside))
-    assert said[:, 1].tolist() == [0, 0]
-    assert said[0, 0] > 0.5 > said[1, 0]
+    p_NC = np.exp(choice_log_probabilities(x_NK[:2], inverse_temperature, outside))
+    assert p_NC[:, 1].tolist() == [0, 0]
+    assert p_NC[0, 0] > 0.5 > p_NC[1, 0]

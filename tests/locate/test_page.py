@@ -1,6 +1,5 @@
-"""The page of answers: whole in one file, silent in a browser, true on the map, and unharmed by
-names.
-"""
+"""The answer page: one file, silent in a browser, to scale on the map, and safe with hostile
+names."""
 
 import io
 import re
@@ -45,7 +44,7 @@ METRE = 1 / 111_195.08
 
 
 def gallery(lon: float = 8.0) -> GalleryMap:
-    """Nine places 100 m apart around latitude 0."""
+    """Nine positions 100 m apart around latitude 0."""
     at = [
         (100 * METRE * row, (lon + 100 * METRE * column + 180) % 360 - 180)
         for row in (-1, 0, 1)
@@ -109,7 +108,7 @@ def page(located: list[LocatedPhoto] = LOCATED, **changes: Any) -> str:
     )
 
 
-def test_the_page_tells_places_what_is_unknown_and_what_is_damaged() -> None:
+def test_page_shows_known_unknown_and_damaged() -> None:
     text = page(true_positions={"flight/a.jpg": (30 * METRE, 8.0)})
     assert "0.000000, 8.000000" in text
     assert "truly 30 m away" in text
@@ -118,26 +117,27 @@ def test_the_page_tells_places_what_is_unknown_and_what_is_damaged() -> None:
     assert "empty file" in text
 
 
-def test_names_run_nothing_and_nothing_leaves_the_page() -> None:
+def test_page_escapes_names_and_loads_nothing() -> None:
     text = page()
     assert "<script" not in text
     assert "default-src 'none'" in text
     assert not re.search(r'(?:src|href)="(?!data:|#)', text)
 
 
-def test_a_picture_on_many_maps_is_held_once() -> None:
+def test_page_contains_each_tile_once() -> None:
     """Nine tiles, however many answers show them."""
     assert page([LOCATED[0]] * 5).count("<image id=") == 9
 
 
-def test_long_lists_are_shown_in_part_and_it_is_said() -> None:
+def test_page_of_many_answers_shows_some() -> None:
     text = page([LOCATED[0]] * (MAX_SHOWN + 20))
     assert text.count('<article class="photo">') == MAX_SHOWN
     assert f"{MAX_SHOWN} of them are shown" in text
 
 
-def test_the_map_puts_metres_where_they_belong() -> None:
-    """100 m north and east of the middle of a map of 400 m: three quarters across, a quarter down."""
+def test_map_frame_pixels_by_hand() -> None:
+    """100 m north and east of the middle of a map of 400 m: three quarters across, a quarter
+    down."""
     frame = MapFrame(lat=60.0, lon=8.0, half_m=200)
     x, y = frame.pixels(np.array([[60 + 100 * METRE, 8 + 200 * METRE]]))[0]
     assert (x, y) == pytest.approx((0.75 * MAP_SIDE_PX, 0.25 * MAP_SIDE_PX), abs=0.1)
@@ -150,7 +150,7 @@ def test_the_map_puts_metres_where_they_belong() -> None:
     ]
 
 
-def test_the_map_crosses_the_meridian_of_180_degrees() -> None:
+def test_position_map_across_180_degrees() -> None:
     around = gallery(lon=180.0)
     view = position_map(answer(lon=180.0), around, {})
     assert view is not None
@@ -160,7 +160,7 @@ def test_the_map_crosses_the_meridian_of_180_degrees() -> None:
     assert frame.half_m < 200
 
 
-def test_tiles_lie_on_their_footprints_where_these_are_known() -> None:
+def test_position_map_tiles_by_known_footprints() -> None:
     corners = square_footprint(0.0, 8.0, 40.0)
     turned = (*corners[1:], corners[0])
     view = position_map(answer(), gallery(), {"gallery-satellite-4": turned})
@@ -172,12 +172,12 @@ def test_tiles_lie_on_their_footprints_where_these_are_known() -> None:
     assert "gallery-satellite-4" in nearby_keys(answer(), gallery())
 
 
-def test_a_square_has_sides_as_long_as_asked_for() -> None:
+def test_square_footprint_side_lengths() -> None:
     corners = np.array(square_footprint(60.0, 8.0, 40.0))
     assert haversine_m(corners, np.roll(corners, -1, axis=0)) == pytest.approx([40] * 4, rel=1e-3)
 
 
-def test_the_overview_has_a_mark_for_each_known_place_and_a_line_for_a_flight() -> None:
+def test_overview_map_marks_and_line() -> None:
     answers = [("a", answer()), ("b", answer(known=False)), ("c", answer(lat=100 * METRE))]
     view = overview_map(answers, gallery(), track=True)
     assert view is not None
@@ -194,7 +194,7 @@ def test_the_overview_has_a_mark_for_each_known_place_and_a_line_for_a_flight() 
     )
 
 
-def test_distances_and_names_are_told_briefly() -> None:
+def test_format_distance_and_short_name() -> None:
     assert [format_distance(metres) for metres in (None, 0.2, 99.6, 2345)] == [
         "",
         "here",
@@ -208,7 +208,7 @@ def test_distances_and_names_are_told_briefly() -> None:
 @pytest.mark.skipif(
     CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"
 )
-def test_the_page_opens_in_silence_and_fits(tmp_path: Path) -> None:
+def test_page_in_a_browser_is_silent_and_fits(tmp_path: Path) -> None:
     sync_api = pytest.importorskip(
         "playwright.sync_api", reason="needs Playwright: install the project with [dev]"
     )
@@ -221,13 +221,13 @@ def test_the_page_opens_in_silence_and_fits(tmp_path: Path) -> None:
         )
         for width, scheme in ((375, "dark"), (1300, "light")):
             tab = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
-            said: list[str] = []
-            asked: list[str] = []
-            tab.on("console", lambda message, said=said: said.append(message.text))
-            tab.on("request", lambda request, asked=asked: asked.append(request.url))
+            messages: list[str] = []
+            urls: list[str] = []
+            tab.on("console", lambda message, messages=messages: messages.append(message.text))
+            tab.on("request", lambda request, urls=urls: urls.append(request.url))
             tab.goto(address)
-            assert said == []
-            assert [url for url in asked if not url.startswith("data:")] == [address]
+            assert messages == []
+            assert [url for url in urls if not url.startswith("data:")] == [address]
             assert tab.evaluate("document.documentElement.scrollWidth") <= width
             assert tab.locator("svg use").first.bounding_box()["width"] > 10
         browser.close()

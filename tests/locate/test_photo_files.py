@@ -1,4 +1,4 @@
-"""Which photos are meant, and when they were taken."""
+"""Photos named on the command line, and their times."""
 
 import io
 from pathlib import Path
@@ -16,7 +16,7 @@ from pipeline.locate.photo_files import (
 )
 
 
-def test_folders_are_looked_through_and_each_photo_is_named_once(tmp_path: Path) -> None:
+def test_find_photos_below_folders_each_once(tmp_path: Path) -> None:
     for name in ("b.jpg", "a.jpg", "notes.txt", "deep/c.PNG"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
@@ -26,7 +26,7 @@ def test_folders_are_looked_through_and_each_photo_is_named_once(tmp_path: Path)
     assert parent_folder("a.jpg") == "."
 
 
-def test_what_is_not_there_is_refused_by_its_name(tmp_path: Path) -> None:
+def test_find_photos_missing_path_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no photo or folder at .*gone.jpg"):
         find_photos([str(tmp_path / "gone.jpg")])
     with pytest.raises(InputError, match="no images below"):
@@ -35,7 +35,7 @@ def test_what_is_not_there_is_refused_by_its_name(tmp_path: Path) -> None:
         find_photos([])
 
 
-def test_the_camera_says_when() -> None:
+def test_read_taken_at_from_exif() -> None:
     stream, exif = io.BytesIO(), Image.Exif()
     exif.get_ifd(0x8769)[0x9003] = "2026:11:24 09:30:05"
     Image.new("RGB", (16, 16)).save(stream, "JPEG", exif=exif)
@@ -43,7 +43,7 @@ def test_the_camera_says_when() -> None:
     assert read_taken_at(b"no image") is None
 
 
-def test_times_are_seconds_or_iso_8601() -> None:
+def test_parse_time_seconds_and_iso_8601() -> None:
     assert parse_time("12.5") == 12.5
     assert parse_time("2026-11-24T09:30:05.5") - parse_time("2026-11-24T09:30:00") == 5.5
     assert parse_time("2026-11-24T10:30:00+01:00") == parse_time("2026-11-24T09:30:00")
@@ -51,7 +51,7 @@ def test_times_are_seconds_or_iso_8601() -> None:
         parse_time("nan")
 
 
-def test_a_table_gives_times_by_path_or_by_name(tmp_path: Path) -> None:
+def test_read_times_by_path_or_name(tmp_path: Path) -> None:
     path = tmp_path / "times.csv"
     path.write_text("photo,time\nb.jpg,20\n/x/a.jpg,10\n")
     assert read_times(str(path), ["/x/a.jpg", "/x/b.jpg"]) == {"/x/a.jpg": "10", "/x/b.jpg": "20"}
@@ -66,7 +66,7 @@ def test_a_table_gives_times_by_path_or_by_name(tmp_path: Path) -> None:
         ("photo,time\na.jpg,noon\n", "has the time 'noon' for /x/a.jpg"),
     ],
 )
-def test_a_table_that_does_not_say_is_refused(
+def test_read_times_invalid_table_is_refused(
     tmp_path: Path, text: str | None, sentence: str
 ) -> None:
     path = tmp_path / "times.csv"

@@ -1,4 +1,4 @@
-"""Said and seen, worked by hand."""
+"""Reliability bins and the expected calibration error by hand."""
 
 from xml.etree import ElementTree
 
@@ -18,19 +18,19 @@ SAID, TRUE, WEIGHT = (
 )
 
 
-def test_bins_hold_what_was_said_and_seen_by_weight() -> None:
+def test_reliability_bins_by_hand() -> None:
     low, high = reliability_bins(SAID, TRUE, WEIGHT)
     assert (low.predicted, low.observed, low.share) == pytest.approx((0.15, 0.5, 2 / 6))
     assert (high.predicted, high.observed, high.share) == pytest.approx((0.9875, 1, 4 / 6))
 
 
-def test_the_calibration_error_is_the_mean_distance_of_said_and_seen() -> None:
+def test_expected_calibration_error_by_hand() -> None:
     assert expected_calibration_error(reliability_bins(SAID, TRUE, WEIGHT)) == pytest.approx(
         (2 * 0.35 + 4 * 0.0125) / 6
     )
 
 
-def test_probabilities_that_come_true_have_no_error() -> None:
+def test_expected_calibration_error_of_calibrated_is_0() -> None:
     assert (
         expected_calibration_error(
             reliability_bins(np.array([0.5, 0.5]), np.array([0.0, 1.0]), np.ones(2))
@@ -39,7 +39,7 @@ def test_probabilities_that_come_true_have_no_error() -> None:
     )
 
 
-def test_the_diagram_is_a_picture_with_a_dot_for_each_bin() -> None:
+def test_reliability_diagram_has_a_dot_per_bin() -> None:
     drawn = ElementTree.fromstring(
         reliability_diagram(reliability_bins(SAID, TRUE, WEIGHT), "A & B")
     )

@@ -1,4 +1,4 @@
-"""The track through a flight's candidates: by hand, and against all chains tried one by one."""
+"""The most probable track of a flight: cases by hand, and against an enumeration of all paths."""
 
 from itertools import product
 
@@ -14,21 +14,20 @@ METRE = 180 / (np.pi * EARTH_RADIUS_M)  # degrees of latitude
 
 
 def photo(time_s: float, norths_m: list[float], chances: list[float]) -> TrackPhoto:
-    """Candidates so many metres north of the equator; what is left of the chances is elsewhere."""
-    places = np.array([(north * METRE, 8.0) for north in norths_m]).reshape(-1, 2)
+    """Candidates so many metres north of the equator; the probability left over is that of none."""
+    positions = np.array([(north * METRE, 8.0) for north in norths_m]).reshape(-1, 2)
     left = 1 - sum(chances)
     return TrackPhoto(
         time_s=time_s,
-        positions_K2=places,
+        positions_K2=positions,
         log_p_K=np.log(chances),
         log_p_none=float(np.log(left)),
     )
 
 
-def test_a_doubtful_photo_is_settled_by_its_neighbours() -> None:
-    """The second photo by itself would be 9 km off; from the first to it and on to the third only
-    100 m can be flown.
-    """
+def test_smooth_track_decides_uncertain_photo() -> None:
+    """By itself the second photo would be 9 km away; from the first photo to it and on to the
+    third, only 100 m can be flown."""
     flight = [
         photo(0, [0, 5000], [0.8, 0.1]),
         photo(10, [9000, 100], [0.5, 0.3]),
@@ -39,13 +38,13 @@ def test_a_doubtful_photo_is_settled_by_its_neighbours() -> None:
     assert found[1].probability > 0.5
 
 
-def test_a_photo_at_none_of_its_candidates_is_passed_over_and_the_limit_holds_across_it() -> None:
-    """150 m in 20 s are flown, 5 km are not, though nobody is between."""
+def test_smooth_track_skips_photo_and_keeps_limit() -> None:
+    """In 20 s 150 m can be flown and 5 km cannot, although no photo lies between."""
     flight = [photo(0, [0], [0.9]), photo(10, [9000], [0.5]), photo(20, [5000, 150], [0.6, 0.3])]
     assert [one.chosen for one in smooth_track(flight, Motion(max_speed=10))] == [0, None, 1]
 
 
-def test_a_rough_start_settles_the_first_photo() -> None:
+def test_smooth_track_start_decides_first_photo() -> None:
     flight = [photo(0, [0, 3000], [0.7, 0.2])]
     start = TrackStart(lat=2900 * METRE, lon=8.0, radius_m=500)
     assert smooth_track(flight, Motion())[0].chosen == 0
@@ -54,27 +53,27 @@ def test_a_rough_start_settles_the_first_photo() -> None:
     assert found.probability == pytest.approx(0.2 / 0.3)
 
 
-def test_slack_is_added_to_every_way() -> None:
+def test_motion_slack_extends_reach() -> None:
     flight = [photo(0, [0], [0.9]), photo(10, [140], [0.9])]
     assert [one.chosen for one in smooth_track(flight, Motion(max_speed=10))] != [0, 0]
     assert [one.chosen for one in smooth_track(flight, Motion(max_speed=10, slack_m=50))] == [0, 0]
 
 
-def test_one_photo_keeps_the_chances_that_it_had() -> None:
+def test_smooth_track_of_one_photo_keeps_probabilities() -> None:
     found = smooth_track([photo(0, [0, 900], [0.5, 0.3])], Motion())[0]
     assert found.p_K == pytest.approx([0.5, 0.3])
     assert found.chosen == 0
     assert found.probability == pytest.approx(0.5)
 
 
-def test_no_photos_and_photos_without_candidates_have_no_places() -> None:
+def test_smooth_track_without_photos_or_candidates() -> None:
     assert smooth_track([], Motion()) == []
     found = smooth_track([photo(0, [], []), photo(1, [5], [0.9])], Motion())
     assert [one.chosen for one in found] == [None, 0]
     assert found[0].probability == pytest.approx(1)
 
 
-def test_a_candidate_without_a_position_is_never_chosen() -> None:
+def test_smooth_track_never_chooses_unknown_position() -> None:
     flight = TrackPhoto(
         time_s=0,
         positions_K2=np.full((1, 2), np.nan),
@@ -84,7 +83,7 @@ def test_a_candidate_without_a_position_is_never_chosen() -> None:
     assert smooth_track([flight], Motion())[0].chosen is None
 
 
-def test_the_way_across_the_meridian_of_180_degrees_is_short() -> None:
+def test_smooth_track_across_180_degrees() -> None:
     flight = [
         TrackPhoto(
             time_s=10.0 * n,
@@ -100,30 +99,32 @@ def test_the_way_across_the_meridian_of_180_degrees_is_short() -> None:
 def chains(
     flight: list[TrackPhoto], motion: Motion, start: TrackStart | None
 ) -> dict[tuple[int | None, ...], float]:
-    """Every chain that can be flown, with its weight: all combinations are tried."""
+    """Every path that can be flown, with its weight, by enumeration."""
     weights = {}
     for chain in product(*([None, *range(len(one.log_p_K))] for one in flight)):
         weight, last = (
             1.0,
             None if start is None else (flight[0].time_s, start.lat, start.lon, start.radius_m),
         )
-        seen = None
+        last_number = None
         for number, (one, at) in enumerate(zip(flight, chain, strict=True)):
             weight *= float(np.exp(one.log_p_none if at is None else one.log_p_K[at]))
             if at is None:
                 continue
             here: Doubles = one.positions_K2[at]
-            if last is not None and (seen is None or number - seen <= motion.max_gap_photos):
+            if last is not None and (
+                last_number is None or number - last_number <= motion.max_gap_photos
+            ):
                 away = float(haversine_m(np.array(last[1:3]), here))
                 way = motion.max_speed * (one.time_s - last[0]) + motion.slack_m + last[3]
                 weight *= float(np.exp(motion.gain(np.array(way)))) if away <= way else 0.0
-            last, seen = (one.time_s, float(here[0]), float(here[1]), 0.0), number
+            last, last_number = (one.time_s, float(here[0]), float(here[1]), 0.0), number
         weights[chain] = weight
     return weights
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_track_and_probabilities_are_those_of_all_chains(seed: int) -> None:
+def test_smooth_track_equals_all_paths_enumerated(seed: int) -> None:
     rng = np.random.default_rng(seed)
     flight = []
     for time in np.cumsum(rng.uniform(1, 20, size=5)):
@@ -150,15 +151,15 @@ def test_track_and_probabilities_are_those_of_all_chains(seed: int) -> None:
             assert chance == pytest.approx(with_it / total, abs=1e-9)
 
 
-def test_a_place_gains_by_how_few_others_are_within_reach() -> None:
-    """Of 100 places on squares of 10 m, 20 lie within a circle of 2,000 square metres: five times
-    as likely. Beyond all and within one there is nothing more to gain."""
+def test_motion_gain_by_hand() -> None:
+    """Of 100 positions on squares of 10 m, 20 lie within a circle of 2,000 square metres: five
+    times as likely. A reach beyond all, or within one, gains nothing more."""
     motion = Motion(gallery_positions=100, spacing_m=10)
     ways = np.array([np.sqrt(2000 / np.pi), 1e6, 0.0])
     assert np.exp(motion.gain(ways)) == pytest.approx([5, 1, 100])
 
 
-def test_near_places_are_likelier_than_elsewhere_though_no_photo_alone_says_so() -> None:
+def test_smooth_track_near_candidates_beat_none() -> None:
     flight = [photo(10.0 * n, [100.0 * n, 9000], [0.2, 0.2]) for n in range(4)]
     assert [one.chosen for one in smooth_track(flight, Motion())] == [None] * 4
     assert [
@@ -166,7 +167,7 @@ def test_near_places_are_likelier_than_elsewhere_though_no_photo_alone_says_so()
     ] == [0] * 4
 
 
-def test_a_motion_that_makes_no_sense_is_refused() -> None:
+def test_motion_invalid_value_is_refused() -> None:
     with pytest.raises(InputError, match="--elsewhere is 1"):
         Motion(elsewhere=1)
     with pytest.raises(InputError, match="--max-speed is 0"):

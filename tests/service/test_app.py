@@ -52,7 +52,7 @@ def test_locate_form_fields_override_query() -> None:
 def test_locate_full_queue_gives_retry_after() -> None:
     async def test(client: Client, engine: FakeEngine) -> None:
         engine.gate.clear()
-        asked = [
+        pending = [
             asyncio.create_task(post(client, photo())) for _ in range(5)
         ]  # 2 at work, 3 waiting
         while "pvda_waiting_photos 4.0" not in await (await client.get("/metrics")).text():
@@ -61,7 +61,7 @@ def test_locate_full_queue_gives_retry_after() -> None:
         assert 1 <= int(refused.headers["Retry-After"]) <= 60
         assert "5 photos are before it" in await error_sentence(refused, 503)
         engine.gate.set()
-        assert [response.status for response in await asyncio.gather(*asked)] == [200] * 5
+        assert [response.status for response in await asyncio.gather(*pending)] == [200] * 5
         assert (await post(client, photo())).status == 200
 
     run_with_service(test, batch=2, waiting=3)
@@ -70,14 +70,14 @@ def test_locate_full_queue_gives_retry_after() -> None:
 def test_locate_queue_beyond_timeout_is_refused_at_once() -> None:
     async def test(client: Client, engine: FakeEngine) -> None:
         engine.gate.clear()
-        asked = [asyncio.create_task(post(client, photo())) for _ in range(3)]
+        pending = [asyncio.create_task(post(client, photo())) for _ in range(3)]
         while "pvda_waiting_photos 2.0" not in await (await client.get("/metrics")).text():
             await asyncio.sleep(0.01)
         assert "before it" in await error_sentence(
             await post(client, photo()), 503
         )  # two batches of a guessed second each
         engine.gate.set()
-        assert [response.status for response in await asyncio.gather(*asked)] == [200] * 3
+        assert [response.status for response in await asyncio.gather(*pending)] == [200] * 3
         assert (await post(client, photo())).status == 200
 
     run_with_service(test, batch=1, timeout_s=1.9)
@@ -100,11 +100,11 @@ def test_locate_poisoned_photo_spares_its_batch() -> None:
         while not engine.batches:
             await asyncio.sleep(0.01)
         sizes = [(40, 30), (13, 13), (40, 30)]
-        asked = [asyncio.create_task(post(client, photo(size=size))) for size in sizes]
+        pending = [asyncio.create_task(post(client, photo(size=size))) for size in sizes]
         while "pvda_waiting_photos 3.0" not in await (await client.get("/metrics")).text():
             await asyncio.sleep(0.01)
         engine.gate.set()
-        assert [response.status for response in await asyncio.gather(first, *asked)] == [
+        assert [response.status for response in await asyncio.gather(first, *pending)] == [
             200,
             200,
             422,
@@ -129,9 +129,9 @@ def test_health_ready_and_not_ready() -> None:
         response = await client.get("/health")
         assert response.status == 503
         assert await response.json() == {"ready": False, "why": "the encoder is being loaded"}
-        asked = await post(client, photo())
-        assert asked.headers["Retry-After"] == "5"
-        assert "the encoder is being loaded" in await error_sentence(asked, 503)
+        response = await post(client, photo())
+        assert response.headers["Retry-After"] == "5"
+        assert "the encoder is being loaded" in await error_sentence(response, 503)
 
     run_with_service(test)
 

@@ -1,6 +1,5 @@
-"""Batches of what waits: nothing waits for company, nobody's answer is another's, and one that
-kills is told from the rest.
-"""
+"""Batches of waiting items: none waits for others, each gets its own result, crashes are
+isolated."""
 
 import asyncio
 from collections.abc import Coroutine, Sequence
@@ -14,7 +13,7 @@ from pipeline.service.batcher import Batcher, PoisonedItem, ReplicaLost
 
 
 class Doubling:
-    """Doubles numbers, `gates` deciding when; remembers its batches."""
+    """Doubles numbers once `gate` opens; records its batches."""
 
     def __init__(self, gated: bool = False) -> None:
         self.batches: list[list[int]] = []
@@ -53,12 +52,12 @@ def test_batcher_lone_item_does_not_wait() -> None:
     async def main() -> None:
         double = Doubling(gated=True)
         batcher = Batcher(double, max_batch=8)
-        asked = [asyncio.create_task(batcher.submit(number)) for number in range(6)]
+        tasks = [asyncio.create_task(batcher.submit(number)) for number in range(6)]
         await asyncio.sleep(0.01)
         assert double.batches == [[0]]
         assert batcher.waiting == 5
         double.gate.set()
-        await asyncio.gather(*asked)
+        await asyncio.gather(*tasks)
         assert double.batches == [[0], [1, 2, 3, 4, 5]]
 
     run(main())
@@ -68,15 +67,15 @@ def test_batcher_cancelled_item_leaves_queue() -> None:
     async def main() -> None:
         double = Doubling(gated=True)
         batcher = Batcher(double, max_batch=8)
-        asked = [asyncio.create_task(batcher.submit(number)) for number in range(4)]
+        tasks = [asyncio.create_task(batcher.submit(number)) for number in range(4)]
         await asyncio.sleep(0.01)
-        asked[0].cancel()  # at work
-        asked[2].cancel()  # waiting
+        tasks[0].cancel()  # at work
+        tasks[2].cancel()  # waiting
         await asyncio.sleep(0.01)
         assert batcher.waiting == 2
         double.gate.set()
-        assert await asked[1] == 2
-        assert await asked[3] == 6
+        assert await tasks[1] == 2
+        assert await tasks[3] == 6
         assert double.batches == [[0], [1, 3]]
 
     run(main())
@@ -122,16 +121,16 @@ def test_batcher_retry_after_grows_with_queue() -> None:
         double = Doubling(gated=True)
         batcher = Batcher(double, max_batch=2)
         assert batcher.retry_after_estimate_s == 1
-        asked = [asyncio.create_task(batcher.submit(number)) for number in range(9)]
+        tasks = [asyncio.create_task(batcher.submit(number)) for number in range(9)]
         await asyncio.sleep(0.01)
         assert (
             batcher.retry_after_estimate_s == 5
         )  # four batches of a guessed second each wait behind the one at work
-        asked += [asyncio.create_task(batcher.submit(number)) for number in range(300)]
+        tasks += [asyncio.create_task(batcher.submit(number)) for number in range(300)]
         await asyncio.sleep(0.01)
         assert batcher.retry_after_estimate_s == 60
         double.gate.set()
-        await asyncio.gather(*asked)
+        await asyncio.gather(*tasks)
 
     run(main())
 

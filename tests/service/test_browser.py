@@ -1,6 +1,5 @@
-"""The service's page in a real browser: a photo dropped, chosen or pasted, the answer seen; by
-keyboard, small, in the dark.
-"""
+"""The service's page in a real browser: a photo dropped, chosen or pasted; by keyboard, small,
+dark."""
 
 import asyncio
 import base64
@@ -76,18 +75,18 @@ def served() -> Iterator[Served]:
 
 @pytest.fixture
 def page(browser: Any, served: Served) -> Iterator[Any]:
-    """The page, and nothing said on its console, nothing asked of anyone else."""
+    """The page; afterwards its console is empty and it has made no request to another host."""
     opened = browser.new_page()
-    said: list[str] = []
-    asked: list[str] = []
-    opened.on("console", lambda message: said.append(message.text))
-    opened.on("pageerror", lambda error: said.append(str(error)))
-    opened.on("request", lambda request: asked.append(request.url))
+    messages: list[str] = []
+    urls: list[str] = []
+    opened.on("console", lambda message: messages.append(message.text))
+    opened.on("pageerror", lambda error: messages.append(str(error)))
+    opened.on("request", lambda request: urls.append(request.url))
     opened.goto(served.address)
     yield opened
     opened.close()
-    assert said == []
-    assert all(url.startswith((served.address, f"blob:{served.address}")) for url in asked), asked
+    assert messages == []
+    assert all(url.startswith((served.address, f"blob:{served.address}")) for url in urls), urls
 
 
 def give(
@@ -115,9 +114,8 @@ def test_page_dropped_photo_shows_answer_and_map(
 
 
 def test_page_map_is_to_scale(page: Any) -> None:
-    """Candidates stand 0.001 degrees of latitude apart, 111.2 m; the rule says how long 100 m or so
-    are.
-    """
+    """Candidates are 0.001 degrees of latitude apart, 111.2 m; the scale bar gives the length of
+    about 100 m."""
     give(page, DROP, photo())
     page.wait_for_selector("#answer:not([hidden])")
     y = sorted(float(dot.get_attribute("cy")) for dot in page.locator("#map circle.dot").all())

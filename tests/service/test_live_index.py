@@ -1,6 +1,4 @@
-"""An index that is replaced while it answers: taken over when whole, refused when broken, never
-half of each.
-"""
+"""An index that is replaced while it is searched: used once complete and valid, else refused."""
 
 import asyncio
 import shutil
@@ -33,9 +31,8 @@ DIMENSION = 8
 
 
 def make_index(path: Path, rows: int, fingerprint: str = "f" * 64) -> Path:
-    """An index of `rows` places 1,000 m apart; place n is seen in direction n of the vectors'
-    space.
-    """
+    """An index of `rows` locations 1,000 m apart; the embedding of location n is the n-th unit
+    vector."""
     table = path.with_name(f"{path.name}-table")
     embeddings_BD = np.eye(rows, DIMENSION, dtype=np.float32)
     part = PartRows(
@@ -57,7 +54,7 @@ def make_index(path: Path, rows: int, fingerprint: str = "f" * 64) -> Path:
 
 
 def replace(path: Path, new: Path) -> None:
-    """As a careful operator does it: the parts first, each by renaming, index.json last."""
+    """Replace an index safely: the parts first, each by renaming, index.json last."""
     for name in sorted(
         (entry.name for entry in new.iterdir()), key=lambda name: name == "index.json"
     ):
@@ -65,20 +62,20 @@ def replace(path: Path, new: Path) -> None:
 
 
 class WidthEncoder:
-    """Sees place n in a photo that is 16 + n pixels wide; one of 15 cannot be decoded."""
+    """Encodes a photo 16 + n pixels wide as location n; one of 15 cannot be decoded."""
 
     def __init__(self, facts: dict[str, Any]) -> None:
         self.batches: list[int] = []
 
     def encode(self, photos: Sequence[bytes]) -> tuple[Floats, list[Rejection | None]]:
         self.batches.append(len(photos))
-        places = [self.width(data) - 16 for data in photos]
-        whole = [place for place in places if place >= 0]
+        numbers = [self.width(data) - 16 for data in photos]
+        decoded = [number for number in numbers if number >= 0]
         refused = [
-            None if place >= 0 else Rejection(path="p", reason="damaged image", found="f")
-            for place in places
+            None if number >= 0 else Rejection(path="p", reason="damaged image", found="f")
+            for number in numbers
         ]
-        return np.eye(DIMENSION, dtype=np.float32)[whole].reshape(-1, DIMENSION), refused
+        return np.eye(DIMENSION, dtype=np.float32)[decoded].reshape(-1, DIMENSION), refused
 
     @staticmethod
     def width(data: bytes) -> int:
@@ -87,8 +84,8 @@ class WidthEncoder:
         return inspect(data)[0]
 
 
-def ask(place: int, **where: Any) -> LocateRequest:
-    return LocateRequest(photo=photo(size=(16 + place, 16)), **where)
+def locate_request(number: int, **where: Any) -> LocateRequest:
+    return LocateRequest(photo=photo(size=(16 + number, 16)), **where)
 
 
 @pytest.fixture
@@ -98,13 +95,15 @@ def path(tmp_path: Path) -> Path:
 
 def test_live_index_switches_to_new_index(path: Path, tmp_path: Path) -> None:
     live = LiveIndex(str(path))
-    held = live.current
+    before = live.current
     live.poll()
-    assert live.current is held
+    assert live.current is before
     replace(path, make_index(tmp_path / "new", 5))
     live.poll()
     assert (len(live.current.index), live.refused) == (5, None)
-    assert held.index.search(np.eye(1, DIMENSION, 2, dtype=np.float32), 1)[0][0].key == "gallery-2"
+    assert (
+        before.index.search(np.eye(1, DIMENSION, 2, dtype=np.float32), 1)[0][0].key == "gallery-2"
+    )
 
 
 def broken_files(path: Path) -> None:
@@ -124,17 +123,17 @@ BROKEN = {
 
 @pytest.mark.parametrize("harm", BROKEN.values(), ids=BROKEN)
 def test_live_index_broken_one_is_refused(path: Path, harm: Any) -> None:
-    whole = path.with_name("whole")
-    shutil.copytree(path, whole)
+    copy = path.with_name("copy")
+    shutil.copytree(path, copy)
     live = LiveIndex(str(path))
-    held = live.current
+    before = live.current
     harm(path)
     live.poll()
-    assert live.current is held
+    assert live.current is before
     assert live.refused is not None
     assert "\n" not in live.refused
     shutil.rmtree(path)
-    shutil.copytree(whole, path)
+    shutil.copytree(copy, path)
     live.poll()
     assert live.refused is None
 
@@ -150,9 +149,8 @@ def test_live_index_of_another_encoder_is_refused(path: Path, tmp_path: Path) ->
 def test_live_index_refused_one_is_retried_later(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A copy whose index.json came first: it is whole later, without index.json having changed
-    again.
-    """
+    """A copy whose index.json came first is complete later, without another change of
+    index.json."""
     live = LiveIndex(str(path))
     new = make_index(tmp_path / "new", 5)
     hidden = (path / "index.faiss").rename(tmp_path / "hidden")
@@ -198,11 +196,11 @@ def test_live_index_missing_is_refused(tmp_path: Path) -> None:
 def test_predictor_batch_is_one_forward_pass(path: Path) -> None:
     predictor = Predictor(str(path), WidthEncoder)
     requests = [
-        ask(2),
+        locate_request(2),
         LocateRequest(photo=photo(size=(15, 15))),
-        ask(0, top=1),
-        ask(1),
-        ask(2, top=1),
+        locate_request(0, top=1),
+        locate_request(1),
+        locate_request(2, top=1),
     ]
     found = predictor.predict(requests)
     assert isinstance(found[1], Rejection)
@@ -212,12 +210,20 @@ def test_predictor_batch_is_one_forward_pass(path: Path) -> None:
     assert predictor._encoder.batches == [5]  # type: ignore[attr-defined]
 
 
+def test_predictor_without_calibration_uses_gallery_spacing(path: Path) -> None:
+    """Locations are 1,000 m apart: half of it is the radius, as `locate` answers."""
+    predictor = Predictor(str(path), WidthEncoder)
+    (answer,) = predictor.predict([locate_request(1)])
+    assert isinstance(answer, Answer)
+    assert answer.position is not None
+    assert answer.position.radius_m == pytest.approx(0.009 / 2 * 111_195, rel=1e-3)
+
+
 def test_service_answers_while_index_is_replaced(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two galleries by turns under a stream of requests; none fails, and the last one asked is the
-    last one built.
-    """
+    """Two galleries in turn under a stream of requests; none fails, and the last index built is in
+    use at the end."""
     predictor = Predictor(str(path), WidthEncoder)
 
     class InThisProcess:

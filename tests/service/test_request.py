@@ -1,6 +1,4 @@
-"""What a request may ask: rough positions, numbers of candidates, and photos judged without
-decoding them.
-"""
+"""Validation of requests: rough positions, numbers of candidates, and photos without decoding."""
 
 import pytest
 
@@ -19,16 +17,16 @@ def refused(photo: bytes, **fields: str) -> RequestError:
 
 @pytest.mark.parametrize("form", ["JPEG", "PNG", "WEBP"])
 def test_request_photo_alone(form: str) -> None:
-    asked = parse_request(photo(form), {}, MEGAPIXELS)
-    assert (asked.near, asked.top) == (None, 5)
+    request = parse_request(photo(form), {}, MEGAPIXELS)
+    assert (request.near, request.top) == (None, 5)
 
 
 def test_request_rough_position() -> None:
-    asked = parse_request(
+    request = parse_request(
         photo(), {"lat": "47.5", "lon": "-8", "radius_m": "2e3", "top": "3"}, MEGAPIXELS
     )
-    assert asked.near == Circle(lat=47.5, lon=-8.0, radius_m=2000.0)
-    assert asked.top == 3
+    assert request.near == Circle(lat=47.5, lon=-8.0, radius_m=2000.0)
+    assert request.top == 3
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
-"""jobs/serve.py as a stranger calls it: a network and an index behind Ray Serve, asked over HTTP,
-killed, told to stop.
-"""
+"""The serve job end to end: an encoder and an index behind Ray Serve, called over HTTP, killed,
+stopped."""
 
 import asyncio
 import json
@@ -43,7 +42,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
-def road(tmp_path: Path, lively_encoder: FeatureEncoder) -> tuple[Path, Path]:
+def checkpoint_and_index(tmp_path: Path, lively_encoder: FeatureEncoder) -> tuple[Path, Path]:
     """A checkpoint, and an index of three photos that it embedded."""
     state = {"modules": {"encoder": lively_encoder.state_dict()}}
     config = PVDAConfig(backbone="resnet18", width=0.25, image_size=64, parts=2, part_dim=16)
@@ -76,15 +75,15 @@ def command(*arguments: object) -> list[str]:
 
 @contextmanager
 def started(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The job in a process of its own, and its address as soon as it listens."""
+    """The job in a process of its own, and its address once it listens."""
     with subprocess.Popen(
         command(*arguments), stderr=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
         try:
             assert process.stderr is not None
-            heard = process.stderr.readline()
-            address = re.match(r"(http://\S+) listens", heard)
-            assert address, heard + process.stderr.read()
+            line = process.stderr.readline()
+            address = re.match(r"(http://\S+) listens", line)
+            assert address, line + process.stderr.read()
             yield process, address[1]
         finally:
             if process.poll() is None:
@@ -116,13 +115,13 @@ def wait_ready(address: str) -> dict[str, Any]:
 
 
 def replica_of(process: subprocess.Popen[str]) -> int:
-    """The process number of the service's replica, by the name that Ray gives it."""
+    """The process id of the service's replica, by the name that Ray gives it."""
     name = f"ray::ServeReplica:pvda-{process.pid}:Replica"
     return next(one for one in descendants(os.getpid()) if command_line(one).startswith(name))
 
 
 def serve_actors() -> list[str]:
-    """What of Ray Serve lives on the session's cluster."""
+    """The actors of Ray Serve on the session's cluster."""
     import ray
 
     named = [str(actor["name"]) for actor in ray.util.list_named_actors(all_namespaces=True)]
@@ -130,9 +129,9 @@ def serve_actors() -> list[str]:
 
 
 def test_serve_answers_replaces_replica_and_ends_cleanly(
-    road: tuple[Path, Path], ray_address: str
+    checkpoint_and_index: tuple[Path, Path], ray_address: str
 ) -> None:
-    checkpoint, index = road
+    checkpoint, index = checkpoint_and_index
     with started("--checkpoint", checkpoint, "--index", index, "--port", 0, "--threads", 1) as (
         process,
         address,
@@ -152,10 +151,12 @@ def test_serve_answers_replaces_replica_and_ends_cleanly(
     assert not serve_actors()
 
 
-def test_serve_other_encoder_is_refused(road: tuple[Path, Path], ray_cluster: None) -> None:
-    checkpoint, index = road
-    said = json_files.read_checksummed(str(index / "index.json"))
-    json_files.write_checksummed(str(index / "index.json"), said | {"fingerprint": "e" * 64})
+def test_serve_other_encoder_is_refused(
+    checkpoint_and_index: tuple[Path, Path], ray_cluster: None
+) -> None:
+    checkpoint, index = checkpoint_and_index
+    metadata = json_files.read_checksummed(str(index / "index.json"))
+    json_files.write_checksummed(str(index / "index.json"), metadata | {"fingerprint": "e" * 64})
     with pytest.raises(InputError, match="did not make this index"):
         main(ServeSettings(checkpoint=str(checkpoint), index=str(index), port=0, threads=1))
     assert not serve_actors()
@@ -170,8 +171,10 @@ def test_serve_missing_input_is_refused(tmp_path: Path) -> None:
         ServeSettings(checkpoint="last.pt", index="index", replicas=0)
 
 
-def test_serve_port_in_use_is_refused(road: tuple[Path, Path], ray_cluster: None) -> None:
-    checkpoint, index = road
+def test_serve_port_in_use_is_refused(
+    checkpoint_and_index: tuple[Path, Path], ray_cluster: None
+) -> None:
+    checkpoint, index = checkpoint_and_index
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -180,8 +183,10 @@ def test_serve_port_in_use_is_refused(road: tuple[Path, Path], ray_cluster: None
             main(ServeSettings(checkpoint=str(checkpoint), index=str(index), port=port))
 
 
-def test_replica_retries_loading(road: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    checkpoint, index = road
+def test_replica_retries_loading(
+    checkpoint_and_index: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint, index = checkpoint_and_index
     monkeypatch.setattr(replicas, "RETRY_S", 0.02)
     hidden = index.rename(index.with_name("hidden"))
     replica = Replica(partial(load_predictor, str(checkpoint), str(index), None, 1))
@@ -196,9 +201,11 @@ def test_replica_retries_loading(road: tuple[Path, Path], monkeypatch: pytest.Mo
 
 
 def test_replica_stuck_batch_fails_health_check(
-    road: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+    checkpoint_and_index: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    replica = Replica(partial(load_predictor, str(road[0]), str(road[1]), None, 1))
+    replica = Replica(
+        partial(load_predictor, str(checkpoint_and_index[0]), str(checkpoint_and_index[1]), None, 1)
+    )
     replica._batch_began = time.monotonic() - replicas.BATCH_TIMEOUT_S - 1
     with pytest.raises(TimeoutError, match="120 s"):
         replica.check_health()
