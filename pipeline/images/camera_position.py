@@ -154,9 +154,9 @@ def _to_wgs84(position: Position, datum: str) -> Position:
     code = next((code for other, code in OTHER_DATUMS.items() if name.startswith(other)), None)
     if code is None:
         raise UnreadableTag(f"GPSMapDatum is {datum!r}, expected WGS-84")
-    from rasterio.warp import transform  # here: a photo in a hundred thousand needs it
+    from pyproj import Transformer  # here: a photo in a hundred thousand needs it
 
-    [lon], [lat] = transform(f"EPSG:{code}", "EPSG:4326", [position[1]], [position[0]])
+    lat, lon = Transformer.from_crs(code, 4326).transform(*position)
     return float(lat), float(lon)
 
 
