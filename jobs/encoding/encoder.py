@@ -25,11 +25,12 @@ from model.inference.precision import (
 )
 from pipeline.batches.ordered import CHANGED, decode_samples, stack
 from pipeline.core import storage
+from pipeline.core.arrays import Pixels
 from pipeline.core.errors import InputError
 from pipeline.features.embed import EncoderSpec
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import Floats
-from pipeline.images.decode import DecodeError, Pixels
+from pipeline.images.decode import DecodeError
 from pipeline.images.transforms import Resizer, preprocessing_name
 from pipeline.shards.samples import Sample
 from pipeline.shards.shard_set import ShardSet, open_or_scan

@@ -20,11 +20,12 @@ from model.inference.int8 import calibration_digest, require_int8
 from model.inference.optimise import optimise_encoder
 from model.inference.precision import EffectivePrecision, describe_preprocessing
 from pipeline.batches.ordered import stack
+from pipeline.core.arrays import Pixels
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import Rejection
 from pipeline.features.table import Floats
-from pipeline.images.decode import DecodeError, Pixels, decode
+from pipeline.images.decode import DecodeError, decode
 from pipeline.images.inspect import inspect
 from pipeline.images.transforms import Resizer, preprocessing_name, resize
 from pipeline.shards.shard_set import open_or_scan

@@ -9,8 +9,9 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.core.arrays import Pixels
 from pipeline.core.prefetch import prefetch_map
-from pipeline.images.decode import DecodeError, Pixels, decode
+from pipeline.images.decode import DecodeError, decode
 from pipeline.images.transforms import Resizer, resize
 from pipeline.shards.samples import Sample
 

@@ -23,12 +23,12 @@ import numpy.typing as npt
 
 from pipeline.batches.ordered import Decoded, decode_sample, stack
 from pipeline.core import storage
-from pipeline.core.arrays import Floats, Halves
+from pipeline.core.arrays import Floats, Halves, Pixels
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch, prefetch_map
 from pipeline.core.records import Rejection
 from pipeline.features.part import PartFooter, PartRows, write_part
-from pipeline.images.decode import DecodeError, Pixels
+from pipeline.images.decode import DecodeError
 from pipeline.images.transforms import Resizer
 from pipeline.shards.manifest import Shard
 from pipeline.shards.samples import Sample

@@ -4,19 +4,27 @@ Shapes: H x W pixels.
 """
 
 import io
-from collections.abc import Iterator
+import re
+import warnings
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import simplejpeg
 from PIL import Image, UnidentifiedImageError
 
-Pixels = npt.NDArray[np.uint8]
+from pipeline.core.arrays import Pixels
+from pipeline.images.stretch import FEWEST_LEVELS, deep_to_8bit
+
 PILLOW_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF", "PPM")
 """Formats that Pillow may recognise, whatever the file's name. It knows forty more, some of them
 seldom reviewed, and starts Ghostscript for a file that declares itself EPS."""
-ORIENTATION_TAG = 0x0112
+PILLOW_WARNINGS = ("ignore", None, Warning, re.compile(r"PIL\."), 0)
+"The filter of warnings that Pillow's modules issue, as `warnings.filters` lists it."
+ORIENTATION_TAG, PHOTOMETRIC_TAG, BITS_TAG, NODATA_TAG = 0x0112, 0x0106, 0x0102, 0xA481
+WHITE_IS_ZERO = 0
+TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
 UPRIGHT_SLICES = {
     1: (slice(None), slice(None)),
     2: (slice(None), slice(None, None, -1)),
@@ -55,17 +63,46 @@ def decode(data: bytes) -> Pixels:
 
 
 def _rgb(image: Image.Image) -> Pixels:
-    if image.mode.startswith("I"):  # 16 bits a pixel, which Pillow's convert would clip at 255
-        grey_HW = (np.asarray(image).astype(np.uint32) >> 8).astype(np.uint8)
+    tags = getattr(image, "tag_v2", {})  # a TIFF's
+    if image.mode.startswith(("I", "F")):  # deeper than 8 bits, which Pillow's convert would clip
+        grey_HW = deep_to_8bit(
+            np.asarray(image), _nodata(tags), negative=tags.get(PHOTOMETRIC_TAG) == WHITE_IS_ZERO
+        )
         return np.repeat(grey_HW[:, :, None], 3, axis=2)
     if image.mode == "P":  # through RGBA: Pillow warns of every palette that holds transparency
         image = image.convert("RGBA")
-    return np.asarray(image.convert("RGB"))
+    image_HW3 = np.asarray(image.convert("RGB"))
+    if max(tags.get(BITS_TAG, (8,))) > 8:  # of which Pillow keeps the upper 8
+        _require_levels(image_HW3)
+    return image_HW3
+
+
+def _nodata(tags: Mapping[int, Any]) -> float | None:
+    """The value of pixels without an image, as GDAL writes it; None if there is none."""
+    try:
+        return float(str(tags.get(NODATA_TAG, "")).strip("\0 "))
+    except ValueError:
+        return None
+
+
+def _require_levels(image_HW3: Pixels) -> None:
+    levels = int(image_HW3.max(initial=0)) + 1
+    if levels < FEWEST_LEVELS:
+        raise DecodeError(
+            "too few levels",
+            f"channels of 16 bits whose values fill {levels} of 256 levels, expected at least "
+            f"{FEWEST_LEVELS}: stretch them, or give it to the geotiff source",
+        )
 
 
 @contextmanager
 def decode_errors(data: bytes) -> Iterator[None]:
-    """Turn any error over an image's bytes into a DecodeError with a countable reason."""
+    """Turn any error over an image's bytes into a DecodeError with a countable reason.
+
+    Pillow's warnings of odd metadata are not shown: they come with each photo of a camera.
+    """
+    if PILLOW_WARNINGS not in warnings.filters:
+        warnings.filterwarnings("ignore", module=PILLOW_WARNINGS[3].pattern)
     if not data:
         raise DecodeError("empty file", "0 bytes")
     try:
@@ -73,6 +110,9 @@ def decode_errors(data: bytes) -> Iterator[None]:
     except (DecodeError, MemoryError):  # the latter is this machine's fault and not the image's
         raise
     except UnidentifiedImageError:
+        if data.startswith(TIFF_SIGNATURES):
+            found = f"{len(data)} bytes of TIFF, cut off or with bands that Pillow does not read"
+            raise DecodeError("damaged image", found) from None
         found = f"{len(data)} bytes that begin with {data[:8]!r}"
         raise DecodeError("not an image", found) from None
     except Image.DecompressionBombError as error:

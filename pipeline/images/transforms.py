@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from PIL import Image
 
+from pipeline.core.arrays import Pixels
 from pipeline.core.records import View
-from pipeline.images.decode import Pixels
 
 Resizer = Literal["torch", "pillow"]
 """Whose antialiased bicubic. Torch's is several times as fast on a CPU with AVX2 and half as fast

@@ -8,8 +8,8 @@ from math import atan2, degrees
 import numpy as np
 import pytest
 
+from pipeline.core.arrays import Pixels
 from pipeline.core.records import View
-from pipeline.images.decode import Pixels
 from pipeline.images.transforms import Augmentation, augment, resize
 
 

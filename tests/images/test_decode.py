@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageOps
 
-from pipeline.images.decode import DecodeError, Pixels, decode
+from pipeline.core.arrays import Pixels
+from pipeline.images.decode import DecodeError, decode
 
 
 def noise(height: int = 37, width: int = 50) -> Pixels:

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from pipeline.images.decode import Pixels
+from pipeline.core.arrays import Pixels
 from pipeline.images.transforms import Resizer, preprocessing_name, resize
 
 ROOT = Path(__file__).parents[2]

@@ -29,9 +29,10 @@ from jobs.training.state import WorkerContext, initial_checkpoint
 from jobs.training.worker import train_worker
 from model.checkpoint import build_encoder, dumps, loads
 from model.errors import CheckpointError
+from pipeline.core.arrays import Pixels
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.progress import progress
-from pipeline.images.decode import DecodeError, Pixels, decode
+from pipeline.images.decode import DecodeError, decode
 from pipeline.shards.samples import read_samples
 
 

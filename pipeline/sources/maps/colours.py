@@ -14,9 +14,9 @@ import numpy.typing as npt
 from rasterio.enums import ColorInterp, MaskFlags, Resampling
 from rasterio.windows import Window as RasterWindow
 
-from pipeline.images.decode import Pixels
+from pipeline.core.arrays import Pixels
+from pipeline.images.stretch import stretch_of
 
-PERCENTILES = (2.0, 98.0)  # of the whole mosaic: the values that a stretch shows as black and white
 MAX_WHOLE_PIXELS = 4096
 "A mosaic, or its coarsest overview, whose longer side has no more pixels is sampled as a whole."
 SAMPLE_PIXELS = 1024  # longer side of that sample
@@ -77,7 +77,11 @@ def colours_of(
     else:
         if stretch is None:
             full = dtype == np.uint8  # of fewer bits
-            stretch = (0.0, 2.0**bits - 1) if full else _percentiles(dataset, bands)
+            stretch = (
+                (0.0, 2.0**bits - 1)
+                if full
+                else stretch_of(np.concatenate(list(sample_values(dataset, bands))))
+            )
         description = f"{dtype} stretched from {stretch[0]:.6g}..{stretch[1]:.6g}"
     if negative:
         description += ", white is zero"
@@ -95,22 +99,6 @@ def colours_of(
         one_mask=all(MaskFlags.per_dataset in flag for flag in flags),
         description=description,
     )
-
-
-def to_8bit(
-    values_BHW: npt.NDArray[Any], stretch: tuple[float, float] | None, negative: bool = False
-) -> Pixels:
-    """Values between the two of `stretch` linearly to 0..255, values beyond them clipped; NaN and
-    infinity are 0, before a negative is inverted.
-    """
-    if stretch is None:
-        shown_BHW = values_BHW.astype(np.uint8, copy=False)
-    else:
-        low, high = stretch
-        values_BHW = np.where(np.isfinite(values_BHW), values_BHW, low)
-        scaled_BHW = np.clip((values_BHW - low) * (255 / (high - low)), 0, 255)
-        shown_BHW = np.rint(scaled_BHW).astype(np.uint8)
-    return 255 - shown_BHW if negative else shown_BHW
 
 
 def _bands(dataset: Any, chosen: tuple[int, ...] | None) -> tuple[tuple[int, ...], str]:
@@ -161,18 +149,6 @@ def _palette(dataset: Any, band: int) -> Pixels:
     for index, colour in entries.items():
         palette_N3[index] = colour[:3]
     return palette_N3
-
-
-def _percentiles(dataset: Any, bands: tuple[int, ...]) -> tuple[float, float]:
-    """The stretch of a mosaic for which none was given; wide enough to divide by, and 0..1 where
-    the mosaic is all nodata.
-    """
-    values = np.concatenate(list(sample_values(dataset, bands)))
-    if not len(values):
-        return 0.0, 1.0
-    low, high = (float(value) for value in np.percentile(values, PERCENTILES))
-    least = low + 1 if values.dtype.kind in "iu" else np.nextafter(low, np.inf) + 1e-9
-    return low, max(high, least)
 
 
 def sample_values(dataset: Any, bands: tuple[int, ...]) -> Iterator[npt.NDArray[Any]]:

@@ -24,8 +24,10 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.windows import Window as RasterWindow
 
 from pipeline.core import storage
-from pipeline.images.decode import DecodeError, Pixels
-from pipeline.sources.maps.colours import Colours, UnknownColours, colours_of, to_8bit
+from pipeline.core.arrays import Pixels
+from pipeline.images.decode import DecodeError
+from pipeline.images.stretch import to_8bit
+from pipeline.sources.maps.colours import Colours, UnknownColours, colours_of
 from pipeline.sources.maps.tiles import Window
 
 Encoding = Literal["jpg", "png"]
