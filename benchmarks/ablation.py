@@ -127,15 +127,15 @@ def main() -> None:
     add("--scale", type=float, default=1.0, help="fraction of the locations: 300 towns, 1,000 real")
     args = parser.parse_args()
     out: Path = args.out.absolute()
-    towns, train, test_, distractors = (
-        max(2, round(args.scale * count)) for count in (300, 600, 300, 100)
-    )
+    # At least a batch of locations to train on.
+    towns, train = (max(16, round(args.scale * count)) for count in (300, 600))
+    queried, distractors = (max(2, round(args.scale * count)) for count in (300, 100))
     real = make_shards(
         out,
         "sensor" if args.other_sensor else "real",
         args.other_sensor,
         train_locations=train,
-        test_locations=test_,
+        test_locations=queried,
         distractors=distractors,
         views=12,
         textures=str(Path(args.textures).absolute()),

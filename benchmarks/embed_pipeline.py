@@ -38,8 +38,6 @@ from pipeline.shards.shard_set import ShardSet
 
 SOURCE_SIDE = 512
 "Side of the images in the tars, pixels: University-1652's."
-DISTINCT = 100
-"Distinct images; the tars repeat them."
 SHARDS = 6
 "Tars of a measured run."
 
@@ -215,10 +213,11 @@ def main() -> None:
     add("--decoders", type=int, default=1, help="threads that decode")
     add("--seconds", type=float, default=8.0, help="length of a measured run, roughly")
     add("--rounds", type=int, default=3, help="alternating rounds")
+    add("--distinct", type=int, default=100, help="distinct images, which the tars repeat")
     add("--few", type=int, default=1000, help="images of the memory baseline; 0: no memory run")
     args = parser.parse_args()
     cluster.connect()
-    images = jpegs(DISTINCT, SOURCE_SIDE, SOURCE_SIDE)
+    images = jpegs(args.distinct, SOURCE_SIDE, SOURCE_SIDE)
     measure_speed(args, images)
     if args.few:
         measure_memory(args, images)

@@ -21,7 +21,6 @@ import pyarrow.parquet as pq
 import ray
 import torch
 from embed_pipeline import (
-    DISTINCT,
     SOURCE_SIDE,
     checkpoint,
     encoder_spec,
@@ -127,6 +126,7 @@ def main() -> None:
     add("--size", type=int, default=256, help="side of its images, pixels")
     add("--batch", type=int, default=16, help="images of a batch")
     add("--images", type=int, default=64, help="images of a measured run; an even number")
+    add("--distinct", type=int, default=100, help="distinct images, which the run repeats")
     add("--rounds", type=int, default=2, help="alternating rounds")
     add("--threads", type=int, default=2, help="threads of the encoder")
     add("--precisions", nargs="+", default=["float32", "int8"], help="float32, int8")
@@ -134,7 +134,7 @@ def main() -> None:
     args = parser.parse_args()
     cluster.connect()
     torch.set_num_threads(args.threads)
-    distinct = jpegs(min(DISTINCT, args.images), SOURCE_SIDE, SOURCE_SIDE)
+    distinct = jpegs(min(args.distinct, args.images), SOURCE_SIDE, SOURCE_SIDE)
     images = [distinct[number % len(distinct)] for number in range(args.images)]
     weights = checkpoint(args.depth, args.size, width=args.width)
     with tempfile.TemporaryDirectory() as folder:

@@ -78,7 +78,7 @@ def prepare(args: argparse.Namespace) -> None:
         )
     )
     pack(University1652(), PackingSettings(root=flights, out=shards))
-    recipe = replace(smoke(epochs=args.epochs), hold_out=0.2)
+    recipe = replace(smoke(epochs=args.epochs), hold_out=args.hold_out)
     checkpoint = train(TrainSettings(recipe=recipe, shards=shards, out=run, workers=0))
     for split, view in ((Split.QUERY, View.DRONE), (Split.GALLERY, View.SATELLITE)):
         embedding = EmbeddingSettings(shards=shards, out=table, split=split, view=view)
@@ -243,6 +243,7 @@ def main() -> None:
     add("--textures", required=True, help="folder of overhead images, 0.3 m per pixel")
     add("--out", required=True, type=Path, help="folder of the artefacts and the diagram")
     add("--epochs", type=int, default=100, help="of training")
+    add("--hold-out", type=float, default=0.2, help="part of the places to calibrate by")
     add("--train-locations", type=int, default=500)
     add("--test-locations", type=int, default=200)
     add("--distractors", type=int, default=200)

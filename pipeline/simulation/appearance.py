@@ -1,8 +1,7 @@
-"""The look of a day: season, sun, shadows, sensor and haze. A World and a Day come in, a lit map
-goes out.
+"""Season, sun, shadows, sensor and haze: a World and a Day come in, a lit map goes out.
 
-The satellite passes on one day and the UAV flies on another, so that one place never looks the same
-twice.
+The satellite passes on one day and the UAV flies on another, so that the two views of a place never
+look the same.
 
 Letters: H, W pixels of the map; 3 red, green, blue; V 256 values of a byte.
 """
@@ -20,8 +19,8 @@ Season = Literal["spring", "summer", "autumn", "winter"]
 SEASONS: tuple[Season, ...] = ("spring", "summer", "autumn", "winter")
 Rgb = tuple[float, float, float]
 
-# Gains on the summer colours of grass and leaves; leaves of autumn go from the first to the second,
-# tree by tree.
+# Gains on the summer colours of grass and leaves; each tree's leaves have a gain between the first
+# and the second.
 GRASS_GAIN: dict[Season, Rgb] = {
     "spring": (0.95, 1.06, 0.90),
     "summer": (1.0, 1.0, 1.0),
@@ -42,19 +41,19 @@ class Day:
 
     season: Season = "summer"
     sun_azimuth_deg: float = 150.0
-    """Where the sun stands, clockwise from north."""
+    """Azimuth of the sun, clockwise from north."""
     sun_elevation_deg: float = 50.0
     shade: float = 0.42
-    """Light in a shadow relative to open sun: the sky's part."""
+    """Light in a shadow as a fraction of open sun: the light of the sky."""
     haze: float = 0.0
-    """Part of every pixel that is air, 0 to 1."""
+    """Fraction of every pixel's colour that is haze."""
     haze_colour: Rgb = (196, 206, 218)
     gain: Rgb = (1.0, 1.0, 1.0)
     """The sensor's gain per colour."""
     gamma: float = 1.0
     saturation: float = 1.0
     noise: float = 2.0
-    """Standard deviation of the sensor's noise, in steps of a byte."""
+    """Standard deviation of the sensor's noise, in byte values."""
 
     def __post_init__(self) -> None:
         if not 0 < self.sun_elevation_deg <= 90:
@@ -69,7 +68,7 @@ class Day:
         return flat * sin(azimuth), flat * cos(azimuth), sin(radians(self.sun_elevation_deg))
 
     def sky_light(self) -> FloatMap:
-        """Light of the sky alone, per colour: bluish. With `sun_light` it sums to about 1."""
+        """Light of the sky alone, per colour: bluish. Its sum with `sun_light` is about 1."""
         return np.asarray([self.shade * 0.92, self.shade * 1.0, self.shade * 1.14], np.float32)
 
     def sun_light(self) -> FloatMap:
@@ -80,7 +79,7 @@ class Day:
         )
 
     def curve_3V(self) -> ByteMap:
-        """Sensor and haze as one table per colour: byte in, byte out."""
+        """Sensor and haze as a lookup table per colour, from byte to byte."""
         value = np.arange(256, dtype=np.float32) / 255
         rows = []
         for gain, air in zip(self.gain, self.haze_colour, strict=True):
@@ -90,9 +89,7 @@ class Day:
 
 
 def sample_day(rng: np.random.Generator) -> Day:
-    """A day at random in a temperate, northern place: the sun stands in the southern half of the
-    sky.
-    """
+    """A random day in the temperate north: the sun is in the southern half of the sky."""
     season = SEASONS[int(rng.choice(4, p=[0.25, 0.40, 0.22, 0.13]))]
     low, high = {"spring": (34, 56), "summer": (40, 64), "autumn": (28, 46), "winter": (23, 34)}[
         season
@@ -118,15 +115,15 @@ def sample_day(rng: np.random.Generator) -> Day:
 
 @dataclass(frozen=True, kw_only=True)
 class LitMap:
-    """A world's colours on one day, before the sensor, and how high its shadows reach."""
+    """A world's colours on one day, before the sensor, and the height of its shadows."""
 
     colour_HW3: ByteMap
     shadow_top_HW: FloatMap
-    """Metres: what lies lower at this pixel is in shadow."""
+    """Metres: surfaces below this height are in shadow at this pixel."""
 
 
 def light_world(world: World, day: Day) -> LitMap:
-    """Dress the world for the season, light it and cast its shadows."""
+    """Apply the season, light the world and cast its shadows."""
     colour_HW3 = _apply_season(world, day.season)
     if world.light_is_baked and not world.height_HW.any():
         shadow_top_HW = np.zeros_like(world.height_HW)
@@ -151,13 +148,13 @@ def light_world(world: World, day: Day) -> LitMap:
 
 
 def _apply_season(world: World, season: Season) -> FloatMap:
-    """Colours with grass and leaves as the season has them."""
+    """Colours with the season's grass and leaves."""
     colour_HW3 = world.texture_HW3.astype(np.float32)
     if season == "summer":
         return colour_HW3
     grass_HW = world.grass_HW.astype(np.float32) / 255
     trees_HW = world.trees_HW.astype(np.float32) / 255
-    # Trees carry 0.75 to 1: the part above 0.75 tells one tree's autumn from the next one's.
+    # Trees have 0.75 to 1: the part above 0.75 is how far a tree's leaves have turned.
     turned_HW = np.clip((trees_HW - 0.75) * 4, 0, 1)
     early, late = LEAF_GAIN[season]
     for c in range(3):
@@ -169,9 +166,7 @@ def _apply_season(world: World, season: Season) -> FloatMap:
 
 
 def _slope_shading(world: World, day: Day) -> FloatMap:
-    """Sunlight on roofs and crowns by their slope, 1 on flat ground. Walls are no slopes and count
-    as flat.
-    """
+    """Sunlight on roofs and crowns by their slope, 1 on flat ground; walls count as flat."""
     span = np.float32(2 * world.metres_per_pixel)
     east_HW, south_HW = np.zeros_like(world.height_HW), np.zeros_like(world.height_HW)
     east_HW[:, 1:-1] = (world.height_HW[:, 2:] - world.height_HW[:, :-2]) / span
@@ -186,7 +181,7 @@ def _slope_shading(world: World, day: Day) -> FloatMap:
 
 
 def _sky_occlusion(world: World) -> FloatMap:
-    """How much of the sky the surroundings hide, 0 to 1, from the mean height around."""
+    """Fraction of the sky that the surroundings hide, estimated from the mean height around."""
     radius = max(1, round(3.5 / world.metres_per_pixel))
     around_HW = _box_mean(_box_mean(world.height_HW, radius).T, radius).T
     hidden: FloatMap = np.clip((around_HW - world.height_HW) / np.float32(6), 0, 1)
@@ -194,7 +189,7 @@ def _sky_occlusion(world: World) -> FloatMap:
 
 
 def _box_mean(map_HW: FloatMap, radius: int) -> FloatMap:
-    """Running mean over 2 * radius + 1 pixels down the columns."""
+    """Running mean down the columns, over 2 * radius + 1 pixels."""
     padded = np.pad(map_HW, ((radius + 1, radius), (0, 0)), mode="edge")
     total = np.cumsum(padded, axis=0, dtype=np.float64)
     mean: FloatMap = (

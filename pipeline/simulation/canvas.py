@@ -1,9 +1,8 @@
-"""The surface that towns are drawn on: colours, heights and plants of a square map, painted stamp
-by stamp.
+"""The canvas of a town: colours, heights and vegetation of a square map, painted stamp by stamp.
 
-A stamp is a small window of the map in the coordinates of the thing drawn there: u metres along it,
-v across it. So a house, a car and a tennis court are each a few lines of arithmetic, at any angle,
-at any resolution.
+A stamp is a small window of the map in the coordinates of the object drawn there: u metres along
+it, v across it. So a house, a car and a tennis court are each a few lines of arithmetic, at any
+angle, at any resolution.
 
 Letters: H, W pixels of the map; h, w pixels of a stamp's window; 3 red, green, blue.
 """
@@ -19,14 +18,12 @@ from pipeline.simulation.world import Facade, FloatMap, World
 Colour = tuple[float, float, float]
 
 GROUND, ROAD, BUILDING, PAVED, WATER = range(5)
-"""What covers a pixel: where a tree may stand and where a car may not."""
+"""Cover of a pixel: decides where trees and cars may be."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stamp:
-    """A window of the map (`rows`, `cols`) with the coordinates of its pixels in the frame of the
-    thing drawn.
-    """
+    """A window of the map (`rows`, `cols`), with its pixels' coordinates in the object's frame."""
 
     rows: slice
     cols: slice
@@ -37,9 +34,7 @@ class Stamp:
 
 
 class Canvas:
-    """Maps under construction; `finish` turns them into a World. Resolution never changes what is
-    drawn where.
-    """
+    """Maps being drawn, alike at every resolution; `finish` makes a World of them."""
 
     def __init__(
         self, *, extent_m: float, metres_per_pixel: float, ground: Colour, rng: np.random.Generator
@@ -62,28 +57,26 @@ class Canvas:
         self.x_W: FloatMap = axis - np.float32(extent_m / 2)
         self.y_H: FloatMap = np.float32(extent_m / 2) - axis
         self.lumps_HW = self.noise(rng, cell_m=1.6)
-        """Noise of the size of a branch or a stain, about -1 to 1."""
+        """Noise at the scale of a branch or a stain, about -1 to 1."""
         self.patches_HW = self.noise(rng, cell_m=9.0)
-        """Noise of the size of a worn lawn, about -1 to 1."""
+        """Noise at the scale of a worn lawn, about -1 to 1."""
 
     def noise(self, rng: np.random.Generator, *, cell_m: float) -> FloatMap:
-        """Smooth noise with features of `cell_m` metres; the same features at every resolution."""
+        """Smooth noise with features of `cell_m` metres, the same at every resolution."""
         cells = max(2, ceil(self.extent_m / cell_m))
         lattice = rng.standard_normal((cells + 1, cells + 1)).astype(np.float32)
         at = np.linspace(0, cells, self.pixels, dtype=np.float32)
         low = np.minimum(at.astype(np.int32), cells - 1)
         blend = at - low
         blend = blend * blend * (3 - 2 * blend)
-        # Not as a product of matrices: its last bit may depend on the number of threads.
+        # No matrix product: its last bit may depend on the number of threads.
         across = lattice[:, low] + blend * (lattice[:, low + 1] - lattice[:, low])
         field = across[low] + blend[:, None] * (across[low + 1] - across[low])
         smooth: FloatMap = np.clip(field * np.float32(0.8), -1.5, 1.5)
         return smooth
 
     def stamp(self, x: float, y: float, angle: float, half_u: float, half_v: float) -> Stamp | None:
-        """The window around a box of half sizes (metres) centred at (x, y); None where it is off
-        the map.
-        """
+        """The window around a box of half sizes (metres) at (x, y); None if it is off the map."""
         c, s = cos(angle), sin(angle)
         reach_x = abs(c) * half_u + abs(s) * half_v
         reach_y = abs(s) * half_u + abs(c) * half_v
@@ -106,9 +99,7 @@ class Canvas:
         )
 
     def coverage(self, inside_m_hw: FloatMap) -> FloatMap:
-        """Part of each pixel that a shape covers, from the signed distance (metres, positive
-        inside) to its edge.
-        """
+        """Fraction of each pixel in a shape, by its signed distance (metres, positive inside)."""
         covered: FloatMap = np.clip(
             inside_m_hw * np.float32(1 / self.metres_per_pixel) + np.float32(0.5), 0, 1
         )
@@ -123,9 +114,7 @@ class Canvas:
         cover: int | None = None,
         grass: float = 0.0,
     ) -> None:
-        """Lay a colour over the ground, seen through its coverage; `cover` says what it is, if that
-        changes.
-        """
+        """Blend a colour over the ground by its coverage; `cover` sets the pixels' cover."""
         at = (stamp.rows, stamp.cols)
         under = self.colour_HW3[at]
         under += coverage_hw[..., None] * (np.asarray(colour, np.float32) - under)
@@ -148,7 +137,7 @@ class Canvas:
         opacity: float = 1.0,
         corner_m: float = 0.0,
     ) -> None:
-        """Paint a flat rectangle with corners rounded by `corner_m`, soft at its edge."""
+        """Paint a flat rectangle with antialiased edges and corners rounded by `corner_m`."""
         stamp = self.stamp(x, y, angle, half_u, half_v)
         if stamp is None:
             return
@@ -186,19 +175,19 @@ class Canvas:
         self.paint(stamp, self.coverage(inside), colour, cover=cover, grass=grass)
 
     def covered_by(self, x: float, y: float) -> int | None:
-        """What covers the pixel at (x, y); None off the map."""
+        """Cover of the pixel at (x, y); None off the map."""
         col, row = self.pixel_of(x, y)
         if not (0 <= col < self.pixels and 0 <= row < self.pixels):
             return None
         return int(self.cover_HW[row, col])
 
     def pixel_of(self, x: float, y: float) -> tuple[int, int]:
-        """Column and row of the pixel at (x, y), perhaps off the map."""
+        """(column, row) of the pixel at (x, y), which may be off the map."""
         half = self.extent_m / 2
         return int((x + half) // self.metres_per_pixel), int((half - y) // self.metres_per_pixel)
 
     def finish(self, *, target_radius_m: float, rng: np.random.Generator) -> World:
-        """The World drawn so far, with the grain that every surface has."""
+        """The World drawn so far, with the grain of its surfaces."""
         grain = rng.standard_normal(self.height_HW.shape, dtype=np.float32) * np.float32(0.035)
         grain += self.lumps_HW * np.float32(0.03) + self.patches_HW * np.float32(0.03)
         grain += self.grass_HW * (

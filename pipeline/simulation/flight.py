@@ -1,7 +1,6 @@
-"""The flight around a building, as University-1652 flew it: a plan and a radius come in, camera
-poses go out.
+"""The flight around a building as in University-1652: a plan and a radius come in, poses go out.
 
-University-1652 tours each building in three turns while the altitude falls from 256 m to 121.5 m,
+University-1652 circles each building in three turns while the altitude falls from 256 m to 121.5 m,
 and keeps 54 views.
 """
 
@@ -13,9 +12,7 @@ UNIVERSITY_VIEWS = 54
 
 @dataclass(frozen=True, kw_only=True)
 class Pose:
-    """Where a camera is and looks; it never rolls. (0, 0) is the middle of the world, x east, y
-    north.
-    """
+    """Position and direction of a camera without roll; (0, 0) is the world's middle, y north."""
 
     x_m: float
     y_m: float
@@ -23,36 +20,31 @@ class Pose:
     heading_deg: float
     """Clockwise from north, 0 to 360."""
     pitch_deg: float
-    """Above the horizon: -90 looks straight down."""
+    """Angle above the horizon: -90 looks straight down."""
     fov_deg: float
-    """Angle across the frame, which is square."""
+    """Field of view across the frame, which is square."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlightPlan:
-    """A descending spiral that looks at the middle of the world all the way."""
+    """A descending spiral; the camera always looks at the middle of the world."""
 
     views: int = UNIVERSITY_VIEWS
-    """Pictures taken, evenly from the first to the last of University-1652's 54."""
+    """Number of images, evenly spaced from the first to the last of University-1652's 54."""
     turns: float = 3.0
-    """University-1652: three, 20 degrees from one view to the next; the last view stops one step
-    short.
-    """
+    """University-1652: three, 20 degrees between views; the last view is one step short."""
     altitude_start_m: float = 256.0
     """University-1652."""
     altitude_end_m: float = 121.5
     """University-1652."""
     depression_start_deg: float = 55.0
-    """How far below the horizon the camera looks at the start. Chosen: the data set does not tell.
-    """
+    """Camera angle below the horizon at the start. Chosen: the data set does not state it."""
     depression_end_deg: float = 45.0
-    """The same at the end. Chosen."""
+    """Camera angle below the horizon at the end. Chosen."""
     fill: float = 0.85
-    """Part of the last frame's width that the building's extent takes up. Chosen."""
+    """Fraction of the last frame's width that the building takes up. Chosen."""
     fov_min_deg: float = 24.0
-    """A smaller scene is flown lower instead of through a longer lens. Chosen: keeps perspective
-    visible.
-    """
+    """Smallest field of view: smaller scenes are flown lower. Chosen: keeps perspective visible."""
 
     def __post_init__(self) -> None:
         if self.views < 1:
@@ -64,13 +56,12 @@ class FlightPlan:
             )
         if not 0 < self.altitude_end_m <= self.altitude_start_m:
             raise ValueError(
-                f"altitudes {self.altitude_start_m} and {self.altitude_end_m} m: expected 0 < end <= start"
+                f"altitudes {self.altitude_start_m} and {self.altitude_end_m} m: "
+                "expected 0 < end <= start"
             )
 
     def lens(self, radius_m: float) -> tuple[float, float]:
-        """(field of view in degrees, scale of all altitudes) with which a scene of this radius
-        fills the last frame.
-        """
+        """(field of view in degrees, scale of altitudes): the radius then fills the last frame."""
         slant = self.altitude_end_m / sin(radians(self.depression_end_deg))
         half = atan(radius_m / (self.fill * slant))
         least = radians(self.fov_min_deg) / 2
@@ -79,7 +70,7 @@ class FlightPlan:
         return self.fov_min_deg, tan(half) / tan(least)
 
     def poses(self, *, radius_m: float, first_heading_deg: float = 0.0) -> list[Pose]:
-        """The views in order; the first looks along `first_heading_deg`."""
+        """Poses of the views in order; the first has the heading `first_heading_deg`."""
         fov, scale = self.lens(radius_m)
         flown = []
         for view in range(self.views):
@@ -90,8 +81,8 @@ class FlightPlan:
             down = self.depression_start_deg + done * (
                 self.depression_end_deg - self.depression_start_deg
             )
-            # Fewer views keep the ends, so their headings do not fall together as a third of three
-            # turns would.
+            # Fewer views keep both ends of the spiral: with one view per full turn, say, all would
+            # have the same heading.
             heading = (
                 first_heading_deg
                 + 360.0 * self.turns * (UNIVERSITY_VIEWS - 1) / UNIVERSITY_VIEWS * done

@@ -1,7 +1,7 @@
-"""One location's pictures in University-1652's folders, and the tables beside them.
+"""A location's images in University-1652's folders, and the tables of all locations.
 
-A folder of pictures appears whole, under its name; a part file, written last, says that the
-location is complete.
+A folder of images is published by renaming it, so it is complete when it appears; the part file,
+written last, marks the location as complete.
 """
 
 import csv
@@ -28,49 +28,49 @@ LAYOUT: dict[Role, tuple[str, ...]] = {
     "test": ("test/query_{view}", "test/gallery_{view}"),
     "distractor": ("test/gallery_{view}",),
 }
-"""Folders that hold a location's pictures: written to the first, linked from the others."""
+"""Folders of a location's images: written to the first, hard links in the others."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LocationJob:
-    """One location to be made by one task."""
+    """One location, rendered and written by one task."""
 
     root: str
     role: Role
-    order: LocationSpec
+    spec: LocationSpec
 
     @property
     def name(self) -> str:
-        return f"{self.order.location:04d}"
+        return f"{self.spec.location:04d}"
 
 
 def write_location(job: LocationJob) -> dict[str, float]:
-    """Take and place all pictures of a location, then its part file; seconds spent by step.
+    """Render and write a location's images, then its part file; seconds spent per step.
 
-    Whatever an earlier, broken attempt left of the location is replaced.
+    Replaces what an interrupted attempt has left of the location.
     """
-    taken = render_location(job.order)
+    images = render_location(job.spec)
     first, *others = LAYOUT[job.role]
     names = {
-        "satellite": {f"{job.name}.jpg": taken.satellite},
-        "drone": {f"image-{i:02d}.jpeg": data for i, data in enumerate(taken.drone, 1)},
+        "satellite": {f"{job.name}.jpg": images.satellite},
+        "drone": {f"image-{i:02d}.jpeg": data for i, data in enumerate(images.drone, 1)},
     }
     for view, files in names.items():
         folder = _create_hidden_folder(Path(job.root), first.format(view=view), job.name)
         for name, data in files.items():
             (folder / name).write_bytes(data)
-        home = _publish_folder(folder)
+        published = _publish_folder(folder)
         for other in others:
             folder = _create_hidden_folder(Path(job.root), other.format(view=view), job.name)
             for name in files:
-                _link_or_copy(home / name, folder / name)
+                _link_or_copy(published / name, folder / name)
             _publish_folder(folder)
-    json_files.write_checksummed(str(part_path(job)), {"poses": _pose_rows(job, taken)})
-    return taken.seconds
+    json_files.write_checksummed(str(part_path(job)), {"poses": _pose_rows(job, images)})
+    return images.seconds
 
 
 def _create_hidden_folder(root: Path, below: str, name: str) -> Path:
-    """An empty folder beside the one that it will become: hidden, so that readers pass it over."""
+    """An empty hidden folder beside its final path: readers skip hidden folders."""
     folder = root / below / f".{name}"
     if folder.exists():
         shutil.rmtree(folder)
@@ -79,11 +79,11 @@ def _create_hidden_folder(root: Path, below: str, name: str) -> Path:
 
 
 def _publish_folder(folder: Path) -> Path:
-    """Give the folder its name: all its pictures appear at once."""
-    home = folder.with_name(folder.name[1:])
-    if home.exists():
-        shutil.rmtree(home)
-    return folder.rename(home)
+    """Rename the folder to its final path: all its images appear at once."""
+    final = folder.with_name(folder.name[1:])
+    if final.exists():
+        shutil.rmtree(final)
+    return folder.rename(final)
 
 
 def _link_or_copy(file: Path, link: Path) -> None:
@@ -94,16 +94,16 @@ def _link_or_copy(file: Path, link: Path) -> None:
 
 
 def part_path(job: LocationJob) -> Path:
-    """The file that says that a location is complete."""
+    """The file whose presence means that a location is complete."""
     return Path(job.root) / ".parts" / f"{job.name}.json"
 
 
-def _pose_rows(job: LocationJob, taken: LocationImages) -> list[dict[str, Any]]:
-    """Rows of `poses.csv`: each picture under each of its paths."""
-    lat, lon = geotag(job.order.location)
+def _pose_rows(job: LocationJob, images: LocationImages) -> list[dict[str, Any]]:
+    """Rows of `poses.csv`: one per image and path, as hard links give an image two paths."""
+    lat, lon = geotag(job.spec.location)
     rows = []
     for folder in LAYOUT[job.role]:
-        for i, pose in enumerate(taken.poses, 1):
+        for i, pose in enumerate(images.poses, 1):
             camera_lat, camera_lon = offset_latlon(lat, lon, pose.x_m, pose.y_m)
             rows.append(
                 {
@@ -125,24 +125,25 @@ def _read_poses(path: Path) -> list[dict[str, Any]]:
         poses: list[dict[str, Any]] = json_files.read_checksummed(str(path))["poses"]
     except (KeyError, ValueError) as error:
         raise InputError(
-            f"{path} is damaged ({error!r}), expected the poses of a location; delete it and run jobs/simulate.py again"
+            f"{path} is damaged ({error!r}), expected the poses of a location; delete it and run "
+            "jobs/simulate.py again"
         ) from None
     return poses
 
 
 def write_tables(root: Path, jobs: list[LocationJob]) -> None:
-    """Write `locations.csv` and `poses.csv`, once all locations are there.
+    """Write `locations.csv` and `poses.csv` when all locations are complete.
 
-    Raises InputError where a location's part is not what was written.
+    Raises InputError if a location's part file is damaged.
     """
-    ordered = sorted(jobs, key=lambda job: job.order.location)
-    places = []
+    ordered = sorted(jobs, key=lambda job: job.spec.location)
+    locations = []
     for job in ordered:
-        lat, lon = geotag(job.order.location)
-        places.append({"location": job.name, "lat": f"{lat:.7f}", "lon": f"{lon:.7f}"})
+        lat, lon = geotag(job.spec.location)
+        locations.append({"location": job.name, "lat": f"{lat:.7f}", "lon": f"{lon:.7f}"})
     poses = [row for job in ordered for row in _read_poses(part_path(job))]
     for name, rows in (
-        ("locations.csv", places),
+        ("locations.csv", locations),
         ("poses.csv", sorted(poses, key=lambda row: str(row["path"]))),
     ):
         text = io.StringIO()

@@ -1,7 +1,6 @@
-"""Colours and facades that every town draws from: shared on purpose, so that no colour gives a
-location away.
+"""Colours and facades of all towns: shared, so that no colour identifies a location.
 
-sRGB, 0 to 255, as seen in even light.
+sRGB, 0 to 255, in even light.
 """
 
 import numpy as np
@@ -74,7 +73,7 @@ CARS: tuple[Colour, ...] = (
     (200, 198, 190),
     (90, 84, 74),
 )
-COURTS: tuple[tuple[Colour, Colour], ...] = (  # the court, and the ground around it
+COURTS: tuple[tuple[Colour, Colour], ...] = (  # (the court, the ground around it)
     ((70, 104, 92), (126, 72, 62)),
     ((72, 94, 128), (84, 116, 92)),
     ((150, 88, 70), (96, 116, 84)),
@@ -91,15 +90,15 @@ WALLS: tuple[Colour, ...] = (
     (120, 122, 126),
     (182, 140, 108),
 )
+WHITE: Colour = (222, 222, 214)
+"Colour of painted lines."
 GLASS: tuple[Colour, ...] = ((58, 70, 82), (72, 90, 100), (46, 54, 60), (92, 112, 122))
 
 
 def pick_colour(
     rng: np.random.Generator, colours: tuple[Colour, ...], *, spread: float = 7.0
 ) -> Colour:
-    """One of the colours, a little lighter or darker and a little off in hue, as paint and weather
-    make it.
-    """
+    """One of the colours with slightly varied lightness and hue, as paint and weather vary it."""
     r, g, b = colours[int(rng.integers(len(colours)))]
     light = float(rng.normal(0, spread))
     hue = rng.normal(0, spread * 0.2, 3)
@@ -107,7 +106,7 @@ def pick_colour(
 
 
 def scale_brightness(colour: Colour, factor: float) -> Colour:
-    """The colour, lighter (factor above 1) or darker."""
+    """The colour made lighter (factor above 1) or darker."""
     return (
         min(250.0, colour[0] * factor),
         min(250.0, colour[1] * factor),
@@ -116,9 +115,7 @@ def scale_brightness(colour: Colour, factor: float) -> Colour:
 
 
 def random_facade(rng: np.random.Generator, *, kind: str) -> Facade:
-    """A facade of a kind: "house", "hall" (few windows), or "block" (punched, ribbon or curtain
-    windows).
-    """
+    """A facade of a kind: "house", "hall" (few windows) or "block" (punched, ribbon or curtain)."""
     wall, glass = pick_colour(rng, WALLS), pick_colour(rng, GLASS)
     if kind == "house":
         return Facade(wall=wall, glass=glass, storey_m=2.9, bay_m=float(rng.uniform(2.6, 4.2)),

@@ -1,9 +1,8 @@
-"""Pictures of a world on a day: straight down as a satellite sees it, or in perspective as a UAV
-does.
+"""Images of a world on one day: straight down like a satellite, or in perspective like a UAV.
 
-A ray is a line in the height z: its column and row on the map are `a + b * z`. So all rays of a
-frame go down together, in steps of one map pixel, from just above what a coarse map of maxima says
-can be hit; three halvings then find where.
+A ray is a line in the height z: its column and row on the map are `a + b * z`. All rays of a frame
+descend together, in steps of one map pixel, from just above the highest surface that a coarse map
+of maxima allows; three bisections then locate the hit.
 
 Letters: H, W pixels of the padded map; h, w its coarse maxima; N rays along a side of the frame; S
 pixels along it; 3 red, green, blue; K facades.
@@ -22,25 +21,29 @@ from pipeline.simulation.world import ByteMap, FloatMap
 RAYS_PER_PIXEL = 2
 """Rays along each side of a pixel: 4 in all, averaged."""
 BUNDLE_SIDE = 4
-"""Rays along a side of the bundle that starts together; its footprint has to stay within a coarse
-cell.
-"""
+"""Rays along a side of a bundle that starts together; its footprint has to fit a coarse cell."""
 BAND_RAYS = 65_536
-"""Rays of a band: a dozen arrays of them fit a core's cache."""
+"""Rays of a band: a dozen arrays of this size fit a core's cache."""
 BUNDLE_STEP_PX = 3.0
-"""Map pixels that a bundle goes between two looks at the coarse map."""
+"""Map pixels between two lookups of a bundle in the coarse map."""
 WALL_DEPTH_M = 0.35
-"""A ray that meets the surface this far below its top has met a wall."""
+"""A hit so far below the surface's top is on a wall."""
 
 Indices = NDArray[np.int32]
 
 
-def render_nadir(scene: Scene, *, size: int, half_m: float, shift_m: tuple[float, float] = (0.0, 0.0), turn_deg: float = 0.0,
-          rng: np.random.Generator | None = None) -> ByteMap:  # fmt: skip
-    """A square of side 2 * half_m metres around `shift_m` seen from straight above, (S, S, 3);
-    north is up.
+def render_nadir(
+    scene: Scene,
+    *,
+    size: int,
+    half_m: float,
+    shift_m: tuple[float, float] = (0.0, 0.0),
+    turn_deg: float = 0.0,
+    rng: np.random.Generator | None = None,
+) -> ByteMap:
+    """A square of side 2 * half_m metres around `shift_m` from straight above, (S, S, 3), north up.
 
-    `turn_deg` turns the picture clockwise. With `rng`, the sensor adds its noise.
+    `turn_deg` turns the image clockwise. With `rng`, the sensor adds noise.
     """
     n = size * RAYS_PER_PIXEL
     mpp = scene.metres_per_pixel
@@ -57,12 +60,10 @@ def render_nadir(scene: Scene, *, size: int, half_m: float, shift_m: tuple[float
 def render_perspective(
     scene: Scene, pose: Pose, *, size: int, rng: np.random.Generator | None = None
 ) -> ByteMap:
-    """The frame (S, S, 3) that a pinhole camera at `pose` takes. With `rng`, the sensor adds its
-    noise.
-    """
+    """The frame (S, S, 3) of a pinhole camera at `pose`. With `rng`, the sensor adds noise."""
     n = size * RAYS_PER_PIXEL
-    # Bands of rows, whole bundles high, whose arrays stay in the processor's cache: half the time
-    # of one go.
+    # Bands of rows, a multiple of a bundle high, whose arrays stay in the processor's cache: half
+    # the time of all rows at once.
     band = max(BUNDLE_SIDE, BAND_RAYS // n // BUNDLE_SIDE * BUNDLE_SIDE)
     seen_NN = np.empty((n, n), np.uint32)
     for first in range(0, n, band):
@@ -74,7 +75,7 @@ def render_perspective(
 def _trace_band(
     scene: Scene, rays: tuple[FloatMap, FloatMap, FloatMap, FloatMap]
 ) -> NDArray[np.uint32]:
-    """Packed colours that the rays of a band meet."""
+    """Packed colours at the hits of a band's rays."""
     col_a, col_b, row_a, row_b = rays
     fall = 1 / np.sqrt(col_b * col_b + row_b * row_b)  # metres down per map pixel along
     z = _bundle_start(scene, col_a, col_b, row_a, row_b, fall)
@@ -108,22 +109,20 @@ def _trace_band(
 def _rays(
     scene: Scene, pose: Pose, n: int, rows: slice
 ) -> tuple[FloatMap, FloatMap, FloatMap, FloatMap]:
-    """(col_a, col_b, row_a, row_b) of a band: a ray at height z is over column col_a + col_b * z,
-    and row alike.
-    """
+    """(col_a, col_b, row_a, row_b) of a band: at height z a ray is at column col_a + col_b * z."""
     axis = ((np.arange(n, dtype=np.float32) + np.float32(0.5)) / n * 2 - 1) * np.float32(
         tan(radians(pose.fov_deg) / 2)
     )
     heading, pitch = radians(pose.heading_deg), radians(pose.pitch_deg)
     up = -axis[rows, None]
-    ahead = np.float32(cos(pitch)) - up * np.float32(sin(pitch))
+    level = np.float32(cos(pitch)) - up * np.float32(sin(pitch))
     down = np.float32(sin(pitch)) + up * np.float32(cos(pitch))
     if float(down.max()) >= -0.05:
         raise ValueError(
-            f"pitch {pose.pitch_deg} with a field of view of {pose.fov_deg} degrees sees the horizon: "
-            "look further down or narrow the lens"
+            f"pitch {pose.pitch_deg} with a field of view of {pose.fov_deg} degrees sees the "
+            "horizon: look further down or narrow the lens"
         )
-    forward, side = ahead / down, axis[None, :] / down
+    forward, side = level / down, axis[None, :] / down
     east = np.float32(sin(heading)) * forward + np.float32(cos(heading)) * side
     north = np.float32(cos(heading)) * forward - np.float32(sin(heading)) * side
     per_m = np.float32(1 / scene.metres_per_pixel)
@@ -136,7 +135,7 @@ def _rays(
 def _bundle_start(
     scene: Scene, col_a: FloatMap, col_b: FloatMap, row_a: FloatMap, row_b: FloatMap, fall: FloatMap
 ) -> FloatMap:
-    """Heights at which the rays start: low, yet above anything that any ray of the bundle can meet."""
+    """Start heights of the rays: low, but above any surface that a ray of the bundle can hit."""
     top = np.float32(scene.height_HW.max() + 0.01)
     spread = _footprint(col_a, row_a)
     bundle = BUNDLE_SIDE if spread * BUNDLE_SIDE / 2 + BUNDLE_STEP_PX <= COARSE_CELL_PX else 1
@@ -162,9 +161,7 @@ def _bundle_start(
 
 
 def _footprint(col_a: FloatMap, row_a: FloatMap) -> float:
-    """The longest distance on the ground between neighbouring rays, map pixels: at the far corners
-    of the frame.
-    """
+    """Longest ground distance between neighbouring rays, map pixels: at the frame's far corners."""
     return max(
         float(np.hypot(col_a[r, c] - col_a[r + 1, c + 1], row_a[r, c] - row_a[r + 1, c + 1]))
         for r in (0, -2)
@@ -189,7 +186,7 @@ def _march(
     while True:
         ca, cb, ra, rb, step = rays
         for _ in range(3):
-            # A ray that has met something does not move, and meets it again: no mask is needed.
+            # A ray that has hit a surface stays and hits it again: no mask is needed.
             lower = now - step
             free = (
                 height_HW.take(_flat_indices(ra + rb * lower, ca + cb * lower, width), mode="clip")
@@ -221,9 +218,7 @@ def _march(
 
 
 def _flat_indices(rows: FloatMap, cols: FloatMap, width: int) -> Indices:
-    """Flat indices of map positions; positions beyond the padding end up on some other pixel, which
-    nobody minds.
-    """
+    """Flat indices of map positions; positions beyond the padding wrap to other pixels."""
     cells: Indices = rows.astype(np.int32)
     cells *= np.int32(width)
     cells += cols.astype(np.int32)
@@ -234,7 +229,7 @@ def _apply_sensor(
     scene: Scene, packed_NN: NDArray[np.uint32], rng: np.random.Generator | None
 ) -> ByteMap:
     """Average the rays of each pixel, add the sensor's noise and apply its curve: (S, S, 3)."""
-    # Red and blue are summed in one number: four bytes' sum fits in the 16 bits between them.
+    # Red and blue are summed in one number: the sum of four bytes fits the 16 bits between them.
     odd = packed_NN & np.uint32(0x00FF00FF)
     even = (packed_NN >> np.uint32(8)) & np.uint32(0xFF)
     odd = odd[0::2] + odd[1::2]
@@ -255,8 +250,8 @@ def _apply_sensor(
 
 
 def _noise(rng: np.random.Generator, size: int, strength: float) -> NDArray[np.int16]:
-    """Noise (S, S) of about the given standard deviation: a sum of bits, several times cheaper than
-    a normal law.
+    """Noise (S, S) of about this standard deviation: a sum of bytes, several times cheaper than
+    normal deviates.
     """
     raw = np.frombuffer(rng.bytes(size * size * 4), np.uint8).reshape(4, size, size)
     # Four uniform bytes have a standard deviation of 2 * 256 / sqrt(12) = 147.8.

@@ -1,5 +1,4 @@
-"""A world on a day, laid out for the renderer: lit, packed, padded by its mirror image, with coarse
-maxima.
+"""A world on one day, prepared for the renderer: lit, packed, mirror-padded, with coarse maxima.
 
 Letters: H, W pixels of the padded map; h, w its coarse maxima.
 """
@@ -18,16 +17,14 @@ from pipeline.simulation.world import ByteMap, FloatMap, World
 Number = TypeVar("Number", bound=np.generic)
 
 REACH_IN_RADII = 4.5
-"""How far from the middle a frame of the default flight can see, in target radii."""
+"""Distance from the middle that a frame of the default flight shows, in target radii."""
 COARSE_CELL_PX = 8
-"""Map pixels along a side of a cell of the coarse map."""
+"""Side of a cell of the coarse map, map pixels."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """A world on a day, laid out for the renderer: padded by its mirror image, colours packed into
-    one number.
-    """
+    """A world on one day, padded by its mirror image, each colour packed into one number."""
 
     packed_HW: NDArray[np.uint32]
     height_HW: FloatMap
@@ -45,14 +42,14 @@ class Scene:
 
 
 def prepare_scene(world: World, day: Day) -> Scene:
-    """Light the world and lay it out; done once per day, used for every frame of it."""
+    """Light the world and lay out its maps; once per day, for every frame of it."""
     lit = light_world(world, day)
     side = world.height_HW.shape[0]
     pad = max(
         2 * COARSE_CELL_PX,
         ceil(REACH_IN_RADII * world.target_radius_m / world.metres_per_pixel - side / 2),
     )
-    # The coarse map needs whole cells.
+    # The coarse map needs a multiple of its cell.
     extra = -(side + 2 * pad) % COARSE_CELL_PX
     widths = ((pad, pad + extra), (pad, pad + extra))
 
@@ -72,7 +69,7 @@ def prepare_scene(world: World, day: Day) -> Scene:
         facade_HW=padded(world.facade_HW),
         along_HW=padded(world.along_HW),
         facing_HW=padded(world.facing_HW),
-        facades=FacadeTable.of(world.facades_K),
+        facades=FacadeTable.from_facades(world.facades_K),
         origin=side / 2 + pad,
         metres_per_pixel=world.metres_per_pixel,
         day=day,
@@ -81,7 +78,7 @@ def prepare_scene(world: World, day: Day) -> Scene:
 
 
 def _coarse_maxima(height_HW: FloatMap) -> FloatMap:
-    """Per cell the highest point of it and of its eight neighbours."""
+    """Per cell the maximum over it and its eight neighbours."""
     h, w = height_HW.shape[0] // COARSE_CELL_PX, height_HW.shape[1] // COARSE_CELL_PX
     cells = height_HW.reshape(h, COARSE_CELL_PX, w, COARSE_CELL_PX).max(axis=(1, 3))
     edged = np.pad(cells, 1, mode="edge")

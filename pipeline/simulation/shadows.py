@@ -1,5 +1,4 @@
-"""Cast shadows: a height map and a direction to the sun come in, the height that the shade reaches
-comes out.
+"""Cast shadows: a height map and the sun's direction come in, the shadows' heights go out.
 
 Letters: H, W pixels of the map.
 """
@@ -12,15 +11,15 @@ from pipeline.simulation.world import FloatMap
 def cast_shadows(
     height_HW: FloatMap, metres_per_pixel: float, *, toward_sun: tuple[float, float, float]
 ) -> FloatMap:
-    """Height (metres) below which each pixel is in shadow: the highest obstacle toward the sun,
-    less the sun's descent.
+    """Height (metres) below which each pixel is in shadow.
 
-    `toward_sun` is the unit vector (east, north, up) to it. The march goes in steps that double, so that a shadow of n
-    pixels costs log2(n) passes over the map.
+    That is the maximum over all obstacles toward the sun of their height less the sun's descent.
+    `toward_sun` is the unit vector (east, north, up) to the sun. The march doubles its steps, so
+    that a shadow of n pixels costs log2(n) passes over the map.
     """
     east, north, up = toward_sun
     reach = max(abs(east), abs(north))
-    if reach < 1e-6:  # the sun stands overhead
+    if reach < 1e-6:  # the sun is overhead
         return np.zeros_like(height_HW)
     step_cols, step_rows = east / reach, -north / reach
     drop = metres_per_pixel * up / reach
@@ -38,8 +37,9 @@ def cast_shadows(
 
 
 def _shift_subpixel(map_HW: FloatMap, rows: float, cols: float) -> FloatMap:
-    """The map as seen from `rows` down and `cols` right; one of the two is whole, the other is
-    blended. 0 beyond.
+    """The map shifted by `rows` down and `cols` right, 0 beyond its edge.
+
+    One of the two is an integer; the other is interpolated.
     """
     low_r, low_c = int(np.floor(rows + 1e-6)), int(np.floor(cols + 1e-6))
     part_r, part_c = rows - low_r, cols - low_c

@@ -1,15 +1,16 @@
-"""Simulated flights: settings come in, a made data set in University-1652's layout goes out.
+"""The simulation stage: settings come in, a data set in University-1652's layout goes out.
 
-    train/{satellite,drone}/<id>/              locations to learn from
-    test/query_{satellite,drone}/<id>/         the test's queries
-    test/gallery_{satellite,drone}/<id>/       the same pictures again, and those of the distractors
+    train/{satellite,drone}/<id>/              locations to train on
+    test/query_{satellite,drone}/<id>/         the queries of the test
+    test/gallery_{satellite,drone}/<id>/       the same images again, and those of the distractors
     locations.csv                              location, lat, lon
-    poses.csv                                  one row per UAV picture: its path, and where and how it was taken
-    simulation.json                            the settings; written last: where it is, the data set is complete
+    poses.csv                                  one row per UAV image: its path and its camera pose
+    simulation.json                            the settings; written last, so its presence means
+                                               that the data set is complete
 
-A location is one Ray task. It leaves `.parts/<id>.json` when all its pictures are in place, so a
-run that was stopped goes on where it was. Pictures are written to a local or mounted path, since
-galleries share files with queries.
+Each location is one Ray task. The task writes `.parts/<id>.json` after all images of its location,
+so a rerun resumes with the missing locations. The output is a local or mounted path, because the
+galleries hold hard links to the queries' files.
 """
 
 import hashlib
@@ -34,47 +35,45 @@ from pipeline.simulation.texture import usable_textures
 
 @locks_output(lambda settings: settings.out)
 def simulate(settings: SimulationSettings) -> Path:
-    """Make the data set, or what is missing of it; its folder.
+    """Write the data set, or its missing locations; the folder.
 
-    Raises InputError for textures that do not suffice and for a folder that holds something else.
+    Raises InputError for too few textures, and for a folder that holds something else.
     """
     if not storage.is_local(settings.out):
         raise InputError(
-            f"--out is {settings.out}; expected a local or mounted folder; make it there and copy it"
+            f"--out is {settings.out}, expected a local or mounted folder; "
+            "write it there and copy it"
         )
     root = Path(storage.resolve(settings.out)[1]).absolute()
-    # Tasks may run in another working directory, so they are given whole paths.
-    textures, passed_over = (
+    # Absolute paths: tasks may run in another working directory.
+    textures, skipped = (
         usable_textures(storage.absolute(settings.textures)) if settings.textures else ([], 0)
     )
-    described = _settings_metadata(settings, textures)
-    if _is_complete(root, described):
-        shutil.rmtree(
-            root / ".parts", ignore_errors=True
-        )  # of a run that was killed between its last two steps
+    metadata = _settings_metadata(settings, textures)
+    if _is_complete(root, metadata):
+        # A run that was killed between its last two steps leaves its parts.
+        shutil.rmtree(root / ".parts", ignore_errors=True)
         console.print(f"{root} is complete already; nothing to do")
         return root
     jobs = plan_jobs(settings, str(root), textures)
-    if passed_over:
-        console.print(
-            f"{settings.textures}: {passed_over} files are no usable images and were passed over"
-        )
+    if skipped:
+        console.print(f"{settings.textures}: skipped {skipped} files that are no usable images")
     (root / ".parts").mkdir(parents=True, exist_ok=True)
-    json_files.write_checksummed(str(root / ".parts" / "settings.json"), described)
-    todo = [job for job in jobs if not part_path(job).exists()]
-    spent = _run_jobs(todo, len(jobs), settings.views + 1)
+    json_files.write_checksummed(str(root / ".parts" / "settings.json"), metadata)
+    missing = [job for job in jobs if not part_path(job).exists()]
+    seconds = _run_jobs(missing, len(jobs), settings.views + 1)
     write_tables(root, jobs)
-    json_files.write_checksummed(str(root / "simulation.json"), described)
+    json_files.write_checksummed(str(root / "simulation.json"), metadata)
     shutil.rmtree(root / ".parts")
-    share = ", ".join(f"{step} {seconds:.1f} s" for step, seconds in spent.items())
-    console.print(f"{root}: {len(jobs)} locations ({share or 'all were there'}, over all cores)")
+    shares = ", ".join(f"{step} {spent:.1f} s" for step, spent in seconds.items())
+    console.print(
+        f"{root}: {len(jobs)} locations ({shares or 'all existed already'}, over all cores)"
+    )
     return root
 
 
 def plan_jobs(settings: SimulationSettings, root: str, textures: list[str]) -> list[LocationJob]:
-    """One job per location. Numbers are dealt out at random, so that they say nothing about the
-    role.
-    """
+    """One job per location; random numbers, so that a location's number does not tell its role."""
     roles: list[Role] = ["train"] * settings.train_locations
     roles += ["test"] * settings.test_locations
     roles += ["distractor"] * settings.distractors
@@ -85,17 +84,19 @@ def plan_jobs(settings: SimulationSettings, root: str, textures: list[str]) -> l
         )
     rng = np.random.default_rng([settings.seed, 0])
     numbers = rng.permutation(len(roles)) + 1
-    dealt = rng.permutation(len(textures)) if textures else None
+    texture_order = rng.permutation(len(textures)) if textures else None
     return [
         LocationJob(
             root=root,
             role=role,
-            order=LocationSpec(
+            spec=LocationSpec(
                 seed=settings.seed,
                 location=int(number),
                 views=settings.views,
                 size=settings.size,
-                texture=None if dealt is None else textures[int(dealt[int(number) - 1])],
+                texture=(
+                    None if texture_order is None else textures[int(texture_order[int(number) - 1])]
+                ),
                 texture_metres_per_pixel=settings.texture_metres_per_pixel,
             ),
         )
@@ -103,64 +104,64 @@ def plan_jobs(settings: SimulationSettings, root: str, textures: list[str]) -> l
     ]
 
 
-def _run_jobs(todo: list[LocationJob], total: int, pictures: int) -> Counter[str]:
-    """Run the jobs over the cluster; seconds spent by step, over all of them."""
+def _run_jobs(missing: list[LocationJob], total: int, images: int) -> Counter[str]:
+    """Run the jobs on the cluster; seconds spent per step, summed over all jobs."""
     spent: Counter[str] = Counter()
-    if not todo:
+    if not missing:
         return spent
     cluster.connect()
     task = ray.remote(num_cpus=1)(write_location)
-    with progress(len(todo) * pictures, "simulate", "images") as meter:
-        if len(todo) < total:
-            meter.note(f"{total - len(todo)} of {total} locations are there already")
-        for _, seconds in cluster.bounded_map(task.remote, todo, window=2 * cluster.cpus()):
+    with progress(len(missing) * images, "simulate", "images") as meter:
+        if len(missing) < total:
+            meter.note(f"{total - len(missing)} of {total} locations exist already")
+        for _, seconds in cluster.bounded_map(task.remote, missing, window=2 * cluster.cpus()):
             spent.update(seconds)
-            meter.advance(pictures)
+            meter.advance(images)
     return spent
 
 
 def _settings_metadata(settings: SimulationSettings, textures: list[str]) -> dict[str, Any]:
-    """What the data set depends on; where it lies, and where its textures lie, is no part of it."""
-    described = {
+    """The settings that determine the data set's content: without its and the textures' folder."""
+    metadata = {
         name: value for name, value in asdict(settings).items() if name not in ("out", "textures")
     }
     if settings.textures:
-        names = "\n".join(
-            str(Path(path).relative_to(storage.absolute(settings.textures))) for path in textures
-        )
-        described["textures"] = (
-            f"{len(textures)} images, {hashlib.sha256(names.encode()).hexdigest()[:16]}"
-        )
-    return described
+        folder = storage.absolute(settings.textures)
+        names = "\n".join(str(Path(path).relative_to(folder)) for path in textures)
+        digest = hashlib.sha256(names.encode()).hexdigest()[:16]
+        metadata["textures"] = f"{len(textures)} images, {digest}"
+    return metadata
 
 
-def _is_complete(root: Path, described: dict[str, Any]) -> bool:
-    """Whether this very data set is there.
+def _is_complete(root: Path, metadata: dict[str, Any]) -> bool:
+    """Whether the folder holds the complete data set of these settings.
 
-    Raises InputError when the folder holds another one, or something else.
+    Raises InputError if the folder holds another data set, or something else.
     """
-    complete, begun = root / "simulation.json", root / ".parts" / "settings.json"
-    there = complete if complete.exists() else begun
-    if not there.exists():
+    complete, started = root / "simulation.json", root / ".parts" / "settings.json"
+    path = complete if complete.exists() else started
+    if not path.exists():
         if root.exists() and any(root.iterdir()):
             raise InputError(
-                f"{root} holds files that no simulation wrote; expected a new or empty folder; choose another --out"
+                f"{root} holds files that no simulation wrote, expected a new or empty folder; "
+                "choose another --out"
             )
         return False
     try:
-        found = json_files.read_checksummed(str(there))
+        found = json_files.read_checksummed(str(path))
     except ValueError as error:
         raise InputError(
-            f"{there} is damaged ({error}), expected the settings of a simulation; remove {root} and run jobs/simulate.py again"
+            f"{path} is damaged ({error}), expected the settings of a simulation; "
+            f"remove {root} and run jobs/simulate.py again"
         ) from None
-    other = [
-        f"{name} {found.get(name)!r} instead of {described.get(name)!r}"
-        for name in sorted({*found, *described})
-        if found.get(name) != described.get(name)
+    differing = [
+        f"{name} {found.get(name)!r} instead of {metadata.get(name)!r}"
+        for name in sorted({*found, *metadata})
+        if found.get(name) != metadata.get(name)
     ]
-    if other:
+    if differing:
         raise InputError(
-            f"{root} holds a data set made with {', '.join(other)}; expected the same settings to go on; "
-            "choose another --out or remove the folder"
+            f"{root} holds a data set made with {', '.join(differing)}, expected the same settings "
+            "to resume; choose another --out or remove the folder"
         )
-    return there == complete
+    return path == complete

@@ -1,9 +1,9 @@
-"""Worlds from real overhead images: a picture comes in, flat ground with its colours goes out.
+"""Worlds from real overhead images: an image comes in, flat ground with its colours goes out.
 
-The picture's middle square is taken. Beside `quad.jpg` there may lie `quad.height.npy`: a
-two-dimensional array of metres above the ground that covers the whole picture, of any resolution;
-without it the ground is flat. Sun and shadows stay as the picture has them; season, sensor and haze
-change with the day.
+The image's middle square is used. Beside `quad.jpg` there may be `quad.height.npy`: a
+two-dimensional array of metres above the ground that covers the whole image, at any resolution;
+without it the ground is flat. Sun and shadows stay as in the image; season, sensor and haze change
+with the day.
 
 Letters: H, W pixels of the map; 3 red, green, blue.
 """
@@ -21,23 +21,21 @@ from pipeline.simulation.world import FloatMap, World
 
 TEXTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 DECODE_ERRORS = (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError)
-"""What Pillow raises for files that are no pictures, or broken, or absurdly large ones."""
+"""Pillow's errors for files that are no images, damaged, or absurdly large."""
 MIN_SIDE_PX = 64
-"""Shorter sides hold too little to fly over."""
+"""Images with a shorter side show too little to fly over."""
 RADIUS_FRACTION = 0.21
-"""Target radius as a part of the picture's side: the satellite view stays on it, and most of the
-first UAV frame.
+"""Target radius as a fraction of the image's side: the satellite view, and most of the first UAV
+frame, stay inside the image.
 """
 FLIGHT_OVER_TEXTURE = FlightPlan(depression_start_deg=65.0, depression_end_deg=55.0)
-"""Steeper than over towns: a picture of flat ground has no facades to show and an edge to stay away
-from.
-"""
+"""Steeper than over towns: flat ground shows no facades, and the image's edge is near."""
 
 
 def usable_textures(folder: str) -> tuple[list[str], int]:
-    """(images that can serve as ground, sorted by path; how many files were passed over).
+    """(usable images sorted by path, number of skipped files).
 
-    Raises InputError when the folder is missing or holds no such image.
+    Raises InputError if the folder is missing or holds no usable image.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -50,8 +48,9 @@ def usable_textures(folder: str) -> tuple[list[str], int]:
     usable = [str(path) for path in files if _is_usable(path)]
     if not usable:
         raise InputError(
-            f"{folder} holds {len(files)} files and none is an image of at least {MIN_SIDE_PX} pixels a side; "
-            f"expected overhead images ({', '.join(TEXTURE_SUFFIXES)}); check --textures"
+            f"{folder} holds {len(files)} files and none is an image of at least {MIN_SIDE_PX} "
+            f"pixels a side; expected overhead images ({', '.join(TEXTURE_SUFFIXES)}); "
+            "check --textures"
         )
     return usable, len(files) - len(usable)
 
@@ -62,8 +61,8 @@ def _is_usable(path: Path) -> bool:
     try:
         with Image.open(path, formats=PILLOW_FORMATS) as image:
             least = min(image.size)
-            # A truncated file shows only when it is decoded; a JPEG at an eighth of its size shows
-            # it as well.
+            # Truncation shows only in decoding; for a JPEG, decoding at an eighth of its size is
+            # enough.
             image.draft("RGB", (MIN_SIDE_PX, MIN_SIDE_PX))
             image.load()
     except DECODE_ERRORS:
@@ -72,9 +71,9 @@ def _is_usable(path: Path) -> bool:
 
 
 def textured_world(path: str, *, metres_per_pixel: float, frame_pixels: int = 256) -> World:
-    """The world that a picture shows, as fine as frames of `frame_pixels` need.
+    """The world of one image, with the detail that frames of `frame_pixels` need.
 
-    `metres_per_pixel` is the picture's own. Raises InputError for a picture or height map that cannot be read.
+    `metres_per_pixel` is the image's own. Raises InputError for an unreadable image or height map.
     """
     try:
         with Image.open(path, formats=PILLOW_FORMATS) as image:
@@ -107,7 +106,7 @@ def textured_world(path: str, *, metres_per_pixel: float, frame_pixels: int = 25
 def _read_heights(
     path: str, size: tuple[int, int], box: tuple[int, int, int, int], side: int
 ) -> FloatMap:
-    """Heights (H, W) from the array beside the picture, metres; flat without one."""
+    """Heights (H, W) in metres from the array beside the image; zero without one."""
     beside = Path(path).with_suffix(".height.npy")
     if not beside.exists():
         return np.zeros((side, side), np.float32)
@@ -119,8 +118,8 @@ def _read_heights(
         ) from None
     if heights.ndim != 2 or heights.dtype.kind not in "fiu" or not np.isfinite(heights).all():
         raise InputError(
-            f"{beside} holds {heights.dtype} of shape {heights.shape}; expected two dimensions of finite metres; "
-            "write it again or take it away"
+            f"{beside} holds {heights.dtype} of shape {heights.shape}; expected two dimensions of "
+            "finite metres; write it again or remove it"
         )
     across, down = heights.shape[1] / size[0], heights.shape[0] / size[1]
     cut = (box[0] * across, box[1] * down, box[2] * across, box[3] * down)
@@ -129,7 +128,7 @@ def _read_heights(
 
 
 def _vegetation(colour_HW3: FloatMap) -> tuple[FloatMap, FloatMap]:
-    """(grass, trees), each (H, W) from 0 to 1: green is plants, and trees are darker than grass."""
+    """(grass, trees), each (H, W) from 0 to 1: vegetation is green, trees darker than grass."""
     red, green, blue = (colour_HW3[..., c] for c in range(3))
     total = red + green + blue + 1
     plants = np.clip(((2 * green - red - blue) / total - 0.03) / 0.12, 0, 1)

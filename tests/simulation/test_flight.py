@@ -1,4 +1,4 @@
-"""The spiral flight: University-1652's altitudes and turns, always looking at the middle."""
+"""The spiral flight: University-1652's altitudes and turns, looking at the middle."""
 
 import itertools
 from math import cos, radians, sin, sqrt, tan
@@ -8,7 +8,7 @@ import pytest
 from pipeline.simulation.flight import FlightPlan
 
 
-def test_the_flight_falls_from_256_to_121_5_metres_in_three_turns_of_twenty_degree_steps() -> None:
+def test_poses_descend_in_three_turns_of_20_degree_steps() -> None:
     poses = FlightPlan().poses(radius_m=40, first_heading_deg=350)
     assert len(poses) == 54
     assert (poses[0].altitude_m, poses[-1].altitude_m) == pytest.approx((256.0, 121.5))
@@ -18,7 +18,7 @@ def test_the_flight_falls_from_256_to_121_5_metres_in_three_turns_of_twenty_degr
     assert poses[18].heading_deg == pytest.approx(poses[0].heading_deg)
 
 
-def test_every_view_looks_at_the_middle() -> None:
+def test_every_pose_looks_at_the_middle() -> None:
     for pose in FlightPlan(views=7).poses(radius_m=40, first_heading_deg=33):
         ahead = cos(radians(pose.pitch_deg))
         direction = (ahead * sin(radians(pose.heading_deg)), ahead * cos(radians(pose.heading_deg)),
@@ -28,7 +28,7 @@ def test_every_view_looks_at_the_middle() -> None:
         assert pose.y_m + to_ground * direction[1] == pytest.approx(0, abs=1e-6)
 
 
-def test_the_first_view_looking_north_is_taken_from_the_south() -> None:
+def test_first_pose_looking_north_is_in_the_south() -> None:
     # 256 m up, looking 45 degrees down: 256 m to the south.
     [pose] = FlightPlan(views=1, depression_start_deg=45, depression_end_deg=45).poses(radius_m=40)
     assert (pose.x_m, pose.y_m) == pytest.approx((0, -256))
@@ -36,19 +36,19 @@ def test_the_first_view_looking_north_is_taken_from_the_south() -> None:
 
 
 @pytest.mark.parametrize("radius_m", [10.0, 40.0])
-def test_the_building_fills_the_last_frame_as_asked(radius_m: float) -> None:
+def test_building_fills_the_asked_part_of_the_last_frame(radius_m: float) -> None:
     last = FlightPlan(fill=0.8).poses(radius_m=radius_m)[-1]
     slant = sqrt(last.x_m**2 + last.y_m**2 + last.altitude_m**2)
     assert radius_m / (slant * tan(radians(last.fov_deg) / 2)) == pytest.approx(0.8)
 
 
-def test_a_small_scene_is_flown_lower_instead_of_through_a_longer_lens() -> None:
+def test_small_scene_is_flown_lower_not_with_a_longer_lens() -> None:
     first = FlightPlan(fov_min_deg=24).poses(radius_m=15)[0]
     assert first.fov_deg == 24
     assert first.altitude_m < 256
 
 
-def test_fewer_views_are_spread_over_the_same_spiral_and_still_look_from_different_sides() -> None:
+def test_fewer_views_spread_over_the_spiral_and_its_headings() -> None:
     plan = FlightPlan(views=6)
     few, all_54 = plan.poses(radius_m=30), FlightPlan().poses(radius_m=30)
     assert few[0] == all_54[0]
@@ -59,6 +59,6 @@ def test_fewer_views_are_spread_over_the_same_spiral_and_still_look_from_differe
 @pytest.mark.parametrize(
     "wrong", [{"views": 0}, {"depression_end_deg": 60.0}, {"altitude_end_m": 300.0}]
 )
-def test_a_plan_that_cannot_be_flown_is_refused(wrong: dict[str, float]) -> None:
+def test_plan_that_cannot_be_flown_is_rejected(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="expected"):
         FlightPlan(**wrong)  # type: ignore[arg-type]  # one of several fields

@@ -1,6 +1,4 @@
-"""The renderer against pinhole arithmetic done by hand: places, parallax, facades, occlusion,
-shadows.
-"""
+"""The renderer against pinhole arithmetic: positions, parallax, facades, occlusion, shadows."""
 
 from math import cos, radians, sin, tan
 
@@ -71,7 +69,7 @@ def project(pose: Pose, x: float, y: float, z: float, size: int) -> tuple[float,
 
 
 @pytest.mark.parametrize("heading", [0, 75, 200, 310])
-def test_points_of_the_ground_appear_where_a_pinhole_puts_them(heading: float) -> None:
+def test_ground_points_are_where_a_pinhole_projects_them(heading: float) -> None:
     view = scene((0, 0, 1.5, RED), (18, 7, 1.5, GREEN))
     pose = FlightPlan(views=3).poses(radius_m=20, first_heading_deg=heading)[1]
     frame = render_perspective(view, pose, size=128)
@@ -79,7 +77,7 @@ def test_points_of_the_ground_appear_where_a_pinhole_puts_them(heading: float) -
     assert where(frame, GREEN).mean(axis=0) == pytest.approx(project(pose, 18, 7, 0, 128), abs=0.9)
 
 
-def test_the_top_of_a_tower_is_displaced_as_perspective_says() -> None:
+def test_tower_top_is_displaced_by_perspective() -> None:
     pose = FlightPlan().poses(radius_m=20)[40]
     frame = render_perspective(scene(tower=(5, 20, 3)), pose, size=128)
     assert where(frame, RED).mean(axis=0) == pytest.approx(project(pose, 5, 0, 20, 128), abs=1.2)
@@ -87,7 +85,7 @@ def test_the_top_of_a_tower_is_displaced_as_perspective_says() -> None:
     assert np.hypot(*(where(frame, RED).mean(axis=0) - base)) > 10
 
 
-def test_a_facade_shows_below_the_roof_and_hides_what_is_behind_but_not_what_is_in_front() -> None:
+def test_facade_is_below_its_roof_and_hides_ground_behind() -> None:
     north_of_it, south_of_it = (0.0, 10.0, 1.5, GREEN), (0.0, -10.0, 1.5, GREEN)
     looking_north = FlightPlan().poses(radius_m=20)[36]
     assert looking_north.heading_deg == pytest.approx(0)
@@ -101,7 +99,7 @@ def test_a_facade_shows_below_the_roof_and_hides_what_is_behind_but_not_what_is_
     assert wall[:, 0].max() == pytest.approx(project(looking_north, 0, -5, 0, 128)[0], abs=1.5)
 
 
-def test_the_view_from_above_has_no_facade_and_the_roof_stands_where_the_building_does() -> None:
+def test_nadir_shows_no_facade_and_the_roof_in_place() -> None:
     frame = render_nadir(scene((0, 20, 2, GREEN), tower=(10, 30, 4)), size=100, half_m=25)
     assert len(where(frame, BLUE)) == 0
     rows, cols = where(frame, RED).mean(axis=0)
@@ -112,20 +110,18 @@ def test_the_view_from_above_has_no_facade_and_the_roof_stands_where_the_buildin
     )  # north is up
 
 
-def test_a_turn_of_the_satellite_turns_its_picture_clockwise() -> None:
+def test_nadir_turn_rotates_the_image_clockwise() -> None:
     frame = render_nadir(scene((0, 20, 2, GREEN)), size=100, half_m=25, turn_deg=90)
     assert where(frame, GREEN).mean(axis=0) == pytest.approx((49.5, 49.5 + 40), abs=0.6)
 
 
-def test_a_shift_of_the_satellite_moves_its_middle() -> None:
+def test_nadir_shift_moves_the_centre() -> None:
     frame = render_nadir(scene((10, 20, 2, GREEN)), size=100, half_m=25, shift_m=(10, 20))
     assert where(frame, GREEN).mean(axis=0) == pytest.approx((49.5, 49.5), abs=0.6)
 
 
 @pytest.mark.parametrize(("azimuth", "direction"), [(180, (-1, 0)), (90, (0, -1)), (225, (-1, 1))])
-def test_a_shadow_is_as_long_as_height_over_tangent_and_points_away_from_the_sun(
-    azimuth: float, direction: tuple[int, int]
-) -> None:
+def test_shadow_has_length_height_over_tangent(azimuth: float, direction: tuple[int, int]) -> None:
     day = Day(sun_azimuth_deg=azimuth, sun_elevation_deg=40)
     top = cast_shadows(world(tower=(0, 15, 1)).height_HW, MPP, toward_sun=day.toward_sun())
     ray = np.array(direction) / np.hypot(*direction)
@@ -138,9 +134,7 @@ def test_a_shadow_is_as_long_as_height_over_tangent_and_points_away_from_the_sun
     assert top[back[:, 0], back[:, 1]].max() < 0.3
 
 
-def test_ground_in_shadow_is_darker_than_ground_in_the_sun_and_a_wall_in_the_sun_brighter_than_one_in_shade() -> (
-    None
-):
+def test_shaded_ground_and_shaded_walls_are_darker() -> None:
     day = Day(sun_azimuth_deg=180, sun_elevation_deg=35, noise=0)
     lit = light_world(world(tower=(0, 15, 3)), day).colour_HW3.mean(axis=2)
     assert lit[SIDE // 2 - 16, SIDE // 2] < 0.7 * lit[SIDE // 2 + 16, SIDE // 2]
@@ -159,7 +153,7 @@ def test_ground_in_shadow_is_darker_than_ground_in_the_sun_and_a_wall_in_the_sun
     assert bright[rows, cols, 2].mean() > 1.5 * dark[rows, cols, 2].mean()
 
 
-def test_noise_comes_from_the_generator_alone() -> None:
+def test_noise_depends_on_the_generator_only() -> None:
     noisy = prepare_scene(world(), Day(noise=4.0))
     one, same, other = (
         render_nadir(noisy, size=64, half_m=20, rng=np.random.default_rng(seed))
@@ -170,7 +164,7 @@ def test_noise_comes_from_the_generator_alone() -> None:
     assert one.astype(float).std(axis=(0, 1)) == pytest.approx([4.0] * 3, rel=0.25)
 
 
-def test_a_camera_that_sees_the_horizon_is_refused() -> None:
+def test_camera_that_sees_the_horizon_is_rejected() -> None:
     level = Pose(x_m=0, y_m=-100, altitude_m=50, heading_deg=0, pitch_deg=-10, fov_deg=40)
     with pytest.raises(ValueError, match="look further down"):
         render_perspective(scene(), level, size=32)

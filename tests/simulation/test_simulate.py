@@ -1,4 +1,4 @@
-"""The stage: layout, determinism, restart, refusals; and that colour alone does not find the place."""
+"""The stage: layout, determinism, resume, rejections; colour alone must not find a location."""
 
 import csv
 import hashlib
@@ -39,9 +39,7 @@ def digest(root: Path) -> dict[str, str]:
 
 @pytest.fixture
 def in_process(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
-    """Run the tasks here, in reverse order, without Ray; `in_process(n)` pulls the plug after n of
-    them.
-    """
+    """Run tasks here, in reverse order, without Ray; `in_process(n)` interrupts after n tasks."""
 
     def use(stop_after: int | None) -> None:
         def bounded(submit: object, items: Iterable[Any], window: int) -> Iterator[tuple[Any, Any]]:
@@ -58,7 +56,7 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
     return use
 
 
-def test_the_folders_are_university_1652s_and_the_bytes_the_same_whatever_the_parallelism(
+def test_simulate_writes_university1652_same_bytes_on_ray(
     tmp_path: Path, ray_cluster: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = simulate(settings(tmp_path / "by_ray"))
@@ -98,36 +96,36 @@ def test_the_folders_are_university_1652s_and_the_bytes_the_same_whatever_the_pa
     assert not (root / ".parts").exists()
 
 
-def test_geotags_name_every_location_and_every_uav_picture(
+def test_tables_hold_every_location_and_every_uav_image(
     tmp_path: Path, in_process: Callable[[int | None], None]
 ) -> None:
     root = simulate(settings(tmp_path / "out"))
     with (root / "locations.csv").open() as stream:
-        places = {row["location"]: row for row in csv.DictReader(stream)}
+        locations = {row["location"]: row for row in csv.DictReader(stream)}
     with (root / "poses.csv").open() as stream:
         poses = list(csv.DictReader(stream))
-    assert sorted(places) == ["0001", "0002", "0003", "0004", "0005"]
+    assert sorted(locations) == ["0001", "0002", "0003", "0004", "0005"]
     on_disk = sorted(str(path.relative_to(root)) for path in root.rglob("image-*.jpeg"))
     assert sorted(row["path"] for row in poses) == on_disk
     for row in poses:
-        place, down = places[row["location"]], np.radians(-float(row["pitch_deg"]))
-        north = (float(row["lat"]) - float(place["lat"])) * 111_320
+        location, down = locations[row["location"]], np.radians(-float(row["pitch_deg"]))
+        north = (float(row["lat"]) - float(location["lat"])) * 111_320
         away = float(row["altitude_m"]) / np.tan(down)
         assert north == pytest.approx(
             -away * np.cos(np.radians(float(row["heading_deg"]))), abs=0.2
         )
 
 
-def test_a_run_that_was_stopped_goes_on_and_leaves_no_half_location(
+def test_interrupted_run_resumes_without_partial_locations(
     tmp_path: Path, in_process: Callable[[int | None], None]
 ) -> None:
-    whole = simulate(settings(tmp_path / "whole"))
+    intact = simulate(settings(tmp_path / "intact"))
     broken = tmp_path / "broken"
     in_process(2)
     with pytest.raises(KeyboardInterrupt):
         simulate(settings(broken))
     assert len(list((broken / ".parts").glob("0*.json"))) == 2
-    # What a kill in the middle of a location leaves: some pictures under a hidden name, one folder
+    # A kill in the middle of a location leaves some images under a hidden name, and one folder
     # without its part.
     first = plan_jobs(settings(broken), str(broken), [])[0]
     (broken / "train/drone" / f".{first.name}").mkdir(parents=True)
@@ -140,11 +138,11 @@ def test_a_run_that_was_stopped_goes_on_and_leaves_no_half_location(
     }
     in_process(None)
     simulate(settings(broken))
-    assert digest(broken) == digest(whole)
+    assert digest(broken) == digest(intact)
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in kept.items())
 
 
-def test_a_finished_data_set_is_left_alone_and_other_settings_are_refused(
+def test_complete_data_set_is_kept_other_settings_rejected(
     tmp_path: Path, in_process: Callable[[int | None], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = simulate(settings(tmp_path / "out"))
@@ -154,18 +152,18 @@ def test_a_finished_data_set_is_left_alone_and_other_settings_are_refused(
     assert {path: path.stat().st_mtime_ns for path in root.rglob("*")} == before
     assert "complete already" in capsys.readouterr().err
     with pytest.raises(
-        InputError, match="made with views 3 instead of 5; expected the same settings"
+        InputError, match="made with views 3 instead of 5, expected the same settings"
     ):
         simulate(settings(tmp_path / "out", views=5))
 
 
-def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
+def test_folder_with_other_files_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(InputError, match="holds files that no simulation wrote"):
         simulate(settings(tmp_path))
 
 
-def test_textures_are_dealt_out_one_each_and_too_few_are_refused(
+def test_textures_are_used_once_each_and_too_few_rejected(
     tmp_path: Path, in_process: Callable[[int | None], None]
 ) -> None:
     folder = tmp_path / "textures"
@@ -174,7 +172,7 @@ def test_textures_are_dealt_out_one_each_and_too_few_are_refused(
         Image.new("RGB", (64, 64), (40 * i, 90, 80)).save(folder / f"{i}.png")
     names = [str(path) for path in sorted(folder.iterdir())]
     jobs = plan_jobs(settings(tmp_path / "out", textures=str(folder)), "root", names)
-    assert len({job.order.texture for job in jobs}) == len(jobs) == 5
+    assert len({job.spec.texture for job in jobs}) == len(jobs) == 5
     assert simulate(
         settings(tmp_path / "out", textures=str(folder), train_locations=1, test_locations=1)
     ).exists()
@@ -183,36 +181,34 @@ def test_textures_are_dealt_out_one_each_and_too_few_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
-        ({"views": 0}, "--views is 0; expected 1 or more"),
-        ({"views": 54_000}, "--views is 54000; expected at most 10000"),
-        ({"distractors": 160_000_000}, "locations asked for; expected at most 1000000"),
-        ({"size": 4000}, "--size is 4000; expected 32 to 1024 pixels"),
-        ({"train_locations": -1}, "--train-locations is -1; expected 0 or more"),
+        ({"views": 0}, "--views is 0, expected 1 or more"),
+        ({"views": 54_000}, "--views is 54000, expected at most 10000"),
+        ({"distractors": 160_000_000}, "locations asked for, expected at most 1000000"),
+        ({"size": 4000}, "--size is 4000, expected 32 to 1024 pixels"),
+        ({"train_locations": -1}, "--train-locations is -1, expected 0 or more"),
         ({"train_locations": 0, "test_locations": 0, "distractors": 0}, "no locations asked for"),
     ],
 )
-def test_settings_that_make_no_data_set_are_refused(
-    tmp_path: Path, wrong: dict[str, int], said: str
-) -> None:
-    with pytest.raises(InputError, match=said):
+def test_invalid_settings_are_rejected(tmp_path: Path, wrong: dict[str, int], message: str) -> None:
+    with pytest.raises(InputError, match=message):
         settings(tmp_path, **wrong)
 
 
-def test_an_address_that_is_no_folder_is_refused() -> None:
+def test_output_that_is_no_folder_is_rejected() -> None:
     with pytest.raises(InputError, match="expected a local or mounted folder"):
         simulate(
             SimulationSettings(out="memory://x", train_locations=1, test_locations=0, distractors=0)
         )
 
 
-def test_mean_colour_alone_does_not_find_the_place() -> None:
+def test_mean_colour_alone_does_not_find_the_location() -> None:
     satellites, drones = [], []
     for location in range(1, 41):
-        taken = render_location(LocationSpec(seed=5, location=location, views=2, size=32))
-        satellites.append(mean_colour(taken.satellite))
-        drones.append([mean_colour(data) for data in taken.drone])
+        images = render_location(LocationSpec(seed=5, location=location, views=2, size=32))
+        satellites.append(mean_colour(images.satellite))
+        drones.append([mean_colour(data) for data in images.drone])
     gallery, queries = np.array(satellites), np.array(drones)
     nearest = np.argmin(np.linalg.norm(queries[:, :, None] - gallery, axis=3), axis=2)
     found = (nearest == np.arange(40)[:, None]).mean()

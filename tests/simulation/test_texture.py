@@ -1,4 +1,4 @@
-"""Worlds from pictures: what is taken, what is passed over, what is refused and how that is said."""
+"""Worlds from images: which files are used, skipped and rejected, and the error messages."""
 
 from pathlib import Path
 
@@ -11,15 +11,15 @@ from pipeline.simulation.appearance import Day, light_world
 from pipeline.simulation.texture import RADIUS_FRACTION, textured_world, usable_textures
 
 
-def picture(
+def save_image(
     path: Path, width: int = 96, height: int = 96, colour: tuple[int, int, int] = (90, 140, 80)
 ) -> Path:
     Image.new("RGB", (width, height), colour).save(path)
     return path
 
 
-def test_a_picture_becomes_flat_ground_of_its_own_size(tmp_path: Path) -> None:
-    ground = textured_world(str(picture(tmp_path / "a.png", 120, 96)), metres_per_pixel=0.3)
+def test_image_becomes_flat_ground_of_its_size(tmp_path: Path) -> None:
+    ground = textured_world(str(save_image(tmp_path / "a.png", 120, 96)), metres_per_pixel=0.3)
     assert ground.extent_m == pytest.approx(96 * 0.3)
     assert ground.target_radius_m == pytest.approx(RADIUS_FRACTION * 96 * 0.3)
     assert not ground.height_HW.any()
@@ -27,23 +27,23 @@ def test_a_picture_becomes_flat_ground_of_its_own_size(tmp_path: Path) -> None:
     assert ground.light_is_baked
 
 
-def test_light_and_shadow_of_a_photograph_are_left_alone_in_summer(tmp_path: Path) -> None:
-    ground = textured_world(str(picture(tmp_path / "a.png")), metres_per_pixel=0.3)
+def test_photo_keeps_its_light_and_shadow_in_summer(tmp_path: Path) -> None:
+    ground = textured_world(str(save_image(tmp_path / "a.png")), metres_per_pixel=0.3)
     assert (light_world(ground, Day(sun_elevation_deg=20)).colour_HW3 == ground.texture_HW3).all()
 
 
-def test_green_turns_with_the_season_and_grey_does_not(tmp_path: Path) -> None:
-    lawn = textured_world(str(picture(tmp_path / "a.png")), metres_per_pixel=0.3)
+def test_season_changes_green_but_not_grey(tmp_path: Path) -> None:
+    lawn = textured_world(str(save_image(tmp_path / "a.png")), metres_per_pixel=0.3)
     road = textured_world(
-        str(picture(tmp_path / "b.png", colour=(120, 120, 120))), metres_per_pixel=0.3
+        str(save_image(tmp_path / "b.png", colour=(120, 120, 120))), metres_per_pixel=0.3
     )
     winter = Day(season="winter")
     assert (light_world(lawn, winter).colour_HW3 != lawn.texture_HW3).any()
     assert (light_world(road, winter).colour_HW3 == road.texture_HW3).all()
 
 
-def test_a_height_map_beside_the_picture_is_taken_whatever_its_resolution(tmp_path: Path) -> None:
-    path = picture(tmp_path / "quad.jpg", 96, 96)
+def test_height_map_is_used_at_any_resolution(tmp_path: Path) -> None:
+    path = save_image(tmp_path / "quad.jpg", 96, 96)
     heights = np.zeros((48, 48))
     heights[:24] = 12.0
     np.save(tmp_path / "quad.height.npy", heights)
@@ -53,28 +53,28 @@ def test_a_height_map_beside_the_picture_is_taken_whatever_its_resolution(tmp_pa
     assert (ground.height_HW[half + 1 :] == 0).all()
 
 
-def test_a_height_map_that_is_no_map_is_refused(tmp_path: Path) -> None:
-    path = picture(tmp_path / "quad.jpg")
+def test_height_map_of_another_shape_is_rejected(tmp_path: Path) -> None:
+    path = save_image(tmp_path / "quad.jpg")
     np.save(tmp_path / "quad.height.npy", np.zeros(7))
     with pytest.raises(InputError, match=r"shape \(7,\); expected two dimensions"):
         textured_world(str(path), metres_per_pixel=0.3)
 
 
-def test_what_is_no_image_is_passed_over_and_counted(tmp_path: Path) -> None:
+def test_files_that_are_no_images_are_skipped_and_counted(tmp_path: Path) -> None:
     (tmp_path / "below").mkdir()
-    picture(tmp_path / "b.png")
-    picture(tmp_path / "below" / "a.jpg")
-    picture(tmp_path / "tiny.png", 20, 200)
+    save_image(tmp_path / "b.png")
+    save_image(tmp_path / "below" / "a.jpg")
+    save_image(tmp_path / "tiny.png", 20, 200)
     (tmp_path / "notes.txt").write_text("no image")
     (tmp_path / "broken.jpg").write_bytes(b"no image either")
-    whole = picture(tmp_path / "cut.jpg", 400, 400).read_bytes()
-    (tmp_path / "cut.jpg").write_bytes(whole[: len(whole) // 2])
-    usable, passed_over = usable_textures(str(tmp_path))
+    intact = save_image(tmp_path / "cut.jpg", 400, 400).read_bytes()
+    (tmp_path / "cut.jpg").write_bytes(intact[: len(intact) // 2])
+    usable, skipped = usable_textures(str(tmp_path))
     assert [Path(path).name for path in usable] == ["b.png", "a.jpg"]
-    assert passed_over == 4
+    assert skipped == 4
 
 
-def test_a_missing_and_an_empty_folder_are_refused_in_one_sentence(tmp_path: Path) -> None:
+def test_missing_and_empty_folders_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"no folder .*nowhere; expected a folder of overhead images"
     ):
@@ -83,8 +83,8 @@ def test_a_missing_and_an_empty_folder_are_refused_in_one_sentence(tmp_path: Pat
         usable_textures(str(tmp_path))
 
 
-def test_a_truncated_picture_is_named(tmp_path: Path) -> None:
-    path = picture(tmp_path / "cut.png", 400, 400)
+def test_truncated_image_is_named_in_the_error(tmp_path: Path) -> None:
+    path = save_image(tmp_path / "cut.png", 400, 400)
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(InputError, match=r"cut\.png cannot be decoded"):
         textured_world(str(path), metres_per_pixel=0.3)

@@ -1,8 +1,6 @@
-"""What fills the blocks between streets: houses, slabs, shops, car parks, parks, sports, sheds,
-woods, old centres.
+"""Fillers of blocks: houses, slabs, shops, car parks, parks, sports, sheds, woods, old centres.
 
-Each filler takes a `Plot`, draws from its generator and returns nothing: the canvas keeps the
-result.
+Each filler takes a `Plot`, draws from its generator and paints on its canvas.
 """
 
 from collections.abc import Callable
@@ -13,7 +11,7 @@ import numpy as np
 
 from pipeline.simulation.canvas import GROUND, PAVED
 from pipeline.simulation.palette import ASPHALT, EARTH, FLAT_ROOFS, METAL_ROOFS, PAVING, pick_colour
-from pipeline.simulation.town import grounds
+from pipeline.simulation.town import grounds, sports
 from pipeline.simulation.town.buildings import BuildingPart, Roof, raise_part
 from pipeline.simulation.town.houses import fill_houses
 from pipeline.simulation.town.plot import Plot
@@ -93,8 +91,15 @@ def fill_park(plot: Plot) -> None:
     b, rng = plot.block, plot.rng
     if rng.random() < 0.5:
         x, y = plot.spot(12)
-        grounds.draw_water(plot.canvas, rng, x, y, float(rng.uniform(0, pi)), float(rng.uniform(8, 20)),
-                      float(rng.uniform(6, 13)))  # fmt: skip
+        grounds.draw_water(
+            plot.canvas,
+            rng,
+            x,
+            y,
+            float(rng.uniform(0, pi)),
+            float(rng.uniform(8, 20)),
+            float(rng.uniform(6, 13)),
+        )
     gravel = pick_colour(rng, PAVING)
     for _ in range(int(rng.integers(2, 5))):
         start, end, via = plot.spot(0), plot.spot(0), plot.spot(6)
@@ -118,9 +123,9 @@ def fill_sports(plot: Plot) -> None:
     long, short = max(b.size_p, b.size_q) / 2, min(b.size_p, b.size_q) / 2
     cut = rng.random()
     if cut < 0.5 and short > 16:
-        grounds.draw_pitch(plot.canvas, rng, x, y, angle, min(long, 54), min(short, 36))
+        sports.draw_pitch(plot.canvas, rng, x, y, angle, min(long, 54), min(short, 36))
     elif cut < 0.7 and short > 20:
-        grounds.draw_diamond(
+        sports.draw_diamond(
             plot.canvas,
             rng,
             x,
@@ -129,7 +134,7 @@ def fill_sports(plot: Plot) -> None:
             min(short, 42),
         )
     else:
-        grounds.draw_courts(plot.canvas, rng, x, y, angle, min(long, 38), min(short, 19))
+        sports.draw_courts(plot.canvas, rng, x, y, angle, min(long, 38), min(short, 19))
     plot.plant(0.5)
 
 
@@ -206,9 +211,11 @@ def fill_old_centre(plot: Plot) -> None:
     )
     deep = float(rng.uniform(9, 13))
     for low, high, fixed, along_p in (
-        (b.p0, b.p1, b.q0 + deep / 2, True), (b.p0, b.p1, b.q1 - deep / 2, True),
-        (b.q0 + deep, b.q1 - deep, b.p0 + deep / 2, False), (b.q0 + deep, b.q1 - deep, b.p1 - deep / 2, False),
-    ):  # fmt: skip
+        (b.p0, b.p1, b.q0 + deep / 2, True),
+        (b.p0, b.p1, b.q1 - deep / 2, True),
+        (b.q0 + deep, b.q1 - deep, b.p0 + deep / 2, False),
+        (b.q0 + deep, b.q1 - deep, b.p1 - deep / 2, False),
+    ):
         at = low
         while at < high - 4:
             wide = min(float(rng.uniform(7, 18)), high - at)
@@ -221,7 +228,7 @@ def fill_old_centre(plot: Plot) -> None:
             if rng.random() < 0.55:
                 x, y, angle = plot.at(p, q)
                 hu, hv = (wide / 2, depth) if along_p else (depth, wide / 2)
-                # Ridges follow the street: give the long side to it.
+                # Ridges follow the street: the long side is along it.
                 roof = Roof(
                     kind="gable",
                     colour=pick_colour(rng, plot.roofs, spread=9),

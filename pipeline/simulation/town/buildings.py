@@ -1,5 +1,4 @@
-"""Buildings: parts with a footprint, walls and a roof, raised on a canvas, and what stands on flat
-roofs.
+"""Buildings: parts with a footprint, walls and a roof, added to a canvas; furniture of flat roofs.
 
 Letters: h, w pixels of a stamp's window; 3 red, green, blue.
 """
@@ -19,16 +18,16 @@ RoofKind = Literal["flat", "gable", "hip", "barrel", "sawtooth", "dome"]
 
 @dataclass(frozen=True, kw_only=True)
 class Roof:
-    """Shape and skin of a roof. Metres."""
+    """Shape and material of a roof. Metres."""
 
     kind: RoofKind
     colour: Colour
     rise_m: float = 0.0
     """Height of the ridge above the eaves."""
     seam_m: float = 0.0
-    """Period of the seams, ribs or courses; 0 for none."""
+    """Period of the seams, ribs or courses; 0: none."""
     parapet: Colour | None = None
-    """Colour of the rim of a flat roof; None for no rim."""
+    """Colour of the rim of a flat roof; None: no rim."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,12 +44,12 @@ class BuildingPart:
     eave_m: float
     roof: Roof
     facade: int
-    """Number that `add_facade` gave."""
+    """Number of the facade, from `add_facade`."""
     round: bool = False
 
 
 def add_facade(canvas: Canvas, facade: Facade) -> int:
-    """Register a facade; its number. A map of bytes holds 255 of them, later ones share."""
+    """Add a facade to the canvas; its number. A byte map holds 255; later ones share a number."""
     if len(canvas.facades) < 255:
         canvas.facades.append(facade)
         return len(canvas.facades)
@@ -58,13 +57,13 @@ def add_facade(canvas: Canvas, facade: Facade) -> int:
 
 
 def to_map(part: BuildingPart, u: float, v: float) -> tuple[float, float]:
-    """World coordinates of a point in the part's own frame."""
+    """Map coordinates of a point in the part's own frame."""
     c, s = cos(part.angle), sin(part.angle)
     return part.x + c * u - s * v, part.y + s * u + c * v
 
 
 def raise_part(canvas: Canvas, part: BuildingPart) -> None:
-    """Build the part wherever it is higher than what is there."""
+    """Draw the part on all pixels where it is higher than the surface so far."""
     stamp = canvas.stamp(part.x, part.y, part.angle, part.half_u, part.half_v)
     if stamp is None:
         return
@@ -137,13 +136,13 @@ def _roof_colours(canvas: Canvas, part: BuildingPart, stamp: Stamp, inside: Floa
         tone = tone + 0.10 * (np.abs(short) < 0.35)
         tone = tone - 0.08 * (np.abs(short) > half_short - 0.4)
     if roof.kind == "sawtooth":
-        # The upright side of a tooth is glass.
+        # The vertical side of a tooth is glass.
         period = max(5.0, max(part.half_u, part.half_v) / 3)
         tone = tone - 0.35 * (np.mod(long + max(part.half_u, part.half_v), period) > period - 1.0)
     colours: FloatMap = tone[..., None].astype(np.float32) * np.asarray(roof.colour, np.float32)
     if roof.kind == "flat" and roof.parapet is not None:
         colours[inside < 0.55] = roof.parapet
-        # Dirt gathers where the rim keeps the rain.
+        # Dirt gathers along the rim, which keeps the rain.
         colours *= (1 - 0.10 * np.exp(-np.maximum(inside - 0.55, 0) / 1.2) * (inside >= 0.55))[
             ..., None
         ]
@@ -166,7 +165,7 @@ def _walls(part: BuildingPart, stamp: Stamp, nearest_is_u: np.ndarray) -> tuple[
 
 
 def _compass(turn: np.ndarray) -> FloatMap:
-    """Counter-clockwise from east -> clockwise from north."""
+    """Radians counter-clockwise from east -> clockwise from north."""
     compass: FloatMap = np.mod(np.float32(pi / 2) - turn, np.float32(2 * pi)).astype(np.float32)
     return compass
 
@@ -174,7 +173,7 @@ def _compass(turn: np.ndarray) -> FloatMap:
 def furnish_flat_roof(
     canvas: Canvas, part: BuildingPart, rng: np.random.Generator, *, richness: float = 1.0
 ) -> None:
-    """Stand machines, skylights, a stair house, vents, walkways or solar panels on a flat roof."""
+    """Place machines, skylights, a stair house, vents, walkways or solar panels on a flat roof."""
     half_u, half_v = part.half_u - 2.0, part.half_v - 2.0
     if half_u < 1.5 or half_v < 1.5 or part.round:
         return

@@ -49,11 +49,20 @@ def fill_houses(plot: Plot) -> None:
     plot.plant(1.0)
 
 
-def _drive(plot: Plot, x: float, y: float, angle: float, half_w: float, half_d: float, side: int, setback: float,
-           colour: Colour) -> None:  # fmt: skip
+def _drive(
+    plot: Plot,
+    x: float,
+    y: float,
+    angle: float,
+    half_w: float,
+    half_d: float,
+    side: int,
+    setback: float,
+    colour: Colour,
+) -> None:
     reach = half_d + setback / 2 + 1
     u = half_w * float(plot.rng.uniform(0.3, 0.9))
-    # The house's v axis is the block's depth, up to its sign.
+    # The house's v axis runs along the block's depth, up to its sign.
     c, s = cos(angle), sin(angle)
     bx, by = x + c * u - s * side * reach, y + s * u + c * side * reach
     plot.canvas.box(bx, by, angle, 1.7, setback / 2 + 1.5, colour, cover=PAVED)

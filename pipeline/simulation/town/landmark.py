@@ -1,8 +1,7 @@
-"""The large building in the middle of a town: a footprint that tells one location from the next,
-raised part by part.
+"""The large central building of a town: a footprint that differs from town to town, built of parts.
 
-Lengths in a footprint are parts of the target radius, so that every family fills the last frame of
-the flight.
+Lengths in a footprint are fractions of the target radius, so that every family of footprints fills
+the last frame of the flight.
 """
 
 from dataclasses import dataclass
@@ -30,7 +29,7 @@ from pipeline.simulation.town.buildings import (
 
 @dataclass(frozen=True, kw_only=True)
 class Wing:
-    """A box of a footprint: centre, half sizes and height relative to the building's."""
+    """A box or ellipse of a footprint: centre, half sizes, height relative to the building's."""
 
     u: float
     v: float
@@ -157,7 +156,7 @@ def random_footprint(rng: np.random.Generator) -> list[Wing]:
 def build_landmark(
     canvas: Canvas, rng: np.random.Generator, *, angle: float, radius_m: float
 ) -> None:
-    """Raise the building around (0, 0), its longer axis at `angle`."""
+    """Build it around (0, 0), with its longer axis at `angle`."""
     storeys = float(rng.uniform(8.0, 22.0))
     walls = add_facade(canvas, random_facade(rng, kind="block"))
     second = add_facade(canvas, random_facade(rng, kind="block"))
@@ -208,7 +207,7 @@ RoofMaterial = tuple[str, Colour]
 
 
 def _random_roof_material(rng: np.random.Generator) -> RoofMaterial:
-    """What a roof is made of: ("flat" | "pitched" | "metal", colour)."""
+    """A roof's material: ("flat" | "pitched" | "metal", colour)."""
     cut = rng.random()
     if cut < 0.62:
         return "flat", pick_colour(rng, FLAT_ROOFS)

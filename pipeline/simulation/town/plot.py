@@ -1,6 +1,4 @@
-"""A block of a town as the fillers see it: a canvas, the block's place in the grid, and the
-neighbourhood's habits.
-"""
+"""A block of a town as fillers see it: canvas, position in the grid, style of the neighbourhood."""
 
 from dataclasses import dataclass
 
@@ -21,14 +19,14 @@ from pipeline.simulation.town.streets import Block, StreetGrid
 
 @dataclass(frozen=True, kw_only=True)
 class Plot:
-    """A block to fill, with the town's habits."""
+    """A block to fill, with the style of its town."""
 
     canvas: Canvas
     grid: StreetGrid
     block: Block
     rng: np.random.Generator
     roofs: tuple[Colour, ...]
-    """The few colours that this neighbourhood roofs its houses with."""
+    """The few roof colours of this neighbourhood's houses."""
     leaves: Colour
     house_walls: tuple[int, ...]
     """Facade numbers for houses."""
@@ -50,7 +48,7 @@ class Plot:
         return self.grid.to_world(float(p), float(q))
 
     def plant(self, density: float = 1.0, *, radius: tuple[float, float] = (1.8, 4.2)) -> None:
-        """Trees all over the open ground of the block."""
+        """Plant trees over the open ground of the block."""
         count = self.rng.poisson(
             self.block.size_p * self.block.size_q / 100 * self.tree_density * density
         )
@@ -87,7 +85,7 @@ class Plot:
 def neighbourhood_style(
     canvas: Canvas, rng: np.random.Generator
 ) -> tuple[tuple[Colour, ...], tuple[int, ...], tuple[int, ...]]:
-    """(roof colours, house facades, block facades) that a town's plots share."""
+    """(roof colours, house facades, block facades) that all plots of a town share."""
     roofs = tuple(pick_colour(rng, PITCHED_ROOFS) for _ in range(int(rng.integers(2, 5))))
     house_walls = tuple(add_facade(canvas, random_facade(rng, kind="house")) for _ in range(3))
     block_walls = tuple(add_facade(canvas, random_facade(rng, kind="block")) for _ in range(3))

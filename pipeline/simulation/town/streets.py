@@ -1,8 +1,7 @@
-"""The streets of a town: a grid at any angle, bent or broken, painted on a canvas, and the blocks
-that it leaves.
+"""The streets of a town: a grid at any angle, bent or broken, and the blocks between them.
 
 Grid coordinates: p across the avenues and q along them, metres, (0, 0) the middle of the map. A
-bend slides p by a sine of q, so that avenues wind and the blocks between them follow.
+bend shifts p by a sine of q, so that avenues wind and the blocks between them follow.
 
 Letters: H, W pixels of the map.
 """
@@ -20,7 +19,7 @@ from pipeline.simulation.world import FloatMap
 
 @dataclass(frozen=True, kw_only=True)
 class Street:
-    """One line of the grid: where it runs, how wide it is, and between which cross lines. Metres."""
+    """One line of the grid: position, width, and the cross lines of its ends. Metres."""
 
     at: float
     width: float
@@ -30,7 +29,7 @@ class Street:
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
-    """What lies between four streets, in grid coordinates, kerb to kerb. Metres."""
+    """The area between four streets, kerb to kerb, in grid coordinates. Metres."""
 
     p0: float
     p1: float
@@ -59,7 +58,7 @@ class Block:
 
 @dataclass(frozen=True, kw_only=True)
 class StreetGrid:
-    """All streets of a town, and the way between grid and map coordinates."""
+    """All streets of a town, and the conversion between grid and map coordinates."""
 
     angle: float
     bend_m: float
@@ -77,7 +76,7 @@ class StreetGrid:
         return c * along - s * q, s * along + c * q
 
     def turn_at(self, q: float) -> float:
-        """Angle of the p axis as the blocks at q stand, radians counter-clockwise from east."""
+        """Angle of the p axis for blocks at q, radians counter-clockwise from east."""
         slope = self.bend_m / self.bend_length_m * cos(q / self.bend_length_m + self.bend_phase)
         return self.angle - atan(slope)
 
@@ -93,7 +92,7 @@ class StreetGrid:
         return p, q
 
     def blocks(self) -> list[Block]:
-        """What the streets leave, the central block first."""
+        """The blocks between the streets, the central block first."""
         found = []
         for left, right in pairwise(self.avenues):
             for low, high in pairwise(self.crosses):
@@ -108,9 +107,7 @@ class StreetGrid:
 
 
 def plan_streets(rng: np.random.Generator, *, extent_m: float, central_m: float) -> StreetGrid:
-    """A street grid whose central block is at least 2 * `central_m` wide; everything else is drawn
-    from `rng`.
-    """
+    """A random street grid whose central block is at least 2 * `central_m` wide."""
     reach = extent_m / 2 * hypot(1, 1)
     bent = rng.random() < 0.35
     return StreetGrid(
@@ -144,7 +141,7 @@ def _plan_lines(
 
 
 def paint_streets(canvas: Canvas, grid: StreetGrid, rng: np.random.Generator) -> None:
-    """Lay pavements, asphalt, markings and crossings."""
+    """Paint pavements, asphalt, markings and crossings."""
     p_HW, q_HW = grid.fields(canvas)
     asphalt, kerb = pick_colour(rng, ASPHALT), pick_colour(rng, PAVING)
     walk_m = float(rng.choice([0.0, 1.6, 2.4], p=[0.15, 0.45, 0.4]))

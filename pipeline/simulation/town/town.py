@@ -1,8 +1,7 @@
 """Procedural towns: a generator comes in, a World around one campus-like building goes out.
 
-Everything that tells two towns apart by colour alone is drawn from palettes that all towns share;
-what is peculiar to a town is its plan: the footprint and roof of the building in the middle, the
-streets, and what fills the blocks.
+All towns share their palettes, so that colour alone does not tell two towns apart; a town's plan
+does: the footprint and roof of its central building, the streets, and the buildings of its blocks.
 """
 
 from math import cos, pi, sin
@@ -17,22 +16,16 @@ from pipeline.simulation.town.plot import Plot, neighbourhood_style
 from pipeline.simulation.world import World
 
 EXTENT_IN_RADII = 6.8
-"""Side of the map in target radii: the first frame of the default flight stays on it but for its
-far corners.
-"""
+"""Side of the map in target radii: only the far corners of the first frame leave it."""
 TEXELS_PER_RADIUS = 110
-"""Map resolution for frames of 256 pixels: the last frame of the flight then shows about one map
-pixel per pixel.
-"""
+"""Map resolution for frames of 256 pixels: the last frame then has one map pixel per pixel."""
 
 
 def make_town(rng: np.random.Generator, *, frame_pixels: int = 256) -> World:
-    """A town, as fine as frames of `frame_pixels` need: the same plan at every size, with finer
-    paint on it.
-    """
+    """A town with the detail of frames of `frame_pixels`; the plan is the same at every size."""
     radius_m = float(rng.uniform(27, 46))
     metres_per_pixel = radius_m / TEXELS_PER_RADIUS * 256 / frame_pixels
-    # Separate streams, so that nothing that depends on the map's resolution can reach the plan.
+    # Separate streams: draws that depend on the map's resolution must not change the plan.
     plan, grain = rng.spawn(2)
     canvas = Canvas(
         extent_m=EXTENT_IN_RADII * radius_m,
@@ -44,7 +37,7 @@ def make_town(rng: np.random.Generator, *, frame_pixels: int = 256) -> World:
     streets.paint_streets(canvas, grid, plan)
     roofs, house_walls, block_walls = neighbourhood_style(canvas, plan)
     leaves, density = pick_colour(plan, TREES), float(plan.gamma(3.0, 0.13))
-    # A town has a character: some fillers are common in it, some absent.
+    # Each town has its own mix of fillers: some are common, some absent.
     names = list(FILLERS)
     weights = plan.dirichlet(np.asarray([2.2, 1.0, 0.9, 0.5, 0.7, 0.7, 0.6, 0.3, 0.7]) * 0.9)
     half = canvas.extent_m / 2
@@ -74,7 +67,7 @@ def make_town(rng: np.random.Generator, *, frame_pixels: int = 256) -> World:
 
 
 def _build_campus(plot: Plot, radius_m: float) -> None:
-    """The grounds of the building in the middle, and the building."""
+    """The central building and its grounds."""
     canvas, rng, b = plot.canvas, plot.rng, plot.block
     x, y, angle = plot.at(0, 0)
     paving = pick_colour(rng, PAVING)
@@ -89,7 +82,7 @@ def _build_campus(plot: Plot, radius_m: float) -> None:
             cover=PAVED,
             corner_m=4,
         )
-    for k in range(int(rng.integers(3, 8))):  # ways from the doors to the streets
+    for k in range(int(rng.integers(3, 8))):  # paths from the doors to the streets
         turn = (
             angle
             + float(rng.choice([0, pi / 2, pi, -pi / 2]))
@@ -119,8 +112,15 @@ def _build_campus(plot: Plot, radius_m: float) -> None:
             )
     if rng.random() < 0.25:
         px, py = plot.spot(14)
-        grounds.draw_water(canvas, rng, px, py, float(rng.uniform(0, pi)), float(rng.uniform(6, 12)),
-                      float(rng.uniform(4, 8)))  # fmt: skip
+        grounds.draw_water(
+            canvas,
+            rng,
+            px,
+            py,
+            float(rng.uniform(0, pi)),
+            float(rng.uniform(6, 12)),
+            float(rng.uniform(4, 8)),
+        )
     skew = float(rng.choice([0.0, 0.0, 0.0, pi / 4])) + float(rng.normal(0, 0.04))
     landmark.build_landmark(
         canvas, rng, angle=angle + skew + float(rng.choice([0, pi / 2])), radius_m=radius_m
@@ -128,9 +128,13 @@ def _build_campus(plot: Plot, radius_m: float) -> None:
     plot.plant(1.2)
 
 
-def _add_street_details(canvas: Canvas, grid: streets.StreetGrid, rng: np.random.Generator, leaves: tuple[float, float, float],
-                 ) -> None:  # fmt: skip
-    """Cars on the roads and along the kerbs, trees in rows beside them."""
+def _add_street_details(
+    canvas: Canvas,
+    grid: streets.StreetGrid,
+    rng: np.random.Generator,
+    leaves: tuple[float, float, float],
+) -> None:
+    """Cars on the roads and along the kerbs, rows of trees beside them."""
     half = canvas.extent_m / 2
     rows = float(rng.choice([0.0, 0.35, 0.8], p=[0.4, 0.35, 0.25]))
     for street, is_avenue in [(s, True) for s in grid.avenues] + [(s, False) for s in grid.crosses]:

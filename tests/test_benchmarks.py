@@ -1,0 +1,133 @@
+"""Every script of benchmarks/ runs at its smallest size and prints its ratio to a baseline."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import ray
+
+from tests.launcher import ROOT, Launcher
+
+FOLDER = ROOT / "benchmarks"
+HELPERS = {"synthetic", "ablation_data"}
+"Modules that other benchmarks import."
+RESNET = "--depth 18 --width 0.25 --size 128"
+"The smallest network of the embedding benchmarks."
+ONE_ROUND = f"{RESNET} --rounds 1"
+
+CASES: dict[str, tuple[str, str]] = {
+    "ablation": (
+        "--textures {images} --out {out} --seeds 1 --period 1 --recipes paper --town-epochs 1 "
+        "--scale 0.01",
+        r"1 seeds: d2s_r1 \d",
+    ),
+    "damage": (
+        "--rows 512 --depth 18 --repeats 1",
+        r"a checkpoint loaded: [\d.]+ x the time without checks",
+    ),
+    "embed": (
+        f"{ONE_ROUND} --encoders folded --probes 2 --calibration 2 --batch-size 2",
+        r"folded: [\d.]+ x the plain encoder's images per second",
+    ),
+    "embed_pipeline": (
+        f"{ONE_ROUND} --distinct 4 --seconds 0.1 --few 0",
+        r"tar -> Parquet.* [\d.]+ x the encoder alone",
+    ),
+    "embed_script": (
+        f"{ONE_ROUND} --images 4 --batch 2 --precisions float32 --compiling never",
+        r"[\d.]+ x the plain script .*cosine with it 1\.0000",
+    ),
+    "embeddings": (
+        "--imagery {images} --checkpoint {trained}/run/last.pt --out {out} --rows 20 --queries 5 "
+        "--batch-size 10",
+        r"gallery: 20 of 20, \d+ crops/s, [\d.]+ x the encoder alone",
+    ),
+    "evaluate": ("--scale 0.01", r"satellite->drone .* [\d.]+ x the float32 products"),
+    "index": (
+        "--rows 2000 --dimension 32 --rounds 1 --factories planned",
+        r"Flat \(the planner\) .* [\d.]+ x \|",
+    ),
+    "serve": (
+        "--checkpoint {trained}/run/last.pt --index {trained}/index "
+        "--photos {trained}/flights/test/query_drone --clients 2 --seconds 0.2 --rounds 1",
+        r"batching [\d.]+ x the photos/s",
+    ),
+    "shards": ("--images 20 --side 64 --repeats 1", r"two tasks takes [\d.]+ x tar's time"),
+    "simulate": ("--sizes 64 --views 1", r"[\d.]+ x the time of encoding them as JPEG"),
+    "streaming": (
+        "--distinct 2 --few 20 --many 40",
+        r"peak memory of 40 images streamed: [\d.]+ x that of 20",
+    ),
+    "train_step": (
+        "--cases smoke --steps 1 --rounds 1",
+        r"streamed step .* [\d.]+ x the resident step",
+    ),
+}
+"Script -> arguments of its smallest size, and a line that it has to print."
+LOCATE = (
+    "--textures {images} --out {trained} --epochs 1 --hold-out 0.4 --train-locations 36 "
+    "--test-locations 6 --distractors 14 --flights 1 --stops 3 --draws 1"
+)
+
+
+def run(launcher: Launcher, name: str, arguments: str, **folders: Path) -> str:
+    """Run a benchmark to its end on the session's Ray; its output."""
+    words = arguments.format(**folders).split()
+    address: str = ray.get_runtime_context().gcs_address
+    result = launcher.start(name, words, folder="benchmarks", RAY_ADDRESS=address).end()
+    assert result.code == 0, result.output[-3000:]
+    return result.output
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Overhead images, synthetic."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(FOLDER))
+        from synthetic import jpegs
+    del sys.modules["synthetic"]
+    folder = tmp_path_factory.mktemp("images")
+    for number, data in enumerate(jpegs(56, 96, 96)):
+        (folder / f"{number:03d}.jpg").write_bytes(data)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(
+    prepared: Launcher,
+    ray_cluster: None,
+    images: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Path, str]:
+    """The artefacts of benchmarks/locate.py, among them a checkpoint and an index; its output."""
+    folder = tmp_path_factory.mktemp("locate")
+    return folder, run(prepared, "locate", LOCATE, images=images, trained=folder)
+
+
+def test_every_script_has_a_case() -> None:
+    assert {path.stem for path in FOLDER.glob("*.py")} == {*CASES, "locate"} | HELPERS
+
+
+def test_locate_compares_tracks_with_single_photos(trained: tuple[Path, str]) -> None:
+    folder, output = trained
+    assert re.search(r"ms per track of 3 photos, [\d.]+ x the time of their single", output), output
+    assert (folder / "reliability.svg").stat().st_size > 0
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_script_prints_a_ratio(
+    name: str,
+    prepared: Launcher,
+    ray_cluster: None,
+    request: pytest.FixtureRequest,
+    tmp_path: Path,
+) -> None:
+    arguments, expected = CASES[name]
+    folders: dict[str, Path] = {"out": tmp_path}
+    if "{images}" in arguments:
+        folders["images"] = request.getfixturevalue("images")
+    if "{trained}" in arguments:
+        folders["trained"] = request.getfixturevalue("trained")[0]
+    output = run(prepared, name, arguments, **folders)
+    assert re.search(expected, output), output[-3000:]
