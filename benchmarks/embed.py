@@ -94,7 +94,7 @@ def compare_encoders(encoder: FeatureEncoder, size: int, args: argparse.Namespac
                 batch_size=batch,
                 probe_B3HW=probe_B3HW,
                 calibration_B3HW=soft_noise(args.calibration, size, seed=4),
-                say=lambda message: None,
+                log=lambda message: None,
             )
         except PrecisionError as error:
             print(f"{name}: not available here: {error}")

@@ -1,4 +1,11 @@
-"""The command lines, the only place where model and pipeline meet."""
+"""The jobs: one entry script each, and the only package where model and pipeline meet.
+
+In: a command line. Out: an artefact on disk (shards, a run, a table, an index, answers), and an
+exit code. `jobs/NAME.py` has a job's settings and imports its stage only after parsing: from
+`pipeline`, from `training/` (the training loop), `encoding/` (checkpoint and images to embeddings)
+or `stages/` (the other stages that need the network). `command_line/` is what all of them share.
+Begin with `train.py` or `locate.py` and follow its one import.
+"""
 
 import sys
 from collections.abc import Callable
@@ -6,8 +13,8 @@ from functools import partial
 from types import TracebackType
 from typing import Any
 
-STOPPED = "stopped; run the same command again to go on"
-"What a job says last when Ctrl-C or SIGTERM ends it."
+STOPPED = "stopped; run the same command again to resume"
+"A job's last line when Ctrl-C or SIGTERM ends it."
 Hook = Callable[[type[BaseException], BaseException, TracebackType | None], Any]
 
 
@@ -20,6 +27,6 @@ def _quietly(
         otherwise(kind, error, trace)
 
 
-# Before jobs/command_line/cli.py has begun: seconds go by while torch and Ray are imported, and
-# Ctrl-C is pressed in these too.
+# For Ctrl-C before and after jobs/command_line/cli.py handles it: while modules are imported, and
+# at the interpreter's end.
 sys.excepthook = partial(_quietly, sys.excepthook)

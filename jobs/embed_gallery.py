@@ -1,4 +1,6 @@
-"""Embed shards into a feature table: `embed_gallery.py --shards DIR --checkpoint FILE --out TABLE`"""
+"""Embed shards into a feature table: `embed_gallery.py --shards DIR --checkpoint FILE --out
+TABLE`
+"""
 
 from dataclasses import fields
 

@@ -1,4 +1,5 @@
-"""Pack imagery into webdataset shards: `make_shards.py --source university1652 --root DIR --out DIR`
+"""Pack imagery into webdataset shards: `make_shards.py --source university1652 --root DIR --out
+DIR`
 
 A finished set is checked by `make_shards.py --verify --out DIR`, and `make_shards.py --export FILE
 --out DIR` writes its record table as Parquet or GeoJSON.

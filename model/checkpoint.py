@@ -23,7 +23,8 @@ from model.pvda import FeatureEncoder
 from model.weights import torch_files
 
 FORMAT = 2
-"""Version of the fields. 2: the network names its backbone, the recipe has the settings' new names."""
+"""Version of the fields. 2: the network names its backbone, the recipe has the settings' new names.
+"""
 CHECKSUM_MARK = b"pvda.sha256"
 CHECKSUM_PATTERN = re.compile(rb"pvda\.sha256:([0-9a-f]{64}):pvda\.sha256")
 CHECKSUM_BYTES = 2 * (len(CHECKSUM_MARK) + 1) + 64

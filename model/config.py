@@ -30,7 +30,7 @@ class PVDAConfig:
     dropout: float = 0.75
     "Before the location classifier [paper, LPN]."
     discriminator_channels: int = 1024
-    "Of the view discriminator's convolutions [paper, fig. 2]."
+    "Channels of the view discriminator's convolutions [paper, fig. 2]."
 
     def __post_init__(self) -> None:
         if self.backbone not in BACKBONES:
@@ -58,7 +58,7 @@ Precision = Literal["auto", "float32", "bfloat16"]
 
 @dataclass(frozen=True, kw_only=True)
 class Optimization:
-    """How the weights are moved. The defaults are the paper's."""
+    """How the weights are updated. The defaults are the paper's."""
 
     optimizer: Literal["sgd", "adamw"] = "sgd"
     """Of the encoder and classifier: SGD with Nesterov momentum [LPN], or AdamW for short runs from
@@ -70,7 +70,7 @@ class Optimization:
     classifier_lr: float = 0.01
     "Learning rate of the location classifier [paper]."
     discriminator_lr: float = 0.002
-    "Learning rate of D, which Adam moves [paper]."
+    "Learning rate of D, whose optimizer is Adam [paper]."
     momentum: float = 0.9
     "Of SGD [LPN]."
     weight_decay: float = 5e-4

@@ -2,8 +2,8 @@
 
 All reduce by the mean over the images of a view, then sum over views and rings [LPN]: literal sums
 over the data set, as printed, would weigh 54 UAV images against one satellite image. Each equation
-is the sum of its terms, one per view (and ring), which training shows one by one. Shapes: B images,
-V views, P rings, L locations.
+is the sum of its terms, one per view (and ring), which training reports one by one. Shapes: B
+images, V views, P rings, L locations.
 """
 
 import torch
@@ -24,7 +24,7 @@ def location_loss(
 def location_terms(
     logits1_BPL: Tensor, location1_B: Tensor, logits2_BPL: Tensor, location2_B: Tensor
 ) -> Tensor:
-    """The terms of Eq. 1 (V, P): cross-entropy of each view and ring, mean over the view's images."""
+    """The terms of Eq. 1 (V, P): cross-entropy by view and ring, mean over the view's images."""
     return torch.stack([_by_ring(logits1_BPL, location1_B), _by_ring(logits2_BPL, location2_B)])
 
 
@@ -56,8 +56,8 @@ def feature_loss(location: Tensor, adversarial: Tensor, alpha: float) -> Tensor:
 
 
 def _by_ring(logits_BPL: Tensor, location_B: Tensor) -> Tensor:
-    # In float32 whatever the networks computed in: a softmax over many locations has no bits to
-    # spare.
+    # In float32 whatever precision the networks computed in: a softmax over many locations needs
+    # all of its bits.
     parts = logits_BPL.shape[1]
     each_BP = F.cross_entropy(
         logits_BPL.float().flatten(0, 1), location_B.repeat_interleave(parts), reduction="none"

@@ -38,7 +38,9 @@ class FeatureEncoder(nn.Module):
             self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
 
     def forward(self, images_B3HW: Tensor) -> tuple[Tensor, Tensor]:
-        """Bytes (B, 3, H, W) -> maps (B, C, H/16, W/16) and one embedding g per ring (B, P, D)."""
+        """Bytes (B, 3, H, W) -> maps (B, C, H/stride, W/stride), one embedding g per ring (B, P,
+        D).
+        """
         normalised = (images_B3HW.to(self.mean_31.dtype) / 255 - self.mean_31) / self.std_31
         maps_BCHW = self.backbone(normalised)
         rings_BPC = ring_average(maps_BCHW, self.parts, self.divisor)

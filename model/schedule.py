@@ -1,6 +1,6 @@
 """Progressive alpha and warm restarts: a pure function of the epoch.
 
-In: how many epochs of training are over. Out: alpha and what every learning rate is multiplied by.
+In: the completed epochs of training. Out: alpha and the factor of every learning rate.
 """
 
 import math
@@ -10,7 +10,7 @@ from typing import Literal
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """How alpha and the learning rates move. The defaults are the paper's."""
+    """How alpha and the learning rates change. The defaults are the paper's."""
 
     epochs: int = 560
     """Passes over the satellite view in all: four periods [chosen: the ablation decays at 140, 280
@@ -18,9 +18,9 @@ class Schedule:
     alpha: float = 0.9
     "Weight of the adversarial loss in the first period [paper]."
     alpha_step: float = 0.1
-    "What it grows by at each new period [paper]."
+    "Increment of alpha at each new period [paper]."
     period: int = 140
-    "Epochs between two growths of alpha [paper]."
+    "Epochs between two increments of alpha [paper]."
     lr_schedule: Literal["step", "cosine"] = "step"
     """`step` is the paper's decay; `cosine` falls to zero over all epochs, for short runs from
     scratch."""
@@ -45,24 +45,24 @@ class Schedule:
 
 @dataclass(frozen=True, kw_only=True)
 class ScheduleState:
-    """What holds at one moment of training."""
+    """Alpha and learning rates at one moment of training."""
 
     alpha: float
     lr_scale: float
-    "Every learning rate is its start times this."
+    "Factor of every learning rate, on its initial value."
 
 
 def schedule_at(schedule: Schedule, epoch: float) -> ScheduleState:
     """Alpha and learning-rate scale after `epoch` passes; fractions of an epoch matter to warm-up
     and cosine only.
     """
-    whole = math.floor(epoch)
-    periods, within = divmod(whole, schedule.period)
+    completed = math.floor(epoch)
+    periods, within = divmod(completed, schedule.period)
     alpha = schedule.alpha + periods * schedule.alpha_step
     if schedule.lr_schedule == "cosine":
         scale = 0.5 * (1 + math.cos(math.pi * min(1.0, epoch / schedule.epochs)))
     else:
-        counted = within if schedule.restart else whole
+        counted = within if schedule.restart else completed
         scale = schedule.decay ** sum(counted >= at for at in schedule.decay_epochs)
     if epoch < schedule.warmup_epochs:
         scale *= epoch / schedule.warmup_epochs

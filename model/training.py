@@ -1,6 +1,6 @@
-"""The two-step update of PVDA, and the state that a checkpoint holds. Knows no Ray and no files.
+"""The two-step update of PVDA, and the state that a checkpoint stores. Knows no Ray and no files.
 
-In: a batch of each view. Out: changed weights, and the measures of the step, which stay on the
+In: a batch of each view. Out: changed weights, and the metrics of the step, which stay on the
 device. Shapes: B images of a view, H x W pixels or cells, C channels of the maps, P rings, L
 locations.
 """
@@ -23,12 +23,11 @@ VIEWS = ("drone", "satellite")
 
 
 class EncoderWithClassifier(nn.Module):
-    """Encoder and classifier as one module: one forward pass an iteration, which is what DDP wants
-    to see.
+    """Encoder and classifier as one module: DDP expects one forward pass an iteration.
 
     The encoder runs once per view, so that BatchNorm's statistics are a view's own [LPN]; with
-    `joint_bn` once on both, so that they are common. Only common ones are what the encoder will be
-    tested with, its running means.
+    `joint_bn` once on both, so that they are common. Only common ones match the running means that
+    the encoder is tested with.
     """
 
     def __init__(self, config: PVDAConfig, locations: int, joint_bn: bool = False) -> None:
@@ -40,7 +39,7 @@ class EncoderWithClassifier(nn.Module):
     def forward(
         self, images1_B3HW: Tensor, images2_B3HW: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """UAV and satellite images -> maps of each (B, C, H, W), location logits of each (B, P, L)."""
+        """UAV and satellite images -> maps (B, C, H, W) and location logits (B, P, L) of each."""
         if self.joint_bn:
             count = len(images1_B3HW)
             maps_BCHW, g_BPD = self.encoder(torch.cat([images1_B3HW, images2_B3HW]))
@@ -52,13 +51,14 @@ class EncoderWithClassifier(nn.Module):
 
 
 class Training:
-    """Networks and optimisers of one run, and the iteration that moves them.
+    """Networks and optimizers of one run, and the iteration that updates them.
 
-    `wrap_ddp` wraps each trained module (DDP over several workers); `adversary=False` leaves the discriminator out,
-    which is LPN. With `sync_bn` BatchNorm's statistics are those of all workers' images, with `joint_bn` the encoder's are
-    those of both views. In `bfloat16` the networks'
-    products are computed so, under autocast, and weights, losses and updates stay float32; `auto` does it on CUDA.
-    With `compile_for` images of each view a step the networks are compiled; `not_compiled` says why they are not.
+    `wrap_ddp` wraps each trained module (DDP over several workers); `adversary=False` leaves the
+    discriminator out, which is LPN. With `sync_bn` BatchNorm's statistics are those of all workers'
+    images, with `joint_bn` the encoder's are those of both views. In `bfloat16` the networks'
+    products are computed under autocast, and weights, losses and updates stay float32; `auto` does
+    this on CUDA. With `compile_for` images of each view a step the networks are compiled;
+    `compile_error` has the reason where they are not.
     """
 
     def __init__(
@@ -91,44 +91,44 @@ class Training:
         self.compile_error = (
             None if compile_for is None else self._compile(config.image_size, compile_for)
         )
-        "Why the networks are not compiled though they should be."
+        "Why the networks are not compiled though compilation was requested."
         self._wrapped = wrap_ddp(self.model)
         self._discriminator = None if self.discriminator is None else wrap_ddp(self.discriminator)
         self.optimizers = self._build_optimizers(optimization)
 
-    def _build_optimizers(self, rates: Optimization) -> list[Optimizer]:
-        """Of encoder and classifier, and of D where there is one; every group knows the rate that
-        it starts with.
+    def _build_optimizers(self, config: Optimization) -> list[Optimizer]:
+        """One for encoder and classifier, one for D where there is one; `start` of a group is its
+        initial learning rate.
         """
 
         def group(name: str, module: nn.Module, rate: float) -> dict[str, Any]:
             return {"params": list(module.parameters()), "start": rate, "name": name}
 
         groups = [
-            group("backbone", self.model.encoder.backbone, rates.backbone_lr),
-            group("head", self.model.encoder.refine, rates.head_lr),
-            group("classifier", self.model.classifier, rates.classifier_lr),
+            group("backbone", self.model.encoder.backbone, config.backbone_lr),
+            group("head", self.model.encoder.refine, config.head_lr),
+            group("classifier", self.model.classifier, config.classifier_lr),
         ]
         optimizers: list[Optimizer] = [
             SGD(
                 groups,
                 lr=0.0,
-                momentum=rates.momentum,
+                momentum=config.momentum,
                 nesterov=True,
-                weight_decay=rates.weight_decay,
+                weight_decay=config.weight_decay,
             )
-            if rates.optimizer == "sgd"
-            else AdamW(groups, lr=0.0, weight_decay=rates.weight_decay)
+            if config.optimizer == "sgd"
+            else AdamW(groups, lr=0.0, weight_decay=config.weight_decay)
         ]
         if self.discriminator is not None:
             optimizers.append(
-                Adam([group("discriminator", self.discriminator, rates.discriminator_lr)], lr=0.0)
+                Adam([group("discriminator", self.discriminator, config.discriminator_lr)], lr=0.0)
             )
         return optimizers
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """The networks by the name under which a checkpoint holds them."""
+        """The networks by their names in a checkpoint."""
         named: dict[str, nn.Module] = {
             "encoder": self.model.encoder,
             "classifier": self.model.classifier,
@@ -152,28 +152,28 @@ class Training:
         location1_B: Tensor,
         images2_B3HW: Tensor,
         location2_B: Tensor,
-        now: ScheduleState,
+        schedule: ScheduleState,
     ) -> dict[str, Tensor]:
         """One iteration: D takes a step on Eq. 2, then encoder and classifier one on Eq. 4.
 
-        One encoder pass serves both steps; D sees both views in one batch, since BatchNorm over
-        separate batches would erase the very shift that it must see. Returns the step's measures,
-        detached scalars that are still on the device: each loss, whole and by view (and ring), how
-        often D was right, and the length of each network's gradient.
+        One encoder pass serves both steps; D gets both views in one batch, since BatchNorm over
+        separate batches would erase the shift between the views that D learns from. Returns the
+        step's metrics, detached scalars that are still on the device: each loss, in total and by
+        view (and ring), the accuracy of D, and the norm of each network's gradient.
         """
         for optimizer in self.optimizers:
             for group in optimizer.param_groups:
-                group["lr"] = group["start"] * now.lr_scale
+                group["lr"] = group["start"] * schedule.lr_scale
         with self._autocast():
             maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = self._wrapped(
                 images1_B3HW, images2_B3HW
             )
         located_VP = location_terms(logits1_BPL, location1_B, logits2_BPL, location2_B)
         total = located_VP.sum()
-        measures = {"location_loss": total} | _by_view("location_loss", located_VP)
+        metrics = {"location_loss": total} | _by_view("location_loss", located_VP)
         if self.discriminator is not None:
             both_BCHW = torch.cat([maps1_BCHW, maps2_BCHW])
-            measures |= self.discriminate(both_BCHW.detach(), len(maps1_BCHW))
+            metrics |= self.discriminate(both_BCHW.detach(), len(maps1_BCHW))
             # D's weights are constants of the second step; its BatchNorm stays in training mode.
             self.discriminator.requires_grad_(False)
             with self._autocast():
@@ -181,8 +181,8 @@ class Training:
             self.discriminator.requires_grad_(True)
             adversarial_V = adversarial_terms(*verdict_B2.tensor_split([len(maps1_BCHW)]))
             adversarial = adversarial_V.sum()
-            total = feature_loss(total, adversarial, now.alpha)
-            measures |= {"adversarial_loss": adversarial} | _by_view(
+            total = feature_loss(total, adversarial, schedule.alpha)
+            metrics |= {"adversarial_loss": adversarial} | _by_view(
                 "adversarial_loss", adversarial_V
             )
         self.optimizers[0].zero_grad(set_to_none=True)
@@ -191,12 +191,12 @@ class Training:
             ("encoder", self.model.encoder),
             ("classifier", self.model.classifier),
         ):
-            measures[f"gradient_norm/{name}"] = gradient_norm(module)
+            metrics[f"gradient_norm/{name}"] = gradient_norm(module)
         self.optimizers[0].step()
-        return {name: measure.detach() for name, measure in measures.items()}
+        return {name: metric.detach() for name, metric in metrics.items()}
 
     def discriminate(self, both_BCHW: Tensor, drones: int) -> dict[str, Tensor]:
-        """Step 1: move D towards telling the views apart; the first `drones` maps are the UAV's."""
+        """Step 1: train D to tell the views apart; the first `drones` maps are the UAV's."""
         assert self._discriminator is not None
         with self._autocast():
             verdict_B2 = self._discriminator(both_BCHW)
@@ -220,11 +220,11 @@ class Training:
         )
 
     def _compile(self, size: int, count: int) -> str | None:
-        """Compile the networks in place, and try them: torch compiles at the first call. Returns
-        why it cannot.
+        """Compile the networks in place and run them once: torch compiles at the first call.
+        Returns the reason where it cannot.
         """
         networks = [self.model] + ([self.discriminator] if self.discriminator is not None else [])
-        held = [
+        states = [
             {name: tensor.clone() for name, tensor in network.state_dict().items()}
             for network in networks
         ]
@@ -241,9 +241,10 @@ class Training:
         except Exception as error:  # the compiler's own kinds, the C++ compiler's, the driver's
             for network in networks:
                 network._compiled_call_impl = None  # torch has no public way back
-            return f"{type(error).__name__}: {str(error).strip().splitlines()[0] if str(error).strip() else ''}"
-        finally:  # the trial left its marks on BatchNorm's statistics
-            for network, state in zip(networks, held, strict=True):
+            reason = "".join(str(error).strip().splitlines()[:1])
+            return f"{type(error).__name__}: {reason}"
+        finally:  # the trial changed BatchNorm's statistics
+            for network, state in zip(networks, states, strict=True):
                 network.load_state_dict(state)
                 network.zero_grad(set_to_none=True)
         return None
@@ -252,8 +253,8 @@ class Training:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the next step depends on, besides the data's order, as tensors and plain
-        values.
+        """Everything that the next step depends on, besides the order of the data, as tensors and
+        plain values.
         """
         return {
             "modules": {name: module.state_dict() for name, module in self.modules.items()},
@@ -262,7 +263,7 @@ class Training:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where `state` was taken."""
+        """Resume where `state` was taken."""
         for name, module in self.modules.items():
             module.load_state_dict(state["modules"][name])
         for optimizer, saved in zip(self.optimizers, state["optimizers"], strict=True):
@@ -271,7 +272,7 @@ class Training:
 
 
 def gradient_norm(module: nn.Module) -> Tensor:
-    """Length of a network's gradient, all its parameters taken as one vector."""
+    """Norm of a network's gradient, all its parameters taken as one vector."""
     return get_total_norm(
         [parameter.grad for parameter in module.parameters() if parameter.grad is not None]
     )
@@ -280,11 +281,12 @@ def gradient_norm(module: nn.Module) -> Tensor:
 def _to_device(module: Module, device: torch.device, sync_bn: bool) -> Module:
     if sync_bn:
         module = nn.SyncBatchNorm.convert_sync_batchnorm(module)  # type: ignore[no-untyped-call]
-    return module.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
+    placed: Module = module.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return placed
 
 
 def _by_view(name: str, terms: Tensor) -> dict[str, Tensor]:
-    """The terms of a measure by view (V,), and by ring where it has any (V, P)."""
+    """The terms of a metric by view (V,), and by ring where it has any (V, P)."""
     if terms.dim() == 1:
         return {f"{name}/{view}": term for view, term in zip(VIEWS, terms.unbind(), strict=True)}
     rings = {

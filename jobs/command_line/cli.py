@@ -1,4 +1,5 @@
-"""How every job starts and ends: flags from its settings, one sentence and exit code 2 on bad input.
+"""How every job starts and ends: flags from its settings, one sentence and exit code 2 on bad
+input.
 
 In: a job's function, whose parameters are its settings. Out: its call, and an exit code. Each
 `jobs/NAME.py` imports its settings alone, and its function imports the work. So `--help` and a
@@ -190,8 +191,8 @@ def _stop(code: int) -> NoReturn:
 
 
 def _is_loss(error: BaseException) -> bool:
-    """Whether Ray lost a node or worker, in contrast to an error of the work itself. Imports nothing
-    for jobs without Ray.
+    """Whether Ray lost a node or worker, in contrast to an error of the work itself. Imports
+    nothing for jobs without Ray.
     """
     if "ray" not in sys.modules:
         return False

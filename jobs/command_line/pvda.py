@@ -12,7 +12,7 @@ from jobs import __file__ as JOBS_FILE
 
 
 def jobs() -> dict[str, str]:
-    """The jobs by name, with the first sentence of each script's docstring. Imports none of them."""
+    """The jobs by name, each with its script's first sentence. Imports none of them."""
     found = {}
     for path in sorted(Path(JOBS_FILE).parent.glob("[a-z]*.py")):
         text = ast.get_docstring(ast.parse(path.read_text())) or ""

@@ -1,8 +1,8 @@
-"""Ctrl-C and SIGTERM, raised until they are heard.
+"""Ctrl-C and SIGTERM, raised until they come through.
 
-An exception that a signal's handler raises comes up wherever the program happens to be. Where that
-is a callback within an import, or a library's C code that clears errors, it is dropped: one Ctrl-C
-in some twenty while pyarrow looks for pandas.
+An exception from a signal handler is raised wherever the program is at that moment. In a callback
+within an import, or in C code of a library that clears errors, it is lost: one Ctrl-C in some
+twenty while pyarrow looks for pandas.
 """
 
 import signal
@@ -20,22 +20,20 @@ def interruptible() -> Iterator[list[int]]:
     """Raise KeyboardInterrupt here on SIGINT and SIGTERM, again and again until it comes through;
     the numbers received.
 
-    Outside the main thread, where Python hears no signals, nothing is changed, and a SIGINT that
-    the caller's shell has it ignore is left ignored.
+    Outside the main thread, where Python handles no signals, nothing is changed, and a SIGINT that
+    the calling shell ignores stays ignored.
     """
-    received: list[
-        int
-    ] = []  # Ray makes a plain KeyboardInterrupt of whatever a handler raises while it waits
+    # Ray turns any exception of a handler into a plain KeyboardInterrupt while it waits.
+    received: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield received
         return
 
-    over = False
+    stopped = False
 
     def stop(number: int, frame: FrameType | None) -> None:
-        # an alarm that was on its way when the timer was stopped: set again it would outlive this
-        # handler
-        if over:
+        # A pending alarm when the timer was stopped: set again it would outlive this handler.
+        if stopped:
             return
         signal.setitimer(signal.ITIMER_REAL, SECONDS_TO_REPEAT)
         if number != signal.SIGALRM:
@@ -44,23 +42,21 @@ def interruptible() -> Iterator[list[int]]:
             return
         raise KeyboardInterrupt
 
-    heard = [signal.SIGALRM, signal.SIGTERM]
+    handled = [signal.SIGALRM, signal.SIGTERM]
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        heard.append(signal.SIGINT)
-    before = {number: signal.signal(number, stop) for number in heard}
+        handled.append(signal.SIGINT)
+    before = {number: signal.signal(number, stop) for number in handled}
     try:
         yield received
     finally:
-        over = True
+        stopped = True
         signal.setitimer(signal.ITIMER_REAL, 0)
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
 def _is_raising() -> bool:
-    """Whether a KeyboardInterrupt is being handled: what tidies up after it is not to be
-    interrupted.
-    """
+    """Whether a KeyboardInterrupt is being handled: its cleanup must not be interrupted."""
     error = sys.exc_info()[1]
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__context__

@@ -88,7 +88,7 @@ class WorkerEncoder:
             compiled={"auto": "auto", "always": True, "never": False}[blueprint.settings.compiling],  # type: ignore[arg-type]
             images=blueprint.images,
             calibration_B3HW=None if calibration is None else torch.from_numpy(calibration),
-            say=self.remarks.append,
+            log=self.remarks.append,
         )
 
     def __call__(self, images_B3HW: Bytes) -> Floats:
@@ -173,7 +173,8 @@ def first_images(shards: ShardSet, size: int, resizer: Resizer, count: int) -> B
     ]
     if not mixed:
         raise InputError(
-            f"none of the first images of {shards.path} can be decoded, expected some to check the encoder by; see "
+            f"none of the first images of {shards.path} can be decoded, expected some to check the "
+            "encoder by; see "
             "make_shards.py --verify, and pack again"
         )
     return stack(mixed)
@@ -185,7 +186,8 @@ def usable_pixels(shards: ShardSet, sample: Sample, image: Pixels | DecodeError)
     """
     if isinstance(image, DecodeError) and image.reason == CHANGED:
         raise InputError(
-            f"image {sample.key} of {shards.path} is not the one that was packed, expected it to check the encoder by; "
+            f"image {sample.key} of {shards.path} is not the one that was packed, expected it to "
+            "check the encoder by; "
             f"{shards.repair_hint}"
         )
     return None if isinstance(image, DecodeError) else image

@@ -66,8 +66,9 @@ class PhotoEncoder:
     ) -> None:
         """`checkpoint` are the bytes of the file `name`, `index_facts` those of Index.facts.
 
-        `shards` are those that the index was made of: needed only where its embeddings are int8, which they calibrated.
-        Raises CheckpointError when the bytes are no checkpoint, InputError when they did not make the index.
+        `shards` are those that the index was made of: needed only where its embeddings are int8,
+        which they calibrated. Raises CheckpointError when the bytes are no checkpoint, InputError
+        when they did not make the index.
         """
         opened = loads(checkpoint, name)
         self.image_size = opened.network.image_size
@@ -81,7 +82,8 @@ class PhotoEncoder:
                 else ", or, where it was embedded in int8, give the --shards that it was made of"
             )
             raise InputError(
-                f"{name} did not make this index: none of its fingerprints is {self.fingerprint[:12]}..., expected the "
+                f"{name} did not make this index: none of its fingerprints is "
+                f"{self.fingerprint[:12]}..., expected the "
                 f"checkpoint that the gallery was embedded with; name that one{int8}"
             )
         self.precision: EffectivePrecision = way.precision
@@ -101,7 +103,7 @@ class PhotoEncoder:
             mirror=way.mirror,
             compiled=False,  # compiling takes longer than some hundred photos
             calibration_B3HW=None if calibration is None else torch.from_numpy(calibration),
-            say=self.remarks.append,
+            log=self.remarks.append,
         )
         self.dimension = opened.network.embedding_dim
 

@@ -133,7 +133,8 @@ def demo(settings: DemoSettings) -> list[dict[str, Any]]:
     )
     print_table(rows["trained"])
     print(
-        f"report: {storage.join(out, 'evaluation-trained', 'report.html')}\nphotos on the map: {page}"
+        f"report: {storage.join(out, 'evaluation-trained', 'report.html')}\nphotos on the map: "
+        f"{page}"
     )
     return rows["trained"]
 

@@ -64,7 +64,8 @@ def import_weights(settings: ImportWeightsSettings) -> str:
     storage.write_bytes(out, dumps(checkpoint))
     network = checkpoint.network
     console.print(
-        f"{out}: {network.backbone}, {network.parts} rings of {network.part_dim} numbers, {network.image_size} px, "
+        f"{out}: {network.backbone}, {network.parts} rings of {network.part_dim} numbers, "
+        f"{network.image_size} px, "
         f"{len(checkpoint.locations)} locations"
     )
     return out

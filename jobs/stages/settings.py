@@ -1,5 +1,5 @@
-"""The settings of the jobs whose stage needs the network and the pipeline. Imports nothing heavy, so
-that the command line is parsed at once."""
+"""The settings of the jobs whose stage needs the network and the pipeline. Imports nothing heavy,
+so that the command line is parsed at once."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any

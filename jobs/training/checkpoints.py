@@ -1,4 +1,4 @@
-"""A training run and its folder: checkpoints that survive any kill, and curves for people.
+"""A training run's folder: checkpoints that survive any kill, and metrics to watch.
 
 In: a run's settings and state. Out: RUN/last.pt and the checkpoints before it, RUN/metrics.jsonl,
 RUN/tensorboard.
@@ -26,7 +26,7 @@ ARCHIVE_PATTERN = re.compile(r"checkpoint-(\d+)-(\d+)\.pt")
 
 
 def archive_name(checkpoint: Checkpoint) -> str:
-    """What a checkpoint is called once another is the last."""
+    """The name of a checkpoint that is no longer the last one."""
     return f"checkpoint-{checkpoint.epoch:04d}-{checkpoint.step:05d}.pt"
 
 
@@ -42,10 +42,10 @@ def list_archived(out: str) -> list[str]:
 
 
 def find_checkpoint(
-    run: RunConfig, say: Callable[[str], None] = lambda word: None
-) -> tuple[str, Checkpoint] | None:
-    """Name and content of the run's newest checkpoint that can be read, if it has any; `say` is
-    told of those that cannot.
+    run: RunConfig, log: Callable[[str], None] = lambda message: None
+) -> FoundCheckpoint:
+    """Name and content of the run's newest checkpoint that can be read, if it has any; `log` gets a
+    message for each that cannot.
 
     Raises InputError when it is of another recipe, CheckpointError when none of them can be read.
     """
@@ -55,20 +55,21 @@ def find_checkpoint(
         if storage.exists(storage.join(run.out, name))
     ]
     if names and names[0] != CHECKPOINT_FILE:
-        say(
-            f"{storage.join(run.out, CHECKPOINT_FILE)} is missing; taking {names[0]}, the one before it"
+        log(
+            f"{storage.join(run.out, CHECKPOINT_FILE)} is missing; taking {names[0]}, the one "
+            "before it"
         )
     for number, name in enumerate(names, start=1):
         path = storage.join(run.out, name)
         try:
-            held = loads(storage.read_bytes(path), path)
+            checkpoint = loads(storage.read_bytes(path), path)
         except CheckpointError as error:
             if number == len(names):
                 raise
-            say(f"{error}; taking {names[number]}, the one before it")
+            log(f"{error}; taking {names[number]}, the one before it")
             continue
-        require_same_recipe(run, held, path)
-        return name, held
+        require_same_recipe(run, checkpoint, path)
+        return name, checkpoint
     return None
 
 
@@ -80,25 +81,27 @@ def read_checkpoint(run: RunConfig) -> Checkpoint | None:
     return None if found is None else found[1]
 
 
-def require_same_recipe(run: RunConfig, held: Checkpoint, path: str) -> None:
-    # Through JSON, as the checkpoint has it: tuples become lists.
-    recipe, trained = json.loads(json.dumps(asdict(run.recipe))), held.recipe
+def require_same_recipe(run: RunConfig, checkpoint: Checkpoint, path: str) -> None:
+    """Raise InputError where a checkpoint was trained with other settings."""
+    # Through JSON, as in the checkpoint: tuples become lists.
+    recipe, trained = json.loads(json.dumps(asdict(run.recipe))), checkpoint.recipe
     changed = sorted(name for name in recipe | trained if trained.get(name) != recipe.get(name))
     if changed:
         raise InputError(
-            f"{path} was trained by recipe {held.recipe.get('name')} with another {', '.join(changed)}; choose another --out, "
-            "or the same recipe and settings to go on with it"
+            f"{path} was trained by recipe {checkpoint.recipe.get('name')} with another "
+            f"{', '.join(changed)}; choose another "
+            "--out, or the same recipe and settings to resume it"
         )
 
 
 class CheckpointWriter:
-    """Writes a run's checkpoints: last.pt is always there and whole, the ones before it keep names
-    of their own.
+    """Writes a run's checkpoints: last.pt always exists and is complete, the ones before it get
+    names of their own.
     """
 
-    def __init__(self, run: RunConfig, found: tuple[str, Checkpoint] | None) -> None:
+    def __init__(self, run: RunConfig, found: FoundCheckpoint) -> None:
         self._run = run
-        # The name under which last.pt lives on; none where it was damaged.
+        # The name that last.pt gets when it is replaced; None where it was damaged.
         self._latest = (
             archive_name(found[1]) if found is not None and found[0] == CHECKPOINT_FILE else None
         )
@@ -114,48 +117,50 @@ class CheckpointWriter:
 
 
 class RunRecorder:
-    """What rank 0 does when a step or an epoch is over, so that a kill costs little and people can
-    watch.
+    """Rank 0's records after steps and epochs: checkpoints, so that a kill costs little, and
+    metrics.
     """
 
-    def __init__(self, run: RunConfig, found: tuple[str, Checkpoint] | None) -> None:
+    def __init__(self, run: RunConfig, found: FoundCheckpoint) -> None:
         self._run, self._checkpoints = run, CheckpointWriter(run, found)
-        self._curves = MetricsLogger(run.out, [] if found is None else found[1].history)
+        self._metrics = MetricsLogger(run.out, [] if found is None else found[1].history)
         self._saved = time.monotonic()
 
-    def after_step(self, now: Callable[[], Checkpoint]) -> None:
-        """Within an epoch: write what `now` gives where it is time."""
+    def after_step(self, checkpoint: Callable[[], Checkpoint]) -> None:
+        """Within an epoch: write the checkpoint where it is due."""
         if time.monotonic() - self._saved >= 60 * self._run.checkpoint_minutes:
-            self._write(now())
+            self._write(checkpoint())
 
-    def after_epoch(self, now: Callable[[], Checkpoint], history: list[dict[str, Any]]) -> None:
+    def after_epoch(
+        self, checkpoint: Callable[[], Checkpoint], history: list[dict[str, Any]]
+    ) -> None:
         """After an epoch, whose row is the last of `history`."""
         epoch = len(history)
-        # Before its checkpoint: a row without one is dropped by the next run, an epoch without its
-        # row would stay so.
-        self._curves.write(history)
+        # Before its checkpoint: on resume a row without a checkpoint is dropped, but an epoch
+        # without its row would stay without it.
+        self._metrics.write(history)
         if epoch % self._run.checkpoint_epochs == 0 or epoch == self._run.recipe.schedule.epochs:
-            self._write(now())
+            self._write(checkpoint())
         else:
-            self.after_step(now)
+            self.after_step(checkpoint)
 
     def _write(self, checkpoint: Checkpoint) -> None:
         self._checkpoints.write(checkpoint)
         self._saved = time.monotonic()
 
     def close(self) -> None:
-        self._curves.close()
+        self._metrics.close()
 
 
 class MetricsLogger:
-    """The run's curves for people: RUN/metrics.jsonl whole after each epoch, and TensorBoard where
-    RUN is on a disk.
+    """The run's metrics to watch: RUN/metrics.jsonl, rewritten after each epoch, and TensorBoard
+    where RUN is on a local disk.
     """
 
     def __init__(self, out: str, history: list[dict[str, Any]]) -> None:
         self._path = storage.join(out, METRICS_FILE)
         self._board: SummaryWriter | None = None
-        # What a killed run wrote after its last checkpoint is dropped, here and there.
+        # Rows that a killed run wrote after its last checkpoint are dropped, from both.
         if storage.exists(self._path):
             self._write(history)
         if storage.is_local(out):

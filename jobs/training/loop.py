@@ -65,7 +65,7 @@ def report_steps(state: TrainingState, figures: dict[str, Any], steps: int) -> N
 
 
 def count_damaged(state: TrainingState, epoch: int, first: str | None) -> int:
-    """Images of all workers that could not be decoded in this epoch; reported where there are any."""
+    """Images of all workers that could not be decoded in this epoch; reported if there are any."""
     counts = state.context.gather((state.metrics.damaged, first))
     total = sum(count for count, _ in counts)
     if total:

@@ -1,7 +1,6 @@
-"""Sums of what an epoch's steps measure: kept on the device, looked at when somebody asks, held in
-a checkpoint.
+"""Sums of an epoch's metrics: kept on the device, read on request, stored in a checkpoint.
 
-In: measures of steps. Out: their means. Looking waits for the device, so a step never does.
+In: metrics of steps. Out: their means. Only reading waits for the device; a step never does.
 """
 
 import math
@@ -15,44 +14,44 @@ SECONDS, DAMAGED = "seconds", "damaged_images"
 
 
 class NotFinite(ArithmeticError):
-    """A measure that is infinite or not a number. The message says which and its value."""
+    """A metric is infinite or not a number. The message has its name and value."""
 
 
 class MetricAccumulator:
-    """What the steps of one epoch add up to. `steps` and `state` are those of a checkpoint
-    that training resumes from.
+    """Sums over the steps of one epoch. `steps` and `state` are those of the checkpoint that
+    training resumes from.
     """
 
     def __init__(self, steps: int = 0, state: Mapping[str, Tensor] | None = None) -> None:
-        held = dict(state or {})
+        sums = dict(state or {})
         self.steps = steps
-        "That were added."
-        self.damaged = int(held.pop(DAMAGED, 0))
+        "Steps that were added."
+        self.damaged = int(sums.pop(DAMAGED, 0))
         "Images that could not be decoded, of those that this worker drew."
-        self._before = float(held.pop(SECONDS, 0.0))
+        self._before = float(sums.pop(SECONDS, 0.0))
         self._began = time.monotonic()
-        self._names = list(held)
-        self._sums: Tensor | None = torch.stack(list(held.values())) if held else None
+        self._names = list(sums)
+        self._sums: Tensor | None = torch.stack(list(sums.values())) if sums else None
 
     @property
     def seconds(self) -> float:
-        """Spent on the epoch, those before a kill included."""
+        """Spent on the epoch, including the time before a kill."""
         return self._before + time.monotonic() - self._began
 
-    def add(self, measures: Mapping[str, Tensor]) -> None:
+    def add(self, metrics: Mapping[str, Tensor]) -> None:
         """Add one step's scalars, on whatever device they are. In float64: an epoch may have many
         steps.
         """
-        values = torch.stack(list(measures.values())).double()
-        self._names = list(measures)
+        values = torch.stack(list(metrics.values())).double()
+        self._names = list(metrics)
         self._sums = values if self._sums is None else self._sums.to(values.device) + values
         self.steps += 1
 
     def means(self) -> dict[str, float]:
-        """Mean of each measure over the steps so far.
+        """Mean of each metric over the steps so far.
 
-        Raises NotFinite: a sum that was once infinite or no number stays so, hence nothing is
-        missed between two looks.
+        Raises NotFinite: a sum that was once infinite or NaN stays so, hence none is missed between
+        two reads.
         """
         sums = [] if self._sums is None else self._sums.tolist()
         means = {name: total / self.steps for name, total in zip(self._names, sums, strict=True)}
@@ -62,7 +61,7 @@ class MetricAccumulator:
         return means
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The sums as a checkpoint holds them."""
+        """The sums as a checkpoint stores them."""
         if self._sums is None:
             return {}
         # Copies: saved as views, each scalar would carry the whole vector along.
@@ -77,5 +76,5 @@ class MetricAccumulator:
 
 
 def first_not_finite(means: Iterable[tuple[str, float]]) -> str | None:
-    """The first measure that is not finite."""
+    """The first metric that is not finite."""
     return next((name for name, mean in means if not math.isfinite(mean)), None)

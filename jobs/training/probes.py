@@ -1,9 +1,7 @@
-"""What training does to places that it looks at from outside: the gap between the views, and
-retrieval of held-out places.
+"""Probes of training: the gap between the views, and retrieval of held-out locations.
 
 In: an encoder and the training stream. Out: figures for the epoch's row. Never the test set: a run
-that was chosen by it would report how well it was chosen. Nothing here changes what training does
-next.
+selected by it would report the selection. Probing does not change the steps that follow.
 
 Shapes: N images, B of a batch, C channels of the maps, E of an embedding.
 """
@@ -27,28 +25,28 @@ from pipeline.retrieval.metrics import summarise
 from pipeline.retrieval.ranking import rank
 
 GAP_IMAGES = 256
-"Of each view, for the view gap; half of them fit the probe, the other half is asked."
+"Images of each view for the view gap; half of them fit the probe, the other half test it."
 BATCH = 32
 RIDGE = 0.1
-"Of the linear probe, on standardised features, as a share of an image's squared length."
+"Ridge penalty of the linear probe on standardised features, as a share of an image's squared norm."
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProbeFeatures:
-    """What the encoder makes of some images of one view."""
+    """Features of some images of one view."""
 
     locations: list[str]
     pooled_NC: Floats
-    "The maps averaged over their cells: what the discriminator's task is about."
+    "The maps averaged over their cells, from which the discriminator tells the views apart."
     embedding_NE: Floats
 
 
 def probe(encoder: FeatureEncoder, stream: TrainingStream) -> dict[str, float]:
-    """The view gap and, where locations are held out, how well these are found in either direction.
+    """The view gap and, where locations are held out, the retrieval of these in either direction.
 
-    The held-out locations' images are all looked at; without any, the first training images, in the
-    shards' order. What cannot be decoded is left out; where that leaves no image of a view, an
-    InputError is raised.
+    Probes all images of the held-out locations; without any, the first training images, in the
+    shards' order. Damaged images are left out. Raises InputError where that leaves no image of a
+    view.
     """
     drone, satellite = (embed_view(encoder, stream, view) for view in (View.DRONE, View.SATELLITE))
     found = view_gap(drone.pooled_NC, satellite.pooled_NC)
@@ -64,26 +62,27 @@ def probe(encoder: FeatureEncoder, stream: TrainingStream) -> dict[str, float]:
 
 
 def embed_view(encoder: FeatureEncoder, stream: TrainingStream, view: View) -> ProbeFeatures:
-    """The images of one view through the encoder as it is, in evaluation mode for that long."""
+    """Features of one view's images by the encoder as it is now, in evaluation mode meanwhile."""
     device = next(encoder.parameters()).device
     was_training, locations, pooled, embeddings = encoder.training, [], [], []
     images = probe_images(stream, view)
     encoder.eval()
     with torch.no_grad():
         while group := list(islice(images, BATCH)):
-            whole, _ = split_failed(group)
-            if not whole:
+            decoded, _ = split_failed(group)
+            if not decoded:
                 continue
             maps_BCHW, g_BPD = encoder(
-                torch.from_numpy(stack([image for _, image in whole])).to(device)
+                torch.from_numpy(stack([image for _, image in decoded])).to(device)
             )
-            locations += [sample.metadata["location"] for sample, _ in whole]
+            locations += [sample.metadata["location"] for sample, _ in decoded]
             pooled.append(maps_BCHW.mean((2, 3)).float().cpu().numpy())
             embeddings.append(unit_embedding(g_BPD.float()).cpu().numpy())
     encoder.train(was_training)
     if not locations:
         raise InputError(
-            f"not one {view} image of {stream.shards.path} that the probes look at can be decoded, expected some; pack again"
+            f"not one {view} image of {stream.shards.path} that the probes look at can be decoded, "
+            "expected some; pack again"
         )
     return ProbeFeatures(
         locations=locations,
@@ -93,7 +92,7 @@ def embed_view(encoder: FeatureEncoder, stream: TrainingStream, view: View) -> P
 
 
 def probe_images(stream: TrainingStream, view: View) -> Iterator[Decoded]:
-    """The images that are looked at, as they are when tested: resized and nothing else."""
+    """The images to probe, preprocessed as in testing: resized, without augmentation."""
     config, held_out = stream.config, stream.held_out
     samples = (
         s
@@ -114,11 +113,11 @@ def embedding_set(seen: ProbeFeatures) -> EmbeddingSet:
 
 
 def view_gap(drone_NC: Floats, satellite_NC: Floats) -> dict[str, float]:
-    """How far apart the views are in the pooled maps.
+    """The gap between the views in the pooled maps.
 
-    `accuracy`: of a linear probe that was fitted on half of the images (ridge regression on the views), on the other half;
-    0.5 where nothing tells the views apart. `distance`: between the views' means, in units of the images' root mean square
-    distance from their own view's mean.
+    `accuracy`: of a linear probe (ridge regression on the views) that was fitted on half of the
+    images, on the other half; 0.5 where the views cannot be told apart. `distance`: between the
+    views' means, in units of the images' root mean square distance from their own view's mean.
     """
     count = min(len(drone_NC), len(satellite_NC), GAP_IMAGES)
     both_NC = np.concatenate([drone_NC[:count], satellite_NC[:count]]).astype(np.float64)
@@ -132,10 +131,10 @@ def view_gap(drone_NC: Floats, satellite_NC: Floats) -> dict[str, float]:
     fitted_N = np.tile(np.arange(count) % 2 == 0, 2)
     scale_C = both_NC[fitted_N].std(0)
     standard_NC = (both_NC - both_NC[fitted_N].mean(0)) / np.where(scale_C > 0, scale_C, 1.0)
-    fit_NC, asked_NC = standard_NC[fitted_N], standard_NC[~fitted_N]
+    fit_NC, test_NC = standard_NC[fitted_N], standard_NC[~fitted_N]
     kernel_NN = fit_NC @ fit_NC.T / fit_NC.shape[1] + RIDGE * np.eye(len(fit_NC))
     weight_C = fit_NC.T @ np.linalg.solve(kernel_NN, view_N[fitted_N])
-    right_N = np.sign(asked_NC @ weight_C) == view_N[~fitted_N]
+    right_N = np.sign(test_NC @ weight_C) == view_N[~fitted_N]
     return {
         "view_gap/accuracy": float(right_N.mean()),
         "view_gap/distance": float(np.linalg.norm(means[1] - means[0]) / max(spread, 1e-12)),

@@ -1,20 +1,20 @@
-"""Named configurations as functions that return the whole of it."""
+"""Named configurations, as functions that return a full config."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from model.config import Optimization, Precision, PVDAConfig
 from model.schedule import Schedule
-from pipeline.core.errors import InputError
+from pipeline.core.errors import require
 from pipeline.images.transforms import Augmentation, Resizer
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """All that decides what training computes, besides the data and the number of workers."""
+    """All settings of training's computation, besides the data and the number of workers."""
 
     name: str = "paper"
-    "Under which it is known."
+    "Name of the recipe."
     network: PVDAConfig = field(default_factory=PVDAConfig)
     optimization: Optimization = field(default_factory=Optimization)
     schedule: Schedule = field(default_factory=Schedule)
@@ -23,34 +23,30 @@ class Recipe:
     """Whose bicubic resizes the images: torch's, or pillow's, which is faster on CPUs without AVX2
     [chosen]."""
     adversary: bool = True
-    "Whether there is a view discriminator; without it PVDA is LPN."
+    "Train with a view discriminator; without it PVDA is LPN."
     batch_size: int = 8
     "Images of each view per step and worker [LPN lineage: 8]."
     seed: int = 0
-    "Of the weights, the data's order and the augmentation."
+    "Seed of the weights, the order of the data and the augmentation."
     precision: Precision = "auto"
-    """Of the networks' products: float32, bfloat16 by autocast, or auto: bfloat16 on CUDA, float32
-    on a CPU [chosen]."""
+    """Precision of the networks' products: float32, bfloat16 by autocast, or auto: bfloat16 on
+    CUDA, float32 on a CPU [chosen]."""
     sync_bn: bool = False
-    """Whether BatchNorm's statistics are those of all workers' images; GPUs only [chosen: each
-    worker's own]."""
+    """BatchNorm's statistics are those of all workers' images; GPUs only [chosen: each worker's
+    own]."""
     joint_bn: bool = False
-    """Whether the encoder sees both views in one batch, so that BatchNorm's statistics are common
-    to them [LPN: a view's own; where the views' sensors differ much, those leave the network
-    untested in training as it will be used]."""
+    """The encoder gets both views in one batch, so that BatchNorm's statistics are common to them
+    [LPN: a view's own; where the views' sensors differ much, training then never runs the network
+    as it is used, with common statistics]."""
     hold_out: float = 0.0
-    """Share of the training locations that is not trained on but looked at every `probe_epochs`
-    [chosen: none]."""
+    """Share of the training locations that is held out, and probed every `probe_epochs` [chosen:
+    none]."""
 
     def __post_init__(self) -> None:
-        if self.batch_size < 2:
-            raise InputError(
-                f"batch_size is {self.batch_size}, expected at least 2: BatchNorm needs two images of a view"
-            )
-        if not 0 <= self.hold_out < 1:
-            raise InputError(
-                f"hold_out is {self.hold_out}, expected a share of the locations, from 0 to below 1"
-            )
+        few = "at least 2: BatchNorm needs two images of a view"
+        require(self.batch_size >= 2, "batch_size", self.batch_size, few)
+        share = "a share of the locations, from 0 to below 1"
+        require(0 <= self.hold_out < 1, "hold_out", self.hold_out, share)
 
 
 def paper() -> Recipe:

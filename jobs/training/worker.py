@@ -1,5 +1,5 @@
-"""One training worker, wherever it runs: the epochs that are left, with checkpoints and metrics after
-each.
+"""One training worker, wherever it runs: the epochs that are left, with checkpoints and metrics
+after each.
 
 In: a run and this worker's context. Out: the run's folder, written by rank 0. `loop.py` has one
 epoch, `state.py` what a worker holds between epochs.

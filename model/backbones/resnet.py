@@ -124,13 +124,13 @@ class ResNet(Backbone):
 
 
 def build(name: str, width: float) -> ResNet:
-    """A ResNet of `LAYOUTS`. Raises ValueError for a width that gives too few or too many channels."""
+    """A ResNet of `LAYOUTS`. Raises ValueError for a width with too few or too many channels."""
     # Channels that leave layer1 and enter the first strided shortcut.
     channels = round(64 * width) * LAYOUTS[name][0].expansion
     if channels < MIN_CHANNELS:
         raise ValueError(
-            f"width is {width}, which gives layer1 of {name} {channels} channels; expected at least "
-            f"{MIN_CHANNELS} (thinner ones crash oneDNN); use a larger width"
+            f"width is {width}, which gives layer1 of {name} {channels} channels; expected at "
+            f"least {MIN_CHANNELS} (thinner ones crash oneDNN); use a larger width"
         )
     if channels > MAX_CHANNELS:
         raise ValueError(

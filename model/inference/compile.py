@@ -3,9 +3,9 @@
 In: a module of images as bytes (B, 3, H, W), and one batch. Out: a callable for batches of exactly
 that size.
 
-Compiled C++ lies in TORCHINDUCTOR_CACHE_DIR, by default a folder in the system's temporary one, and
-is found again by the next start. Tracing and planning are done anew at each start: torch's cache of
-whole graphs leaves out any that holds weights packed for oneDNN.
+Compiled C++ is cached in TORCHINDUCTOR_CACHE_DIR, by default a folder in the system's temporary
+one, and reused by the next start. Tracing and planning are repeated at each start: torch's cache of
+entire graphs excludes those with weights packed for oneDNN.
 """
 
 import warnings
@@ -20,21 +20,20 @@ EmbedBatch = Callable[[Tensor], Tensor]
 
 
 class NotCompiled(RuntimeError):
-    """What cannot be compiled here. The message is the first line of the reason."""
+    """A module cannot be compiled here. The message is the first line of the reason."""
 
 
 def compile_frozen(module: nn.Module, images_B3HW: Tensor) -> EmbedBatch:
-    """`module` compiled and tried on a batch, whose sizes are the only ones that it should be
-    given.
+    """`module` compiled and tried on a batch; call it with batches of that size only.
 
-    Raises NotCompiled: no C++ compiler, a driver too old, or whatever else torch reports.
+    Raises NotCompiled: no C++ compiler, a driver too old, or another of torch's errors.
     """
-    # A whole graph or none: pieces of it in Python, or a limit of recompilations that is hit, would
-    # be slow in silence.
+    # One full graph or an error: graph breaks, or the limit of recompilations, would make it slow
+    # without a message.
     compiled = torch.compile(module, dynamic=False, fullgraph=True)
 
     def run(images_B3HW: Tensor) -> Tensor:
-        # Freezing is looked up at each (re)compilation, not kept by the compiled function, and
+        # Freezing is read at each (re)compilation, not stored in the compiled function, and
         # gradients would switch it off.
         with torch.no_grad(), torch._inductor.config.patch(freezing=True):
             embeddings_BE: Tensor = compiled(images_B3HW)
@@ -46,15 +45,15 @@ def compile_frozen(module: nn.Module, images_B3HW: Tensor) -> EmbedBatch:
     except Exception as error:  # the compiler's own kinds, the C++ compiler's, the driver's
         lines = str(error).strip().splitlines()
         raise NotCompiled(
-            f"{type(error).__name__}: {lines[0] if lines else 'without a word'}"
+            f"{type(error).__name__}: {lines[0] if lines else 'no message'}"
         ) from error
     return run
 
 
 @contextmanager
 def ignore_deprecations() -> Iterator[None]:
-    """Without the deprecation that torch 2.13's own import of its compiler gives rise to. Anything
-    else is told.
+    """Ignore the deprecation that torch 2.13 raises when it imports its own compiler; show all
+    other warnings.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings(

@@ -1,6 +1,7 @@
 """The encoder as embedding uses it: bytes of images in, unit vectors out.
 
-`embed` is the reference; a FastEncoder computes the same faster, and is made and checked in `model/inference/optimise.py`.
+`embed` is the reference; a FastEncoder computes the same faster. `optimise.py` builds it and checks
+it against the reference.
 Shapes: B images, P rings, D numbers per ring, E = P * D numbers of an embedding.
 """
 
@@ -41,7 +42,7 @@ def embed(encoder: FeatureEncoder, images_B3HW: Tensor, mirror: bool = True) -> 
 
 
 class MirroredEncoder(nn.Module):
-    """Images as bytes -> unit embeddings in one pass: the mirror images are the second half of the
+    """Images as bytes -> unit embeddings in one pass; the mirror images are the second half of the
     batch.
     """
 
@@ -68,30 +69,29 @@ class FastEncoder:
     """
 
     kind: EncoderKind
-    "How it computes."
+    "Which implementation it is."
     precision: EffectivePrecision
-    "What it computes in; part of the fingerprint."
+    "Precision of its products; part of the fingerprint."
     agreement: float = 1.0
     "The least cosine between its embedding and the plain encoder's, over the probe images."
     mean_agreement: float = 1.0
-    "The mean of these."
+    "The mean of these cosines."
     batch_size: int
-    "Images of a pass; a mirror image counts with its image."
+    "Images of a pass; an image and its mirror image count as one."
     device: torch.device
-    "Where it computes."
     run: Callable[[Tensor], Tensor]
-    "What embeds a batch."
+    "Embeds one batch."
 
     def __call__(self, images_B3HW: Tensor) -> Tensor:
-        # Not in inference mode, whatever the caller is in: the compiler takes it for another input
-        # and starts anew.
+        # Never in inference mode, even within a caller's: the compiler treats such tensors as other
+        # inputs and compiles again.
         with torch.inference_mode(False), torch.no_grad():
             return torch.cat(
                 [self._one(part_B3HW) for part_B3HW in torch.split(images_B3HW, self.batch_size)]
             )
 
     def _one(self, images_B3HW: Tensor) -> Tensor:
-        """A batch in memory of its own, whose strides are always the same; filled up with black for
+        """A batch in new memory, whose strides are always the same; padded with black images for
         the compiled encoder.
         """
         count, rows = (

@@ -1,5 +1,4 @@
-"""A trained encoder without its BatchNorms: in evaluation each is a scale and a shift, which the
-layer before it takes in.
+"""Fusing BatchNorm into the layer before it: in evaluation it is a scale and a shift.
 
 In: an encoder in evaluation mode. Out: a copy that computes the same with fewer passes over memory.
 """
@@ -17,18 +16,19 @@ def fuse_batchnorm(encoder: FeatureEncoder) -> FeatureEncoder:
     """A copy of `encoder` whose BatchNorms are folded into convolutions and linear layers, without
     gradients.
 
-    Its embeddings differ from the encoder's by float32's rounding only. `encoder` itself stays as
-    it is.
+    Its embeddings differ from the encoder's by float32's rounding only. `encoder` itself is
+    unchanged.
 
-    Raises ValueError when the encoder is in training mode, or when a BatchNorm stands after no
-    layer that could take it in.
+    Raises ValueError when the encoder is in training mode, or when a BatchNorm does not follow a
+    convolution or a linear layer.
     """
     if any(
         isinstance(module, nn.modules.batchnorm._BatchNorm) and module.training
         for module in encoder.modules()
     ):
         raise ValueError(
-            "the encoder is in training mode, where BatchNorm depends on the batch; expected evaluation mode; call eval()"
+            "the encoder is in training mode, where BatchNorm depends on the batch; expected "
+            "evaluation mode; call eval()"
         )
     folded = copy.deepcopy(encoder).requires_grad_(False)
     for parent in list(folded.modules()):
@@ -40,7 +40,8 @@ def fuse_batchnorm(encoder: FeatureEncoder) -> FeatureEncoder:
     ]
     if left:
         raise ValueError(
-            f"{', '.join(left)} cannot be folded; expected each BatchNorm straight after its convolution or linear layer; "
+            f"{', '.join(left)} cannot be folded; expected each BatchNorm straight after its "
+            "convolution or linear layer; "
             "register the two in this order"
         )
     return folded

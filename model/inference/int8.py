@@ -1,9 +1,9 @@
 """The backbone in 8-bit integers, for CPUs that multiply them fast: torchao's post-training
 quantisation for x86.
 
-In: a folded encoder and images to calibrate by. Out: the same encoder with a quantised backbone, to
-be compiled: uncompiled it computes the same slower than float32. Rings and refinement stay in
-float32: they are a thousandth of the products.
+In: an encoder with fused BatchNorms, and images to calibrate by. Out: the same encoder with a
+quantised backbone, to be compiled: uncompiled it computes the same slower than float32. Rings and
+refinement stay in float32: they are a thousandth of the products.
 """
 
 import hashlib
@@ -20,21 +20,21 @@ from model.pvda import FeatureEncoder
 
 QUANTIZE_MODULE = "torchao.quantization.pt2e.quantize_pt2e"
 QUANTIZER_MODULE = "torchao.quantization.pt2e.quantizer.x86_inductor_quantizer"
-"Imported when they are needed: torchao is optional, and its import takes seconds."
+"Imported on use: torchao is optional, and its import takes seconds."
 CALIBRATION_BATCH = 8
-"Images at a time, whatever the batch size of embedding: the ranges must not depend on it."
+"Images at a time, independent of embedding's batch size: the ranges must not depend on that."
 INT8_INSTRUCTIONS = ("avx512_vnni", "avx_vnni", "amx_int8")
-"Any one of these multiplies 8-bit integers, as torch names them."
+"Instruction sets that multiply 8-bit integers, by torch's names; one of them suffices."
 
 
 class PrecisionError(ValueError):
-    """A precision that cannot be had here. The message says what was found, what was expected and
+    """A precision is not available here. The message has what was found, what was expected and
     what to do.
     """
 
 
 def require_int8(device: str) -> None:
-    """Raises PrecisionError where int8 would not be faster than float32, or torchao is not
+    """Raise PrecisionError where int8 would not be faster than float32, or torchao is not
     installed.
     """
     has = torch.cpu.get_capabilities()
@@ -44,7 +44,8 @@ def require_int8(device: str) -> None:
         )
     if not any(has.get(name) for name in INT8_INSTRUCTIONS):
         raise PrecisionError(
-            f"this CPU ({has.get('architecture', 'unknown')}) has no {', '.join(INT8_INSTRUCTIONS)}, so int8 would be slower than "
+            f"this CPU ({has.get('architecture', 'unknown')}) has no "
+            f"{', '.join(INT8_INSTRUCTIONS)}, so int8 would be slower than "
             "float32; choose --precision float32"
         )
     try:
@@ -52,17 +53,19 @@ def require_int8(device: str) -> None:
             import_module(QUANTIZER_MODULE)
     except ImportError as error:
         raise PrecisionError(
-            f"int8 needs torchao, which cannot be imported here ({error}); pip install 'pvda[int8]', or choose "
+            f"int8 needs torchao, which cannot be imported here ({error}); pip install "
+            "'pvda[int8]', or choose "
             "--precision float32"
         ) from error
 
 
 def quantise(encoder: FeatureEncoder, size: int, calibrate: Callable[[], None]) -> None:
-    """Put a quantised backbone into a folded `encoder`, for images of `size` x `size` pixels.
+    """Put a quantised backbone into a fused `encoder`, for images of `size` x `size` pixels.
 
-    `calibrate` runs images through the encoder while the ranges of its activations are watched: per tensor, 8 bits
-    unsigned, from histograms. Weights have a range per output channel, signed. It runs on one thread: sums in another
-    order give other ranges in their last digit, and workers would round differently.
+    `calibrate` runs images through the encoder while observers record the ranges of its
+    activations: per tensor, 8 bits unsigned, from histograms. Weights have a range per output
+    channel, signed. It runs on one thread: sums in another order give other ranges in their last
+    digit, and workers would round differently.
     """
     threads = torch.get_num_threads()
     with _filter_torchao_logs(), torch.no_grad():
@@ -88,23 +91,21 @@ def quantise(encoder: FeatureEncoder, size: int, calibrate: Callable[[], None]) 
 
 
 def calibration_digest(images_B3HW: Tensor) -> str:
-    """16 hexadecimal digits that name the images a backbone was calibrated by: their order and
-    their bytes (B, 3, H, W).
-    """
+    """16 hexadecimal digits of a hash over the calibration images (B, 3, H, W), in their order."""
     shape = str(tuple(images_B3HW.shape)).encode()
     return hashlib.sha256(shape + images_B3HW.cpu().contiguous().numpy().tobytes()).hexdigest()[:16]
 
 
 @contextmanager
 def _filter_torchao_logs() -> Iterator[None]:
-    """Without what torchao 0.18 says on a machine without CUDA, and of its own future. Anything
-    else is told.
+    """Filter torchao 0.18's log messages about missing CUDA libraries and about its own
+    deprecations; show all others.
     """
 
     def wanted(record: logging.LogRecord) -> bool:
-        said = record.getMessage()
-        return "register_constant() on Enum" not in said and not (
-            "Failed to load" in said and "/torchao/_C_" in said
+        message = record.getMessage()
+        return "register_constant() on Enum" not in message and not (
+            "Failed to load" in message and "/torchao/_C_" in message
         )
 
     loggers = [logging.getLogger(name) for name in ("torchao", "torch.utils._pytree")]

@@ -1,8 +1,8 @@
-"""An encoder made fast, each way of it checked against the plain one before it is used.
+"""Making an encoder fast; each implementation is checked against the plain one before it is used.
 
 In: an encoder in evaluation mode on its device, and a few images to check by. Out: a FastEncoder:
-BatchNorm folded away, channels last, image and mirror image in one batch, compiled where that pays;
-in bfloat16 or 8-bit integers where asked for. Shapes: B images, E numbers of an embedding.
+BatchNorm fused, channels last, image and mirror image in one batch, compiled where that pays; in
+bfloat16 or 8-bit integers on request. Shapes: B images, E numbers of an embedding.
 """
 
 import time
@@ -22,8 +22,8 @@ from model.inference.precision import EffectivePrecision, Precision, effective_p
 from model.pvda import FeatureEncoder
 
 MIN_COSINE: dict[EffectivePrecision, float] = {"float32": 0.9999, "bfloat16": 0.999, "int8": 0.99}
-"""Between the fast and the plain embedding of a probe image: of the worst image, for int8 of their
-mean."""
+"""Required cosine between the fast and the plain embedding of a probe image: of the worst image,
+for int8 of their mean."""
 COMPILE_BREAK_EVEN_S = 120.0
 """Seconds that the folded encoder would need for all images. Compiling ResNet-50 for 256 px took 13
 to 25 s on two busy cores and saved a quarter of each image's time, so from two minutes on it has
@@ -41,19 +41,19 @@ def optimise_encoder(
     compiled: bool | Literal["auto"] = "auto",
     images: int | None = None,
     calibration_B3HW: Tensor | None = None,
-    say: Log = print,
+    log: Log = print,
 ) -> FastEncoder:
     """The fastest encoder that computes what `embed` does with `encoder`, which is in evaluation
     mode on its device.
 
-    It is checked on `probe_B3HW`, a few images as bytes: where it disagrees (LEAST_COSINE) `say` is
-    told, and a plainer one of the same precision is used. `images` is how many will be embedded:
-    with `compiled="auto"` the encoder is compiled where that pays, and unknown numbers count as
+    It is checked on `probe_B3HW`, a few images as bytes: where it disagrees (MIN_COSINE) `log` gets
+    a message, and a plainer one of the same precision is used. `images` is the number to embed:
+    with `compiled="auto"` the encoder is compiled where that pays, and an unknown number counts as
     small. Set torch's threads before: it is compiled for their number. int8 is calibrated by
     `calibration_B3HW`, 64 images or more, none of which should be a probe.
 
-    Raises PrecisionError where `precision` cannot be had or agrees too little. What is in effect
-    must be what the fingerprint says, so nothing falls back to float32 here.
+    Raises PrecisionError where `precision` is not available or agrees too little. The fingerprint
+    names the precision in effect, so nothing falls back to float32 here.
     """
     device = encoder.mean_31.device
     wanted = effective_precision(precision, device.type)
@@ -74,29 +74,31 @@ def optimise_encoder(
     module = MirroredEncoder(fuse_batchnorm(encoder), mirror, wanted == "bfloat16")
     module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if wanted == "int8":
-        return _int8(module, check, calibration_B3HW, say)
-    fast = check.measured("folded", module)
+        return _int8(module, check, calibration_B3HW, log)
+    fast = check.measure("folded", module)
     if not fast.agreement >= MIN_COSINE[wanted]:  # NaN agrees with nothing
-        say(
-            f"the folded encoder disagrees with the plain one ({check.told(fast)}); the plain one is used"
+        log(
+            f"the folded encoder disagrees with the plain one ({check.describe(fast)}); "
+            "the plain one is used"
         )
-        fast = check.measured("plain", partial(_embed_plain, encoder, mirror, wanted == "bfloat16"))
+        fast = check.measure("plain", partial(_embed_plain, encoder, mirror, wanted == "bfloat16"))
         if wanted != "float32" and not fast.agreement >= MIN_COSINE[wanted]:
             raise PrecisionError(
-                f"{wanted} embeddings agree with the float32 ones by a cosine of {fast.agreement:.4f}, expected at least "
+                f"{wanted} embeddings agree with the float32 ones by a cosine of "
+                f"{fast.agreement:.4f}, expected at least "
                 f"{MIN_COSINE[wanted]}; choose --precision float32"
             )
     elif compiled is True or (
         compiled == "auto" and images is not None and _compiling_pays(fast, probe_B3HW, images)
     ):
-        fast = _compiled(module, check, fast, say)
-    say(f"{fast.kind} encoder in {wanted}: {check.told(fast)}")
+        fast = _compile(module, check, fast, log)
+    log(f"{fast.kind} encoder in {wanted}: {check.describe(fast)}")
     return fast
 
 
 @dataclass(frozen=True, kw_only=True)
 class _AgreementCheck:
-    """What a candidate is measured by."""
+    """The check of a candidate against the plain encoder."""
 
     probe_B3HW: Tensor
     expected_BE: Tensor
@@ -105,8 +107,8 @@ class _AgreementCheck:
     batch_size: int
     device: torch.device
 
-    def measured(self, kind: EncoderKind, run: Callable[[Tensor], Tensor]) -> FastEncoder:
-        """The candidate, with its agreement."""
+    def measure(self, kind: EncoderKind, run: Callable[[Tensor], Tensor]) -> FastEncoder:
+        """The candidate with its agreement."""
         fast = FastEncoder(
             kind=kind,
             precision=self.precision,
@@ -117,7 +119,7 @@ class _AgreementCheck:
         cosine_B = (fast(self.probe_B3HW).double() * self.expected_BE.double()).sum(1)
         return replace(fast, agreement=float(cosine_B.min()), mean_agreement=float(cosine_B.mean()))
 
-    def told(self, fast: FastEncoder) -> str:
+    def describe(self, fast: FastEncoder) -> str:
         count = len(self.probe_B3HW)
         mean, worst = f"{fast.mean_agreement:.6f} in the mean", f"{fast.agreement:.6f} at worst"
         return f"cosine with the plain one {mean}, {worst}, over {count} images"
@@ -129,38 +131,41 @@ class _AgreementCheck:
         return black_B3HW.to(memory_format=torch.channels_last)
 
 
-def _compiled(
-    module: MirroredEncoder, check: _AgreementCheck, folded: FastEncoder, say: Log
+def _compile(
+    module: MirroredEncoder, check: _AgreementCheck, folded: FastEncoder, log: Log
 ) -> FastEncoder:
-    """`module` compiled, or `folded`, which it is, with the reason told."""
-    say(
-        f"compiling the encoder for batches of {check.batch_size}: this takes a while, less where it was done before"
+    """`module` compiled; or `folded`, its uncompiled form, with the reason logged."""
+    log(
+        f"compiling the encoder for batches of {check.batch_size}: this takes a while, less where "
+        "it was done before"
     )
     start = time.perf_counter()
     try:
-        fast = check.measured("compiled", compile_frozen(module, check.batch()))
+        fast = check.measure("compiled", compile_frozen(module, check.batch()))
     except NotCompiled as error:
-        say(f"the encoder cannot be compiled here ({error}); it goes on uncompiled")
+        log(f"the encoder cannot be compiled here ({error}); continuing uncompiled")
         return folded
-    say(f"compiled in {time.perf_counter() - start:.0f} s")
+    log(f"compiled in {time.perf_counter() - start:.0f} s")
     if not fast.agreement >= MIN_COSINE[check.precision]:
-        say(
-            f"the compiled encoder disagrees with the plain one ({check.told(fast)}); it goes on uncompiled"
+        log(
+            f"the compiled encoder disagrees with the plain one ({check.describe(fast)}); "
+            "continuing uncompiled"
         )
         return folded
     return fast
 
 
 def _int8(
-    module: MirroredEncoder, check: _AgreementCheck, calibration_B3HW: Tensor | None, say: Log
+    module: MirroredEncoder, check: _AgreementCheck, calibration_B3HW: Tensor | None, log: Log
 ) -> FastEncoder:
     """`module` quantised and compiled. Raises PrecisionError."""
     if calibration_B3HW is None or not len(calibration_B3HW):
         raise PrecisionError(
             "int8 without images to calibrate by; expected 64 or more of the gallery; give some"
         )
-    say(
-        f"calibrating int8 on {len(calibration_B3HW)} images and compiling it: this takes a minute or two"
+    log(
+        f"calibrating int8 on {len(calibration_B3HW)} images and compiling it: this takes a minute "
+        "or two"
     )
     start = time.perf_counter()
 
@@ -170,22 +175,25 @@ def _int8(
 
     quantise(module.encoder, check.probe_B3HW.shape[2], calibrate)
     try:
-        fast = check.measured("compiled", compile_frozen(module, check.batch()))
+        fast = check.measure("compiled", compile_frozen(module, check.batch()))
     except NotCompiled as error:
         raise PrecisionError(
-            f"int8 needs a compiler and torch.compile failed ({error}); install g++, or choose --precision float32"
+            f"int8 needs a compiler and torch.compile failed ({error}); install g++, or choose "
+            "--precision float32"
         ) from error
-    say(f"int8 encoder, made in {time.perf_counter() - start:.0f} s: {check.told(fast)}")
+    log(f"int8 encoder, made in {time.perf_counter() - start:.0f} s: {check.describe(fast)}")
     if not fast.mean_agreement >= MIN_COSINE["int8"]:
         raise PrecisionError(
-            f"int8 embeddings agree with the float32 ones by a mean cosine of {fast.mean_agreement:.4f}, expected at least "
-            f"{MIN_COSINE['int8']}; calibrate by more images that are like the gallery's, or choose --precision float32"
+            "int8 embeddings agree with the float32 ones by a mean cosine of "
+            f"{fast.mean_agreement:.4f}, expected at least "
+            f"{MIN_COSINE['int8']}; calibrate by more images that are like the gallery's, or "
+            "choose --precision float32"
         )
     return fast
 
 
 def _compiling_pays(fast: FastEncoder, probe_B3HW: Tensor, images: int) -> bool:
-    """Whether `images` of them would take `fast` long enough for compiling to pay. The probe has
+    """Whether `images` images would take `fast` long enough for compiling to pay. The check has
     warmed it up.
     """
     start = time.perf_counter()

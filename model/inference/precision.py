@@ -1,5 +1,5 @@
-"""The precisions that an encoder computes in, and how a fingerprint names them. Imports nothing heavy:
-the command line offers them before torch is loaded."""
+"""The precisions that an encoder computes in, and how a fingerprint names them. Imports nothing
+heavy: the command line offers them before torch is loaded."""
 
 from typing import Literal
 
@@ -19,7 +19,7 @@ def effective_precision(precision: Precision, device: str) -> EffectivePrecision
 def describe_preprocessing(
     preprocessing: str, precision: EffectivePrecision, calibration: str | None = None
 ) -> str:
-    """What a model's fingerprint says of preprocessing, and of the precision where it changes the
+    """The words of a fingerprint for the preprocessing, and for the precision where it changes the
     embeddings.
 
     float32 adds nothing: plain, folded and compiled embeddings are the same up to rounding, and may
@@ -29,7 +29,8 @@ def describe_preprocessing(
     if precision == "int8":
         if not calibration:
             raise ValueError(
-                "int8 without its calibration; expected the digest of the images; see calibration_digest"
+                "int8 without its calibration; expected the digest of the images; see "
+                "calibration_digest"
             )
         return f"{preprocessing}, int8 calibrated by {calibration}"
     return preprocessing if precision == "float32" else f"{preprocessing}, {precision}"

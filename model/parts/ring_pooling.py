@@ -10,7 +10,7 @@ from model.config import Divisor
 
 
 def ring_masks(height: int, width: int, parts: int) -> Tensor:
-    """Which cells belong to which ring: (P, H, W) of 0 and 1, each cell in exactly one ring.
+    """Masks of the rings: (P, H, W) of 0 and 1, each cell in exactly one ring.
 
     Box i spans `[c - i*per, H - c + i*per)` with `c = H // 2`, `per = H // (2P)`, the last one the
     whole map; ring i is box i without box i-1. For even maps this is LPN's `[c - i*per, c +
@@ -20,7 +20,8 @@ def ring_masks(height: int, width: int, parts: int) -> Tensor:
     """
     if min(height, width) < 2 * parts:
         raise ValueError(
-            f"maps of {height} x {width} cells cannot hold {parts} square rings; expected at least {2 * parts} cells a "
+            f"maps of {height} x {width} cells cannot hold {parts} square rings; expected at least "
+            f"{2 * parts} cells a "
             "side; use larger images or fewer parts"
         )
     rings = torch.full((height, width), parts - 1, dtype=torch.long)
@@ -37,8 +38,8 @@ def _span(size: int, box: int, parts: int) -> slice:
 def ring_average(maps_BCHW: Tensor, parts: int, divisor: Divisor = "box") -> Tensor:
     """Average of each ring's cells, (B, P, C).
 
-    With `box` the sum over a ring is divided by the area of the box that it lies in, as LPN's
-    zero-filled boxes do (factors 1, .75, .556, .4375 of the true mean for P = 4 on 16 x 16 cells);
+    With `box` the sum over a ring is divided by the area of the box around it, as LPN's zero-filled
+    boxes do (factors 1, .75, .556, .4375 of the true mean for P = 4 on 16 x 16 cells);
     with `ring` by the ring's own area.
     """
     masks_PHW = ring_masks(maps_BCHW.shape[2], maps_BCHW.shape[3], parts)

@@ -21,7 +21,7 @@ TORCHVISION_HINT = (
     "a state dict of torchvision's ResNet: on a machine with a network, "
     "torchvision.models.resnet50(weights='IMAGENET1K_V1').state_dict() saved with torch.save"
 )
-"What a backbone starts from, and where it comes from."
+"The weights that a backbone starts from, and where to get them."
 
 
 def read_state_dict(path: str) -> dict[str, Tensor]:
@@ -60,7 +60,8 @@ def parse_state_dict(data: bytes, name: str) -> dict[str, Tensor]:
         isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in state.items()
     ):
         raise CheckpointError(
-            f"{name} holds something else than tensors by name; expected a state dict; save model.state_dict() alone"
+            f"{name} has other values than tensors by name; expected a state dict; save "
+            "model.state_dict() alone"
         )
     return state
 

@@ -30,24 +30,24 @@ OURS_TO_LPN = {
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertedWeights:
-    """LPN's network as ours."""
+    """LPN's network as one of ours."""
 
     network: PVDAConfig
     modules: dict[str, dict[str, Tensor]]
-    "State dicts of encoder and classifier, as a checkpoint holds them."
+    "State dicts of encoder and classifier, as in a checkpoint."
     locations: int
     """L, the classifier's outputs. Their names are not in LPN's file: they are the training
     folders', sorted."""
     left_out: str | None
-    "LPN's backbone of a view that we do not have, where it is another than the one that is taken."
+    "LPN's backbone of a view that PVDA does not have, where it differs from the converted one."
 
 
 def convert_lpn(state: dict[str, Tensor], name: str, image_size: int = 256) -> ConvertedWeights:
     """Encoder and classifier that embed and classify as LPN's do, its rings averaged over their
     boxes.
 
-    `image_size`, in pixels, is not in the file; LPN's opts.yaml says it. Nor are its stride and its pooling: 1 and avg are
-    taken for granted, as LPN's run on University-1652 has them.
+    `image_size`, in pixels, is not in the file but in LPN's opts.yaml, and so are its stride and
+    its pooling: 1 and avg are assumed, as in LPN's run on University-1652.
 
     Raises CheckpointError that lists what is missing or unexpected, or where UAV and satellite
     images have backbones of their own; ValueError where the image size is none that PVDAConfig
@@ -58,8 +58,10 @@ def convert_lpn(state: dict[str, Tensor], name: str, image_size: int = 256) -> C
     )
     if not numbers or numbers != list(range(len(numbers))):
         raise CheckpointError(
-            f"{name} is no three_view_net of LPN: its classifiers are numbered {numbers or 'not at all'} and its names begin "
-            f"with {', '.join(list(state)[:3]) or 'nothing'}; expected classifier0, classifier1, ... and model_1.model.*"
+            f"{name} is no three_view_net of LPN: its classifiers are numbered "
+            f"{numbers or 'not at all'} and its names begin "
+            f"with {', '.join(list(state)[:3]) or 'nothing'}; expected classifier0, classifier1, "
+            "... and model_1.model.*"
         )
     backbone, width = infer_backbone(backbone_of(state, "model_1"), f"{name} (model_1.model)")
     left_out = check_shared_backbone(state, name)
@@ -91,14 +93,14 @@ def convert_lpn(state: dict[str, Tensor], name: str, image_size: int = 256) -> C
 def backbone_of(state: dict[str, Tensor], view: str) -> dict[str, Tensor]:
     """One view's backbone by torchvision's names, without its ImageNet classifier."""
     start = f"{view}.model."
-    held = {
+    backbone = {
         key.removeprefix(start): tensor for key, tensor in state.items() if key.startswith(start)
     }
-    return {key: tensor for key, tensor in held.items() if not key.startswith("fc.")}
+    return {key: tensor for key, tensor in backbone.items() if not key.startswith("fc.")}
 
 
 def check_shared_backbone(state: dict[str, Tensor], name: str) -> str | None:
-    """Which backbone is left out: the street view's, where it is one of its own.
+    """The backbone that is left out: the street view's, where it has its own.
 
     The UAV's must be the satellite's (in a file of two views, the second the first): PVDA's encoder
     is shared by both. Raises CheckpointError where it is not.
@@ -106,15 +108,16 @@ def check_shared_backbone(state: dict[str, Tensor], name: str) -> str | None:
     other = "model_3" if backbone_of(state, "model_3") else "model_2"
     if differing := differing_tensors(state, other):
         raise CheckpointError(
-            f"{name} has a backbone per view: model_1 and {other} differ in {len(differing)} tensors, {differing[0]} first; "
+            f"{name} has a backbone per view: model_1 and {other} differ in {len(differing)} "
+            f"tensors, {differing[0]} first; "
             "expected one for satellite and UAV images; train LPN with --share"
         )
     return "model_2" if differing_tensors(state, "model_2") else None
 
 
 def differing_tensors(state: dict[str, Tensor], other: str) -> list[str]:
-    """Names of what differs between the backbones of model_1 and another view; nothing where the
-    other is not there.
+    """Names of the tensors that differ between the backbones of model_1 and another view; none
+    where the file has no other.
     """
     first, second = backbone_of(state, "model_1"), backbone_of(state, other)
     names = [*first, *(key for key in second if key not in first)] if second else []
@@ -130,7 +133,7 @@ def tensors_equal(one: Tensor, other: Tensor) -> bool:
 
 
 def linear_outputs(state: dict[str, Tensor], key: str, name: str) -> int:
-    """Outputs of a Linear. Raises CheckpointError where it is none."""
+    """Outputs of the Linear whose weight is `key`. Raises CheckpointError where it is no Linear."""
     if key not in state or state[key].ndim != 2:
         found = f"of shape {tuple(state[key].shape)}" if key in state else "missing"
         raise CheckpointError(

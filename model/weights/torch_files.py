@@ -1,8 +1,8 @@
-"""Bytes of a file that torch wrote -> what is in it: no code runs, nothing is inflated, and tensors
-hold what they say.
+"""Reading files that torch wrote, from untrusted sources: no code runs, nothing is decompressed,
+and every tensor has the memory that its shape claims.
 
-In: bytes from anybody. Out: plain values and tensors, or a ValueError. torch raises many other
-kinds over a damaged file.
+In: bytes. Out: plain values and tensors, or a ValueError; torch raises many other kinds over a
+damaged file.
 """
 
 import io
@@ -14,7 +14,7 @@ from torch import Tensor
 
 
 def read(data: bytes) -> Any:
-    """What `torch.save` wrote. Raises ValueError, and whatever torch does."""
+    """The value that `torch.save` wrote. Raises ValueError, and torch's own errors."""
     if zipfile.is_zipfile(io.BytesIO(data)):
         with zipfile.ZipFile(io.BytesIO(data)) as parts:
             require_uncompressed(parts, len(data))
@@ -24,22 +24,22 @@ def read(data: bytes) -> Any:
 
 
 def require_uncompressed(parts: zipfile.ZipFile, size: int) -> None:
-    """Raise ValueError where a zip of `size` bytes holds more than these.
+    """Raise ValueError where a zip of `size` bytes unpacks to more.
 
-    torch writes records as they are: one that inflates may be of any size, and so may many that
+    torch stores records uncompressed: a compressed one may have any size, and so may records that
     overlap.
     """
-    held = parts.infolist()
+    records = parts.infolist()
     if (
-        any(part.compress_type != zipfile.ZIP_STORED for part in held)
-        or sum(part.file_size for part in held) > size
+        any(part.compress_type != zipfile.ZIP_STORED for part in records)
+        or sum(part.file_size for part in records) > size
     ):
         raise ValueError("it is packed in another way than torch does")
 
 
 def require_full_tensors(value: Any) -> None:
-    """Raise ValueError where a tensor says that it is larger than what is there: one number may be
-    strided into any shape.
+    """Raise ValueError where a tensor's shape exceeds its memory: one number may be strided into
+    any shape.
     """
     seen, waiting = set[int](), [value]
     while waiting:
@@ -52,10 +52,10 @@ def require_full_tensors(value: Any) -> None:
         elif isinstance(value, list | tuple | set | frozenset):
             waiting += value
         elif isinstance(value, Tensor):
-            whole = (
+            plain = (
                 value.layout == torch.strided
                 and value.device.type == "cpu"
                 and not value.is_quantized
             )
-            if not whole or value.untyped_storage().nbytes() < value.numel() * value.element_size():
+            if not plain or value.untyped_storage().nbytes() < value.numel() * value.element_size():
                 raise ValueError("it holds a tensor that is not there in full")

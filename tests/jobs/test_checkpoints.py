@@ -224,7 +224,7 @@ def test_the_last_checkpoints_are_kept_and_a_damaged_one_gives_way_to_the_one_be
     said = capsys.readouterr().err
     assert "last.pt is damaged" in said
     assert "taking checkpoint-0001-00001.pt, the one before it" in said
-    assert "going on after epoch 1 of 3 and 1 of 3 steps" in said
+    assert "resuming after epoch 1 of 3 and 1 of 3 steps" in said
     assert_same_run(tmp_path, undisturbed)
     assert list_archived(str(tmp_path)) == ["checkpoint-0002-00002.pt"]
 

@@ -312,7 +312,7 @@ REFUSED: dict[str, tuple[Callable[[State], State], str]] = {
     ),
     "a tensor is missing": (
         lambda state: without(state, "classifier2.add_block.1.running_var"),
-        r"does not fit a ResNet-18 with 4 rings: classifier2\.add_block\.1\.running_var is missing; expected",
+        r"does not fit resnet18 with 4 rings: classifier2\.add_block\.1\.running_var is missing; expected",
     ),
     "a layer is missing": (
         lambda state: without(without(state, "model_1.model.bn1"), "model_3.model.bn1"),

@@ -39,7 +39,7 @@ def fast(encoder: FeatureEncoder, **settings: Any) -> tuple[Any, list[str]]:
     """The fast encoder, with what it said."""
     said: list[str] = []
     defaults: dict[str, Any] = {"probe_B3HW": images(6), "batch_size": 4, "compiled": False}
-    return optimise_encoder(encoder, say=said.append, **(defaults | settings)), said
+    return optimise_encoder(encoder, log=said.append, **(defaults | settings)), said
 
 
 def rolled() -> Callable[[MirroredEncoder, Tensor], Tensor]:
@@ -59,7 +59,8 @@ def test_the_folded_encoder_embeds_as_the_plain_one_does(
     assert (encoder.kind, encoder.precision) == ("folded", "float32")
     assert encoder.agreement > 1 - 1e-5
     assert said == [
-        "folded encoder in float32: cosine with the plain one 1.000000 in the mean, 1.000000 at worst, over 6 images"
+        "folded encoder in float32: cosine with the plain one 1.000000 in the mean, 1.000000 at "
+        "worst, over 6 images"
     ]
     found_BE = encoder(images(7, seed=5))
     assert found_BE.dtype == torch.float32
@@ -95,8 +96,8 @@ def test_a_compiled_encoder_that_computes_something_else_is_found_and_the_folded
     encoder, said = fast(lively_encoder, compiled=True)
     assert encoder.kind == "folded"
     assert (
-        "the compiled encoder disagrees with the plain one (cosine with the plain one nan in the mean"
-        in said[2]
+        "the compiled encoder disagrees with the plain one (cosine with the plain one nan in the "
+        "mean" in said[2]
     )
 
 
@@ -135,7 +136,7 @@ def test_compiling_is_left_out_where_it_does_not_pay_and_the_reason_told_where_i
         assert said[0].startswith("compiling the encoder for batches of 4")
         assert (
             said[1]
-            == "the encoder cannot be compiled here (RuntimeError: no C++ compiler); it goes on uncompiled"
+            == "the encoder cannot be compiled here (RuntimeError: no C++ compiler); continuing uncompiled"
         )
 
 

@@ -96,7 +96,7 @@ def test_a_file_that_holds_something_else_is_refused_with_the_remedy(
 ) -> None:
     torch.save(value, tmp_path / "else.pth")
     with pytest.raises(
-        CheckpointError, match=r"else\.pth holds something else than tensors by name.*save model"
+        CheckpointError, match=r"else\.pth has other values than tensors by name.*save model"
     ):
         read_state_dict(str(tmp_path / "else.pth"))
 
