@@ -116,11 +116,11 @@ def look_at_table(part: Path) -> list[Any]:
     return seen
 
 
-def test_a_damaged_part_of_a_table_is_refused_however_it_is_read(part: Path) -> None:
+def test_part_damaged_is_rejected_by_every_reader(part: Path) -> None:
     assert count_detected(part, lambda: look_at_table(part), 400) > 300
 
 
-def test_a_footer_is_held_against_the_seal_before_arrow_sees_it(part: Path) -> None:
+def test_footer_checksum_is_compared_before_arrow_reads(part: Path) -> None:
     """Arrow ends the process over some of them, and believes others."""
     good, rng = part.read_bytes(), np.random.default_rng(0)
     begin = len(good) - 8 - int.from_bytes(good[-8:-4], "little")
@@ -132,13 +132,13 @@ def test_a_footer_is_held_against_the_seal_before_arrow_sees_it(part: Path) -> N
             read_header(str(part))
 
 
-def test_every_byte_of_a_part_is_looked_at_when_asked(part: Path) -> None:
+def test_verify_part_checks_every_byte(part: Path) -> None:
     assert (
         count_detected(part, raising_if_missing(part, lambda: verify_part(str(part))), 200) == 201
     )
 
 
-def test_parts_without_seals_and_checksums_are_read_as_they_are(part: Path) -> None:
+def test_part_without_checksums_is_read(part: Path) -> None:
     expected, whole = look_at_table(part), pq.read_table(part)
     for dictionary in (False, ["key", "view"]):
         pq.write_table(
@@ -148,7 +148,7 @@ def test_parts_without_seals_and_checksums_are_read_as_they_are(part: Path) -> N
         verify_part(str(part))
 
 
-def test_a_damaged_record_part_is_refused_and_not_taken_for_done(tmp_path: Path) -> None:
+def test_record_part_damaged_does_not_count_as_done(tmp_path: Path) -> None:
     shard = Shard(
         name="train-drone-000000",
         split=Split.TRAIN,
@@ -191,7 +191,7 @@ def test_a_damaged_record_part_is_refused_and_not_taken_for_done(tmp_path: Path)
     assert count_detected(path, look, 300) > 200
 
 
-def test_a_damaged_list_of_what_was_refused_is_named(tmp_path: Path) -> None:
+def test_rejected_list_damaged_is_named(tmp_path: Path) -> None:
     rejections.write_rejections(
         str(tmp_path), [Rejection(path="a", reason="b", found="c")], keep=False
     )
@@ -213,7 +213,7 @@ def test_a_damaged_list_of_what_was_refused_is_named(tmp_path: Path) -> None:
             assert REMEDIES.search(said)
 
 
-def test_a_damaged_list_of_a_table_is_named_and_written_again(tmp_path: Path) -> None:
+def test_expected_parts_damaged_are_rewritten(tmp_path: Path) -> None:
     rows = [("shard", "key", "reason", "found")]
     write_rejected(str(tmp_path), rows)
     path = tmp_path / "_rejected" / "rejected.parquet"
@@ -226,7 +226,7 @@ def test_a_damaged_list_of_a_table_is_named_and_written_again(tmp_path: Path) ->
         assert len(read_rejected(str(tmp_path))) == 1
 
 
-def test_a_damaged_manifest_is_refused(tmp_path: Path) -> None:
+def test_manifest_damaged_is_rejected(tmp_path: Path) -> None:
     shards = tuple(
         Shard(
             name=f"train-drone-{n:06d}",
@@ -247,7 +247,7 @@ def test_a_damaged_manifest_is_refused(tmp_path: Path) -> None:
     assert count_detected(path, look, 400) > 300
 
 
-def test_a_damaged_index_json_is_refused(tmp_path: Path) -> None:
+def test_index_json_damaged_is_rejected(tmp_path: Path) -> None:
     part = PartMetadata(
         faiss="index.faiss",
         ids="ids.arrow",
@@ -287,7 +287,7 @@ def test_a_damaged_index_json_is_refused(tmp_path: Path) -> None:
     )
 
 
-def test_a_damaged_calibration_is_refused(tmp_path: Path) -> None:
+def test_calibration_damaged_is_rejected(tmp_path: Path) -> None:
     model = LogisticModel(
         mean_F=(0.1, 0.2, 0.3, 0.4),
         scale_F=(1.0,) * 4,
@@ -320,7 +320,7 @@ def test_a_damaged_calibration_is_refused(tmp_path: Path) -> None:
     assert count_detected(path, look, 400) > 300
 
 
-def test_an_evaluation_is_read_back_as_it_was_written_or_not_at_all(tmp_path: Path) -> None:
+def test_evaluation_damaged_is_rejected(tmp_path: Path) -> None:
     metrics = [
         {
             "task": "drone->satellite",

@@ -32,7 +32,7 @@ def mean_colour_network(fingerprint: str = "f" * 64) -> EncoderSpec:
     return EncoderSpec(fingerprint=fingerprint, image_size=32, factory=factory)
 
 
-def test_every_image_has_one_row_with_its_label_and_position(
+def test_embed_writes_one_row_per_image(
     tmp_path: Path, tiny_shards: str, ray_cluster: None
 ) -> None:
     out = str(tmp_path / "table")
@@ -53,7 +53,7 @@ def test_every_image_has_one_row_with_its_label_and_position(
     assert np.allclose(np.linalg.norm(table.embeddings(), axis=1), 1, atol=1e-6)
 
 
-def test_run_again_does_only_what_is_missing(
+def test_embed_rerun_embeds_missing_parts_only(
     tmp_path: Path, tiny_shards: str, ray_cluster: None
 ) -> None:
     settings = EmbeddingSettings(
@@ -74,7 +74,7 @@ def test_run_again_does_only_what_is_missing(
     )
 
 
-def test_a_table_of_another_network_is_refused(
+def test_embed_rejects_table_of_another_network(
     tmp_path: Path, tiny_shards: str, ray_cluster: None
 ) -> None:
     settings = EmbeddingSettings(
@@ -87,7 +87,7 @@ def test_a_table_of_another_network_is_refused(
         embed_gallery(settings, mean_colour_network("g" * 64))
 
 
-def test_what_the_shards_do_not_hold_is_named(tmp_path: Path, tiny_shards: str) -> None:
+def test_embed_names_absent_split_or_view(tmp_path: Path, tiny_shards: str) -> None:
     with pytest.raises(InputError, match="none of it was asked for"):
         embed_gallery(
             EmbeddingSettings(shards=tiny_shards, out=str(tmp_path), view=View.STREET),
@@ -99,7 +99,7 @@ def test_what_the_shards_do_not_hold_is_named(tmp_path: Path, tiny_shards: str) 
         )
 
 
-def test_an_image_that_cannot_be_decoded_is_left_out_and_told(
+def test_embed_skips_and_reports_undecodable_image(
     tmp_path: Path, tiny_shards: str, ray_cluster: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Packing refuses such images; this one was changed later, and tar and manifest by somebody who
@@ -128,7 +128,7 @@ def test_an_image_that_cannot_be_decoded_is_left_out_and_told(
     assert embed_gallery(settings, mean_colour_network()) == 0
 
 
-def test_shards_and_tables_may_be_uris(tmp_path: Path, tiny_shards: str, ray_cluster: None) -> None:
+def test_embed_accepts_uris(tmp_path: Path, tiny_shards: str, ray_cluster: None) -> None:
     out = (tmp_path / "table").as_uri()
     settings = EmbeddingSettings(
         shards=Path(tiny_shards).as_uri(), out=out, split=Split.QUERY, view=View.DRONE

@@ -113,7 +113,7 @@ def blacken(shards: Path, shard: Shard) -> None:
     update_checksum(shards, shard.name)
 
 
-def test_a_shard_that_kills_its_worker_is_set_aside_and_the_rest_is_done(
+def test_embed_skips_shard_that_kills_its_worker(
     tmp_path: Path, copied: Path, undisturbed: dict[str, bytes]
 ) -> None:
     out, shard, pids = tmp_path / "table", a_shard(copied), tmp_path / "pids"
@@ -144,9 +144,7 @@ def test_a_shard_that_kills_its_worker_is_set_aside_and_the_rest_is_done(
     assert held(out).keys() == undisturbed.keys()
 
 
-def test_an_error_nobody_foresaw_costs_the_shard_and_not_its_neighbours(
-    tmp_path: Path, copied: Path
-) -> None:
+def test_embed_unexpected_error_skips_one_shard(tmp_path: Path, copied: Path) -> None:
     shard = a_shard(copied)
     blacken(copied, shard)
     with pytest.raises(
@@ -159,9 +157,7 @@ def test_an_error_nobody_foresaw_costs_the_shard_and_not_its_neighbours(
     assert len(part_names(str(tmp_path / "table"))) == len(read_manifest(str(copied)).shards) - 1
 
 
-def test_an_embedding_that_is_no_number_never_reaches_the_table(
-    tmp_path: Path, copied: Path
-) -> None:
+def test_embed_rejects_nan_embeddings(tmp_path: Path, copied: Path) -> None:
     shard = a_shard(copied)
     blacken(copied, shard)
     with pytest.raises(
@@ -172,7 +168,7 @@ def test_an_embedding_that_is_no_number_never_reaches_the_table(
     verify_table(str(tmp_path / "table"))
 
 
-def test_a_tar_that_is_cut_off_is_set_aside_at_once_and_done_when_it_is_whole(
+def test_embed_skips_truncated_tar_until_repaired(
     tmp_path: Path, copied: Path, tiny_shards: str, undisturbed: dict[str, bytes]
 ) -> None:
     out, shard, pids = tmp_path / "table", a_shard(copied), tmp_path / "pids"
@@ -191,9 +187,7 @@ def test_a_tar_that_is_cut_off_is_set_aside_at_once_and_done_when_it_is_whole(
     assert held(out) == undisturbed
 
 
-def test_a_shard_without_one_image_becomes_a_part_without_rows(
-    tmp_path: Path, copied: Path
-) -> None:
+def test_embed_shard_without_images_gives_empty_part(tmp_path: Path, copied: Path) -> None:
     manifest, out = read_manifest(str(copied)), str(tmp_path / "table")
     shard = min(manifest.shards, key=lambda one: one.samples)
     tar = copied / f"{shard.name}.tar"
@@ -229,7 +223,7 @@ def full_disk() -> Callable[[], None]:
     return fill
 
 
-def test_a_full_disk_ends_the_stage_with_a_sentence_and_it_goes_on_when_there_is_room(
+def test_embed_full_disk_stops_and_resumes(
     tmp_path: Path, tiny_shards: str, undisturbed: dict[str, bytes]
 ) -> None:
     out = tmp_path / "table"
@@ -248,7 +242,7 @@ def test_a_full_disk_ends_the_stage_with_a_sentence_and_it_goes_on_when_there_is
     assert held(out) == undisturbed
 
 
-def test_what_killed_workers_left_half_written_is_swept_away_and_a_torn_part_made_again(
+def test_embed_sweeps_leftovers_and_repairs_torn_part(
     tmp_path: Path, tiny_shards: str, undisturbed: dict[str, bytes]
 ) -> None:
     embed_gallery(settings_of(tiny_shards, tmp_path), network_of_colours())
@@ -260,7 +254,7 @@ def test_what_killed_workers_left_half_written_is_swept_away_and_a_torn_part_mad
 
 
 @pytest.mark.parametrize("workers", [2, 3])
-def test_more_workers_than_the_cluster_has_room_for_starve_nobody(
+def test_embed_more_workers_than_cpus_still_finishes(
     workers: int,
     tmp_path: Path,
     tiny_shards: str,
@@ -274,7 +268,7 @@ def test_more_workers_than_the_cluster_has_room_for_starve_nobody(
     assert held(tmp_path) == undisturbed
 
 
-def test_a_worker_that_no_node_has_room_for_is_told_and_given_up(
+def test_embed_gives_up_without_room_for_a_worker(
     tmp_path: Path, tiny_shards: str, ray_cluster: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
     settings = settings_of(tiny_shards, tmp_path, cpus_per_worker=1000, patience=2.0)
@@ -285,7 +279,7 @@ def test_a_worker_that_no_node_has_room_for_is_told_and_given_up(
         embed_gallery(settings, network_of_colours())
 
 
-def test_shards_added_later_are_all_that_is_embedded(
+def test_embed_after_extension_embeds_new_shards_only(
     tmp_path: Path, copied: Path, undisturbed: dict[str, bytes], ray_cluster: None
 ) -> None:
     out, manifest = tmp_path / "table", copied / "manifest.json"

@@ -38,7 +38,7 @@ def saved(path: Path, **changed: Any) -> str:
     return str(path)
 
 
-def test_exported_features_come_back_with_the_same_figures(tmp_path: Path) -> None:
+def test_import_mat_round_trip_keeps_measures(tmp_path: Path) -> None:
     queries, gallery = (
         made_table(tmp_path / "q", TEST_SET[:1]),
         made_table(tmp_path / "g", TEST_SET[3:]),
@@ -72,7 +72,7 @@ def test_exported_features_come_back_with_the_same_figures(tmp_path: Path) -> No
     assert [len(line.split("\t")) for line in lines] == [10] * 10
 
 
-def test_places_are_the_folders_of_the_paths_and_else_the_labels(tmp_path: Path) -> None:
+def test_import_mat_locations_from_paths_or_labels(tmp_path: Path) -> None:
     import_features(ImportSettings(mat=saved(tmp_path / "p.mat"), out=str(tmp_path / "p")))
     table = open_table(str(tmp_path / "p" / "gallery"))
     assert table.labels().locations.tolist() == ["0839", "0840", "0007"]
@@ -89,7 +89,7 @@ def test_places_are_the_folders_of_the_paths_and_else_the_labels(tmp_path: Path)
     ]
 
 
-def test_the_views_are_read_off_the_paths(tmp_path: Path) -> None:
+def test_import_mat_views_from_paths(tmp_path: Path) -> None:
     turned = {
         "query_path": ["/d/query_satellite/0839/a.jpg", "/d/query_satellite/0007/b.jpg"],
         "gallery_path": [f"/d/gallery_drone/{n:04d}/i.jpg" for n in (839, 840, 7)],
@@ -101,7 +101,7 @@ def test_the_views_are_read_off_the_paths(tmp_path: Path) -> None:
     assert open_table(str(tmp_path / "t" / "gallery")).counts == {(Split.GALLERY, View.DRONE): 3}
 
 
-def test_junk_of_the_gallery_is_left_out_as_the_official_code_leaves_it_out(tmp_path: Path) -> None:
+def test_import_mat_drops_junk_as_official_code(tmp_path: Path) -> None:
     mat = saved(tmp_path / "j.mat", gallery_label=[839, -1, 7])
     assert import_features(ImportSettings(mat=mat, out=str(tmp_path / "j")))["gallery"][1] == 2
 
@@ -115,7 +115,7 @@ def test_junk_of_the_gallery_is_left_out_as_the_official_code_leaves_it_out(tmp_
         ({"gallery_f": np.zeros((3, 4))}, r"row 0 of gallery_f .* has length 0"),
     ],
 )
-def test_a_file_that_does_not_fit_is_refused(
+def test_import_mat_rejects_mismatched_shapes(
     tmp_path: Path, changed: dict[str, Any], sentence: str
 ) -> None:
     with pytest.raises(InputError, match=sentence):
@@ -124,7 +124,7 @@ def test_a_file_that_does_not_fit_is_refused(
         )
 
 
-def test_what_is_no_mat_file_is_refused(tmp_path: Path) -> None:
+def test_import_mat_rejects_other_files(tmp_path: Path) -> None:
     (tmp_path / "x.mat").write_text("nothing of the kind")
     for name, sentence in (
         ("x.mat", r"cannot be read as a .mat file"),
@@ -134,13 +134,13 @@ def test_what_is_no_mat_file_is_refused(tmp_path: Path) -> None:
             import_features(ImportSettings(mat=str(tmp_path / name), out=str(tmp_path / "o")))
 
 
-def test_other_features_in_the_folder_are_not_mixed_with_these(tmp_path: Path) -> None:
+def test_import_mat_rejects_folder_of_other_features(tmp_path: Path) -> None:
     made_table(tmp_path / "o" / "gallery", TEST_SET[2:3])
     with pytest.raises(InputError, match=r"not of these features; choose another --out"):
         import_features(ImportSettings(mat=saved(tmp_path / "p.mat"), out=str(tmp_path / "o")))
 
 
-def test_names_that_are_no_numbers_get_numbers_and_keep_their_folder(tmp_path: Path) -> None:
+def test_mat_export_numbers_textual_locations(tmp_path: Path) -> None:
     for split, view in ((Split.QUERY, View.DRONE), (Split.GALLERY, View.SATELLITE)):
         write_part(
             str(tmp_path / "t" / f"{split}.parquet"),
@@ -173,7 +173,7 @@ def row(query: str, *best: str) -> dict[str, Any]:
     }
 
 
-def test_an_answer_is_a_line_of_gallery_ids_between_tabs() -> None:
+def test_answer_export_has_tab_separated_gallery_ids() -> None:
     rows = [row("q1", "0001", "0002"), row("q2", "0002", "0001")]
     assert exports.answer_text(rows) == "0001\t0002\n0002\t0001\n"
     names = {"q1": "Ab.jpeg", "q2": "Cd.jpeg", "k0001": "Xy.jpg", "k0002": "Zz.jpg"}

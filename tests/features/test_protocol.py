@@ -93,7 +93,7 @@ def by_hand(queries: Listed, gallery: Listed) -> dict[str, float]:
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("protocol", ["full", "queried-only"])
-def test_every_figure_is_that_of_a_loop_over_the_queries(
+def test_protocol_measures_equal_loop_over_queries(
     tmp_path: Path, seed: int, protocol: Protocol
 ) -> None:
     drone, satellite = world(seed)
@@ -116,7 +116,7 @@ def test_every_figure_is_that_of_a_loop_over_the_queries(
             )
 
 
-def test_the_world_holds_ties_distractors_a_55_image_place_and_queries_without_a_match() -> None:
+def test_protocol_world_has_hard_cases() -> None:
     drone, satellite = world(0)
     counts = [sum(place == f"{p:04d}" for place, _ in drone) for p in range(7)]
     assert 55 in counts
@@ -129,7 +129,7 @@ def test_the_world_holds_ties_distractors_a_55_image_place_and_queries_without_a
     assert len({tuple(vector.tolist()) for _, vector in drone}) < len(drone) / 2
 
 
-def test_multi_query_is_the_loop_over_the_mean_vectors(tmp_path: Path) -> None:
+def test_protocol_multi_query_equals_loop_over_means(tmp_path: Path) -> None:
     drone, satellite = world(1)
     opened = open_table(table(tmp_path, drone, satellite))
     means: Listed = []

@@ -19,7 +19,7 @@ NAME = "gallery-satellite-000000.parquet"
 
 
 @pytest.mark.parametrize("dtype", ["float16", "float32"])
-def test_rows_are_what_pyarrow_reads(tmp_path: Path, dtype: str) -> None:
+def test_row_reader_equals_pyarrow(tmp_path: Path, dtype: str) -> None:
     """40,000 rows: three row groups, of several pages each."""
     vectors = clustered(40_000, 24, 0)
     write_table_part(tmp_path, 0, vectors, dtype=dtype)
@@ -35,7 +35,7 @@ def test_rows_are_what_pyarrow_reads(tmp_path: Path, dtype: str) -> None:
     version=st.sampled_from(["1.0", "2.0"]), dtype=st.sampled_from(["float16", "float32"]),
 )  # fmt: skip
 @settings(max_examples=40)
-def test_rows_are_found_whatever_the_pages(
+def test_row_reader_finds_rows_across_pages(
     tmp_path_factory: pytest.TempPathFactory,
     rows: int,
     dimension: int,
@@ -83,9 +83,7 @@ STORED: list[dict[str, object]] = [
 
 
 @pytest.mark.parametrize("stored", STORED)
-def test_embeddings_that_are_not_plain_are_refused(
-    tmp_path: Path, stored: dict[str, object]
-) -> None:
+def test_row_reader_rejects_encoded_embeddings(tmp_path: Path, stored: dict[str, object]) -> None:
     write_table_part(tmp_path, 0, clustered(20, 8, 1))
     table = pq.read_table(tmp_path / NAME)
     pq.write_table(table, tmp_path / NAME, **stored)
@@ -93,7 +91,7 @@ def test_embeddings_that_are_not_plain_are_refused(
         RowReader(str(tmp_path), 8).read(NAME, "shard 0", np.array([3]))
 
 
-def test_a_part_that_is_another_shards_or_gone_is_refused(tmp_path: Path) -> None:
+def test_row_reader_rejects_changed_or_missing_part(tmp_path: Path) -> None:
     write_table_part(tmp_path, 0, clustered(20, 8, 1))
     reader = RowReader(str(tmp_path), 8)
     with pytest.raises(InputError, match="no longer of the shard"):
@@ -105,7 +103,7 @@ def test_a_part_that_is_another_shards_or_gone_is_refused(tmp_path: Path) -> Non
         reader.read(NAME, "shard 0", np.array([3]))
 
 
-def test_few_parts_are_open_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_row_reader_keeps_few_parts_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(row_reader, "MAX_OPEN_PARTS", 2)
     for number in range(5):
         write_table_part(tmp_path, number, clustered(4, 8, number))
@@ -118,6 +116,6 @@ def test_few_parts_are_open_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert len(reader._open) <= 2
 
 
-def test_only_tables_on_this_machine_are_read_by_rows() -> None:
+def test_row_reader_needs_local_table() -> None:
     assert supports_row_reads("/somewhere/table")
     assert not supports_row_reads("memory://table")

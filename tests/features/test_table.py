@@ -48,7 +48,7 @@ def write(
     return vectors
 
 
-def test_what_is_written_is_read_back_by_split_and_view(tmp_path: Path) -> None:
+def test_table_round_trip_by_split_and_view(tmp_path: Path) -> None:
     drone, satellite = (
         write(tmp_path, "query", "drone", 0),
         write(tmp_path, "gallery", "satellite", 1),
@@ -69,7 +69,7 @@ def test_what_is_written_is_read_back_by_split_and_view(tmp_path: Path) -> None:
     assert table.select(view=View.STREET).labels().keys.tolist() == []
 
 
-def test_a_part_that_mixes_splits_is_filtered_by_row(tmp_path: Path) -> None:
+def test_table_filters_mixed_part_by_row(tmp_path: Path) -> None:
     rows = PartRows(
         keys=["a", "b"],
         locations=["1", "2"],
@@ -85,14 +85,14 @@ def test_a_part_that_mixes_splits_is_filtered_by_row(tmp_path: Path) -> None:
     assert open_table(str(tmp_path)).select(Split.GALLERY).labels().keys.tolist() == ["b"]
 
 
-def test_half_precision_is_stored_as_such_and_read_as_float32(tmp_path: Path) -> None:
+def test_write_part_float16_is_read_as_float32(tmp_path: Path) -> None:
     vectors = write(tmp_path, "query", "drone", 0, "float16")
     read = open_table(str(tmp_path)).embeddings()
     assert read.dtype == np.float32
     assert np.abs(read - vectors).max() < 5e-4
 
 
-def test_pandas_and_pyarrow_read_the_table_as_it_is(tmp_path: Path) -> None:
+def test_table_is_read_by_pandas_and_pyarrow(tmp_path: Path) -> None:
     vectors = write(tmp_path, "query", "drone", 0)
     frame = pd.read_parquet(tmp_path)
     assert frame["key"].tolist() == [f"query-drone-{n}" for n in range(5)]
@@ -100,7 +100,7 @@ def test_pandas_and_pyarrow_read_the_table_as_it_is(tmp_path: Path) -> None:
     assert pyarrow.dataset.dataset(tmp_path).count_rows() == 5
 
 
-def test_the_footer_says_what_made_the_part(tmp_path: Path) -> None:
+def test_footer_records_encoder_and_shard(tmp_path: Path) -> None:
     footer = PartFooter(
         fingerprint="f",
         shard_sha256="s",
@@ -111,7 +111,7 @@ def test_the_footer_says_what_made_the_part(tmp_path: Path) -> None:
     assert read_footer(str(tmp_path / "query-drone-000000.parquet")) == footer
 
 
-def test_embeddings_are_neither_compressed_nor_given_statistics(tmp_path: Path) -> None:
+def test_write_part_stores_plain_embeddings(tmp_path: Path) -> None:
     write(tmp_path, "query", "drone", 0)
     group = pq.ParquetFile(tmp_path / "query-drone-000000.parquet").metadata.row_group(0)
     columns = {group.column(n).path_in_schema: group.column(n) for n in range(group.num_columns)}
@@ -122,7 +122,7 @@ def test_embeddings_are_neither_compressed_nor_given_statistics(tmp_path: Path) 
     assert not any("DICTIONARY" in encoding for encoding in embedding.encodings)
 
 
-def test_two_networks_in_one_table_are_refused_with_the_remedy(tmp_path: Path) -> None:
+def test_table_rejects_two_fingerprints(tmp_path: Path) -> None:
     write(tmp_path, "query", "drone", 0)
     write(
         tmp_path,
@@ -135,7 +135,7 @@ def test_two_networks_in_one_table_are_refused_with_the_remedy(tmp_path: Path) -
         open_table(str(tmp_path))
 
 
-def test_no_table_a_foreign_file_and_a_torn_one_are_told_apart(tmp_path: Path) -> None:
+def test_open_table_distinguishes_absent_foreign_torn(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="found no Parquet part"):
         open_table(str(tmp_path))
     (tmp_path / "a.parquet").write_bytes(b"torn")
@@ -146,7 +146,7 @@ def test_no_table_a_foreign_file_and_a_torn_one_are_told_apart(tmp_path: Path) -
         open_table(str(tmp_path))
 
 
-def test_a_part_with_fewer_rows_than_it_says_is_refused(tmp_path: Path) -> None:
+def test_table_rejects_part_with_missing_rows(tmp_path: Path) -> None:
     write(
         tmp_path, "query", "drone", 0, footer=PartFooter(fingerprint="f", shard_sha256="s", rows=6)
     )
@@ -179,7 +179,7 @@ def keys_of(table: FeatureTable) -> list[str]:
     return found
 
 
-def test_rows_are_selected_by_location_and_by_rectangle_and_by_both(tmp_path: Path) -> None:
+def test_select_by_location_and_box(tmp_path: Path) -> None:
     vectors = table_of_places(tmp_path)
     table = open_table(str(tmp_path))
     assert keys_of(table.select(locations="b")) == ["drone-1", "satellite-1"]
@@ -207,7 +207,7 @@ def test_rows_are_selected_by_location_and_by_rectangle_and_by_both(tmp_path: Pa
         Box(south=5, north=4, west=0, east=1)
 
 
-def test_a_second_selection_narrows_the_first(tmp_path: Path) -> None:
+def test_select_narrows_earlier_selection(tmp_path: Path) -> None:
     table_of_places(tmp_path)
     table = open_table(str(tmp_path)).select(view=View.DRONE)
     assert table.select(view=View.SATELLITE).rows == 0
@@ -215,7 +215,7 @@ def test_a_second_selection_narrows_the_first(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float16"])
-def test_blocks_come_as_stored_or_as_asked_for(tmp_path: Path, dtype: str) -> None:
+def test_blocks_have_stored_or_requested_dtype(tmp_path: Path, dtype: str) -> None:
     vectors = table_of_places(tmp_path, dtype)
     table = open_table(str(tmp_path))
     assert table.dtype == dtype
@@ -225,7 +225,7 @@ def test_blocks_come_as_stored_or_as_asked_for(tmp_path: Path, dtype: str) -> No
     assert np.allclose(table.embeddings(), vectors, atol=1e-3)
 
 
-def test_a_part_of_many_rows_is_read_in_little_memory(tmp_path: Path) -> None:
+def test_table_reads_large_part_in_little_memory(tmp_path: Path) -> None:
     rows, dimension = 60_000, 256  # 61 MB
     vectors = np.zeros((rows, dimension), np.float32)
     vectors[np.arange(rows), np.arange(rows) % dimension] = 1
@@ -249,9 +249,7 @@ def test_a_part_of_many_rows_is_read_in_little_memory(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("length", [np.nan, 0.0, 1.1])
-def test_an_embedding_that_is_no_unit_vector_is_refused_with_its_part(
-    tmp_path: Path, length: float
-) -> None:
+def test_table_rejects_non_unit_embedding(tmp_path: Path, length: float) -> None:
     write(tmp_path, "gallery", "satellite", 1)
     rows = PartRows(
         keys=["k"], locations=["a"], views=["drone"], splits=["query"], lats=[None], lons=[None],
@@ -269,7 +267,7 @@ def test_an_embedding_that_is_no_unit_vector_is_refused_with_its_part(
     assert table.select(Split.GALLERY).embeddings().shape == (5, 8)
 
 
-def test_a_key_that_is_there_twice_is_refused_with_both_parts(tmp_path: Path) -> None:
+def test_table_rejects_duplicate_key_with_both_parts(tmp_path: Path) -> None:
     write(tmp_path, "query", "drone", 0)
     shutil.copy(tmp_path / "query-drone-000000.parquet", tmp_path / "query-drone-000001.parquet")
     said = r"query-drone-000001\.parquet holds key query-drone-0, which query-drone-000000\.parquet holds too"
@@ -278,7 +276,7 @@ def test_a_key_that_is_there_twice_is_refused_with_both_parts(tmp_path: Path) ->
             opened(str(tmp_path))
 
 
-def test_parts_of_other_numbers_are_refused(tmp_path: Path) -> None:
+def test_table_rejects_mixed_dtypes(tmp_path: Path) -> None:
     write(tmp_path, "query", "drone", 0, "float16")
     write(tmp_path, "gallery", "drone", 1)
     with pytest.raises(
@@ -288,7 +286,7 @@ def test_parts_of_other_numbers_are_refused(tmp_path: Path) -> None:
         open_table(str(tmp_path))
 
 
-def test_the_list_of_what_has_no_row_is_beside_the_parts_and_in_nobodys_way(tmp_path: Path) -> None:
+def test_rejected_list_is_hidden_from_readers(tmp_path: Path) -> None:
     write(tmp_path, "query", "drone", 0)
     assert write_rejected(
         str(tmp_path), [("s", "k", "not an image", "9 bytes"), ("r", None, "unusable", "cut off")]
@@ -306,7 +304,7 @@ def test_the_list_of_what_has_no_row_is_beside_the_parts_and_in_nobodys_way(tmp_
     assert len(read_rejected(str(tmp_path))) == 0
 
 
-def test_the_snippets_of_the_docs_run(tmp_path: Path) -> None:
+def test_docs_snippets_run(tmp_path: Path) -> None:
     vectors = write(tmp_path, "query", "drone", 0)
     write_rejected(str(tmp_path), [("s", "k", "not an image", "9 bytes")])
     frame = pd.read_parquet(tmp_path, filters=[("view", "==", "drone")])

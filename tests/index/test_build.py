@@ -58,7 +58,7 @@ def answers(index: Index, table: str) -> list[list[tuple[str, float]]]:
 
 
 @pytest.mark.parametrize("factory", MERGED)
-def test_units_make_the_index_that_one_pass_makes(
+def test_build_by_units_equals_one_pass(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factory: str
 ) -> None:
     whole = build(table, tmp_path / "whole", factory=factory)
@@ -70,7 +70,7 @@ def test_units_make_the_index_that_one_pass_makes(
     assert answers(units, table) == answers(whole, table)
 
 
-def test_ray_builds_what_this_process_builds(
+def test_build_by_ray_equals_one_process(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ray_cluster: None
 ) -> None:
     here = build(table, tmp_path / "here", factory="IVF8,SQ8")
@@ -84,7 +84,7 @@ def test_ray_builds_what_this_process_builds(
 
 
 @pytest.mark.parametrize("factory", ["Flat", "HNSW16,SQ8", "IVF8,SQ8"])
-def test_an_index_in_parts_answers_as_one(table: str, tmp_path: Path, factory: str) -> None:
+def test_build_in_parts_answers_as_one(table: str, tmp_path: Path, factory: str) -> None:
     one, three = (
         build(table, tmp_path / f"{parts}", factory=factory, parts=parts, target_recall=1.0)
         for parts in (1, 3)
@@ -128,7 +128,7 @@ KILLED = """
     ("at", "nth", "left"),
     [("build_unit", 1, 0), ("build_unit", 3, 2), ("merge", 1, 4), ("write_ids", 1, 4)],
 )
-def test_a_killed_build_goes_on_to_the_same_answers(
+def test_build_killed_resumes_to_the_same_answers(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str, nth: int, left: int
 ) -> None:
     """SIGKILL before the n-th call; the next run does not do again what was done."""
@@ -160,7 +160,7 @@ def test_a_killed_build_goes_on_to_the_same_answers(
     )
 
 
-def test_unfinished_work_of_another_plan_is_not_gone_on_with(
+def test_build_does_not_resume_another_plan(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "index"
@@ -177,7 +177,7 @@ def test_unfinished_work_of_another_plan_is_not_gone_on_with(
     )
 
 
-def test_lists_on_the_disk_answer_as_lists_in_memory(
+def test_lists_on_disk_answer_as_in_memory(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def on_disk(gallery: object, on_disk: bool = True) -> IndexPlan:
@@ -207,7 +207,7 @@ def test_lists_on_the_disk_answer_as_lists_in_memory(
     assert kinds == ["OnDiskInvertedLists", "ArrayInvertedLists"]
 
 
-def test_the_planner_is_told_of_strong_directions(tmp_path: Path) -> None:
+def test_build_passes_strong_directions_to_planner(tmp_path: Path) -> None:
     """Vectors in 16 of 64 directions: the projection keeps all of them, and inner products as they
     were.
     """
@@ -235,7 +235,7 @@ def test_the_planner_is_told_of_strong_directions(tmp_path: Path) -> None:
     assert index.facts["recall_at_10"] >= 0.9
 
 
-def test_what_an_index_says_of_itself(table: str, tmp_path: Path) -> None:
+def test_index_metadata_describes_the_build(table: str, tmp_path: Path) -> None:
     index = build(table, tmp_path / "index", factory="IVF8,SQ8", target_recall=0.9)
     facts = json.loads((tmp_path / "index" / "index.json").read_text())
     assert facts["rows"] == 1000
@@ -250,7 +250,7 @@ def test_what_an_index_says_of_itself(table: str, tmp_path: Path) -> None:
     assert index.told.effort.breadth < 8, "no more lists than it takes"
 
 
-def test_recall_that_cannot_be_reached_is_said(
+def test_build_reports_unreachable_recall(
     table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     index = build(table, tmp_path / "index", factory="IVF8,PQ2x4", target_recall=0.99)
@@ -258,9 +258,7 @@ def test_recall_that_cannot_be_reached_is_said(
     assert "however hard the search tries, below the target of 0.99" in capsys.readouterr().err
 
 
-def test_an_index_of_all_rows_is_measured_by_rows_that_do_not_find_themselves(
-    table: str, tmp_path: Path
-) -> None:
+def test_build_of_all_rows_excludes_own_row_from_recall(table: str, tmp_path: Path) -> None:
     index = build(
         table, tmp_path / "index", factory="IVF8,PQ2x4", split=None, view=None, target_recall=0.99
     )
@@ -268,7 +266,7 @@ def test_an_index_of_all_rows_is_measured_by_rows_that_do_not_find_themselves(
     assert index.facts["recall_at_1"] < 0.9
 
 
-def test_a_finished_index_is_left_alone_and_other_rows_are_refused(
+def test_build_finished_index_is_a_no_op(
     table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "index"
@@ -299,7 +297,7 @@ def test_a_finished_index_is_left_alone_and_other_rows_are_refused(
         ({"table": "/nowhere"}, "no feature table at /nowhere"),
     ],
 )
-def test_bad_calls_get_one_sentence(
+def test_build_invalid_settings_get_one_sentence(
     table: str, tmp_path: Path, changes: dict[str, object], sentence: str
 ) -> None:
     with pytest.raises(InputError, match=sentence):
@@ -308,7 +306,7 @@ def test_bad_calls_get_one_sentence(
 
 
 @pytest.mark.parametrize("name", ["index.faiss", "ids.arrow", "ids.parquet"])
-def test_a_torn_or_missing_file_is_named(table: str, tmp_path: Path, name: str) -> None:
+def test_open_index_names_torn_or_missing_file(table: str, tmp_path: Path, name: str) -> None:
     out = tmp_path / "index"
     build(table, out)
     whole = (out / name).read_bytes()
@@ -333,7 +331,7 @@ def test_a_torn_or_missing_file_is_named(table: str, tmp_path: Path, name: str) 
         (lambda facts: [facts], "is damaged"),
     ],
 )
-def test_an_index_that_another_wrote_is_refused(
+def test_build_rejects_index_of_other_settings(
     table: str, tmp_path: Path, change: object, sentence: str
 ) -> None:
     out = tmp_path / "index"
@@ -347,7 +345,7 @@ def test_an_index_that_another_wrote_is_refused(
         Index(str(out))
 
 
-def test_an_index_lies_on_any_storage(table: str, tmp_path: Path) -> None:
+def test_build_on_any_storage(table: str, tmp_path: Path) -> None:
     settings = IndexSettings(
         table=table,
         out="memory://index-of-tests",
@@ -364,7 +362,7 @@ def test_an_index_lies_on_any_storage(table: str, tmp_path: Path) -> None:
         storage.remove_folder(settings.out)
 
 
-def test_budgets_are_read_as_people_write_them() -> None:
+def test_parse_bytes_reads_usual_notations() -> None:
     assert [parse_bytes(text) for text in ("4GB", "512 mb", "1.5G", "100")] == [
         4 * 10**9,
         512 * 10**6,
@@ -373,7 +371,7 @@ def test_budgets_are_read_as_people_write_them() -> None:
     ]
 
 
-def test_units_are_whole_parts_of_the_table_in_order() -> None:
+def test_work_units_are_table_parts_in_order() -> None:
     units = plan_units({"a": 3, "b": 4, "c": 9, "d": 1}, 8)
     assert [(unit.table_parts, unit.rows) for unit in units] == [
         (("a", "b"), 7),
@@ -384,7 +382,7 @@ def test_units_are_whole_parts_of_the_table_in_order() -> None:
 
 
 @given(st.lists(st.integers(1, 50), max_size=40), st.integers(1, 200))
-def test_groups_are_consecutive_and_about_as_large_as_wanted(sizes: list[int], wanted: int) -> None:
+def test_groups_are_consecutive_and_even(sizes: list[int], wanted: int) -> None:
     groups = even_groups(sizes, wanted)
     assert [number for group in groups for number in group] == list(range(len(sizes)))
     for group in groups:
@@ -393,7 +391,7 @@ def test_groups_are_consecutive_and_about_as_large_as_wanted(sizes: list[int], w
         )
 
 
-def test_merged_lists_take_no_more_than_they_hold(
+def test_merged_lists_have_exact_size(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pipeline.index.plan.MIN_UNIT_ROWS", 250)

@@ -54,16 +54,14 @@ def answers(out: Path, table: str) -> list[Any]:
 
 
 @pytest.mark.parametrize("name", ["index.faiss", "ids.arrow", "ids.parquet"])
-def test_a_damaged_file_of_an_index_is_refused_before_it_is_opened(
+def test_index_file_damaged_is_rejected_before_opening(
     name: str, table: str, built: Path, tmp_path: Path
 ) -> None:
     out = Path(shutil.copytree(built, tmp_path / "index"))
     assert count_detected(out / name, lambda: answers(out, table), 40) == 41
 
 
-def test_the_trained_index_is_looked_at_where_it_is_used(
-    table: str, built: Path, tmp_path: Path
-) -> None:
+def test_trained_index_is_hashed_when_used(table: str, built: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(built, tmp_path / "index"))
     path = out / "trained.faiss"
     assert count_detected(path, lambda: verify_index(str(out)).rows, 20) == 21
@@ -77,7 +75,7 @@ def test_the_trained_index_is_looked_at_where_it_is_used(
         extend_index(str(more), str(out))
 
 
-def test_an_index_too_large_to_hash_is_looked_at_when_asked(
+def test_large_index_is_hashed_by_verify_only(
     table: str, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pipeline.index.searcher.HASHED_ON_OPEN_BYTES", 0)
@@ -98,7 +96,7 @@ class Killed(Exception):
 @pytest.mark.parametrize(
     "name", ["unit-000001.faiss", "unit-000001.faiss.json", "trained.faiss", "plan.json"]
 )
-def test_damage_to_what_a_killed_build_left_costs_work_and_nothing_else(
+def test_build_redoes_damaged_work_of_a_killed_build(
     name: str, table: str, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pipeline.index.plan.MIN_UNIT_ROWS", 100)
@@ -126,7 +124,7 @@ def test_damage_to_what_a_killed_build_left_costs_work_and_nothing_else(
         assert (out / "index.faiss").read_bytes() == (built / "index.faiss").read_bytes()
 
 
-def test_a_file_is_whole_as_long_as_it_is_what_was_vouched_for(tmp_path: Path) -> None:
+def test_checksum_ok_until_the_file_changes(tmp_path: Path) -> None:
     path = tmp_path / "unit.faiss"
     path.write_bytes(np.random.default_rng(0).bytes(500))
     assert not checksum_ok(str(path))
@@ -140,7 +138,7 @@ def test_a_file_is_whole_as_long_as_it_is_what_was_vouched_for(tmp_path: Path) -
             assert checksum_ok(str(path)) == (data == good)
 
 
-def test_a_table_is_looked_at_before_an_index_is_built_of_it(table: str, tmp_path: Path) -> None:
+def test_build_verifies_the_table_first(table: str, tmp_path: Path) -> None:
     spoilt = Path(shutil.copytree(table, tmp_path / "table"))
     build_index(settings(str(spoilt), tmp_path / "index", verify=True))
     path = next(spoilt.glob("gallery*"))
@@ -154,9 +152,7 @@ def test_a_table_is_looked_at_before_an_index_is_built_of_it(table: str, tmp_pat
             build_index(settings(str(spoilt), tmp_path / out, verify=True))
 
 
-def test_an_evaluation_looks_at_every_byte_of_its_tables_when_asked(
-    table: str, tmp_path: Path
-) -> None:
+def test_evaluate_verify_checks_every_byte_of_tables(table: str, tmp_path: Path) -> None:
     spoilt = Path(shutil.copytree(table, tmp_path / "table"))
     asked = EvaluationSettings(table=str(spoilt), out=str(tmp_path / "out"), verify=True)
     plan_tasks(asked)

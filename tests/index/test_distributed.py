@@ -38,9 +38,7 @@ def index(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
     return table, str(folder / "index")
 
 
-def test_actors_answer_together_what_one_process_answers(
-    index: tuple[str, str], ray_cluster: None
-) -> None:
+def test_distributed_answers_equal_one_process(index: tuple[str, str], ray_cluster: None) -> None:
     table, path = index
     queries_QD = open_table(table).select(Split.QUERY).embeddings()
     here = Index(path)
@@ -61,7 +59,7 @@ def test_actors_answer_together_what_one_process_answers(
             spread.search(queries_QD[:, :5])
 
 
-def test_a_damaged_part_is_refused_before_any_question(
+def test_distributed_rejects_damaged_part_on_opening(
     index: tuple[str, str], ray_cluster: None
 ) -> None:
     _, path = index

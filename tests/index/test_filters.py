@@ -34,11 +34,11 @@ def meant(where: Filter) -> list[int]:
     return np.flatnonzero(where.mask(rows)).tolist()
 
 
-def test_without_conditions_every_row_may_answer() -> None:
+def test_filter_without_conditions_allows_every_row() -> None:
     assert meant(Filter()) == [0, 1, 2, 3, 4]
 
 
-def test_each_condition_alone_and_all_together() -> None:
+def test_filter_conditions_alone_and_combined() -> None:
     assert meant(Filter(view=View.DRONE)) == [4]
     assert meant(Filter(view=View.STREET)) == []
     assert meant(Filter(locations=frozenset(["a", "unheard-of"]))) == [0, 3]
@@ -60,7 +60,7 @@ def test_each_condition_alone_and_all_together() -> None:
     assert meant(together) == [0]
 
 
-def test_a_row_without_a_position_is_in_no_box_and_no_circle() -> None:
+def test_row_without_position_is_outside_box_and_circle() -> None:
     assert 4 not in meant(Filter(box=Box(south=-90, north=90, west=-180, east=180)))
     assert 4 not in meant(Filter(near=Circle(lat=0, lon=0, radius_m=3e7)))
 
@@ -69,7 +69,7 @@ def test_a_row_without_a_position_is_in_no_box_and_no_circle() -> None:
     st.lists(st.tuples(st.floats(-90, 90), st.floats(-180, 180)), min_size=1, max_size=8),
     st.floats(-90, 90), st.floats(-180, 180), st.floats(1, 2.1e7),
 )  # fmt: skip
-def test_a_circle_holds_what_is_within_its_radius(
+def test_circle_contains_rows_within_its_radius(
     places: list[tuple[float, float]], lat: float, lon: float, radius: float
 ) -> None:
     places_N2 = np.array(places)
@@ -87,6 +87,6 @@ def test_a_circle_holds_what_is_within_its_radius(
     ("lat", "lon", "radius"),
     [(91, 0, 1), (0, 181, 1), (0, 0, 0), (0, 0, float("nan")), (0, 0, float("inf"))],
 )
-def test_what_is_no_circle_is_refused(lat: float, lon: float, radius: float) -> None:
+def test_circle_rejects_invalid_values(lat: float, lon: float, radius: float) -> None:
     with pytest.raises(InputError, match="expected a latitude from -90 to 90"):
         Circle(lat=lat, lon=lon, radius_m=radius)

@@ -39,7 +39,7 @@ def planned(gallery: GallerySpec) -> IndexPlan | None:
 
 
 @given(galleries)
-def test_a_plan_is_never_over_the_budget(gallery: GallerySpec) -> None:
+def test_plan_is_never_over_the_budget(gallery: GallerySpec) -> None:
     plan = planned(gallery)
     if plan is not None:
         assert plan.search_bytes <= gallery.budget
@@ -49,7 +49,7 @@ def test_a_plan_is_never_over_the_budget(gallery: GallerySpec) -> None:
 
 
 @given(galleries, st.floats(1, 100))
-def test_more_memory_never_means_less_recall(gallery: GallerySpec, more: float) -> None:
+def test_plan_more_memory_never_lowers_recall(gallery: GallerySpec, more: float) -> None:
     plan = planned(gallery)
     if plan is not None:
         richer = plan_index(replace(gallery, budget=gallery.budget * more))
@@ -58,14 +58,14 @@ def test_more_memory_never_means_less_recall(gallery: GallerySpec, more: float) 
 
 
 @given(galleries)
-def test_what_fits_into_no_budget_is_refused_with_what_it_would_take(gallery: GallerySpec) -> None:
+def test_plan_over_budget_is_rejected_with_bytes_needed(gallery: GallerySpec) -> None:
     starved = replace(gallery, budget=1e6)
     with pytest.raises(InputError, match=r"GB at least, by .*raise --memory-budget"):
         plan_index(starved)
 
 
 @given(galleries)
-def test_every_plan_is_one_that_faiss_builds(gallery: GallerySpec) -> None:
+def test_plan_is_built_by_faiss(gallery: GallerySpec) -> None:
     plan = planned(replace(gallery, rows=min(gallery.rows, 10**7)))
     if plan is not None:
         index = faiss.index_factory(gallery.dimension, plan.factory, faiss.METRIC_INNER_PRODUCT)
@@ -75,12 +75,12 @@ def test_every_plan_is_one_that_faiss_builds(gallery: GallerySpec) -> None:
 
 
 @given(galleries)
-def test_vectors_that_cannot_be_read_singly_are_not_reckoned_with(gallery: GallerySpec) -> None:
+def test_plan_ignores_vectors_without_row_access(gallery: GallerySpec) -> None:
     plan = planned(replace(gallery, rows_readable=False))
     assert plan is None or plan.refine == "none"
 
 
-def test_few_rows_are_searched_exactly_and_the_sentence_says_so() -> None:
+def test_plan_few_rows_are_searched_exactly() -> None:
     plan = plan_index(GallerySpec(rows=EXACT_ROWS, dimension=2048, budget=4e9, target_recall=0.95))
     assert (plan.factory, plan.training_rows, plan.expected_recall) == ("Flat", 0, 1.0)
     assert plan.why == "exact search: 100,000 rows are few enough to look at each"
@@ -92,7 +92,7 @@ def test_few_rows_are_searched_exactly_and_the_sentence_says_so() -> None:
     )
 
 
-def test_memory_is_what_it_comes_to() -> None:
+def test_plan_memory_matches_the_index() -> None:
     """Lists of 8-bit codes of 1,000,000 x 2048 with their ids: 2.056 GB, beside the process and the
     centroids.
     """
@@ -104,7 +104,7 @@ def test_memory_is_what_it_comes_to() -> None:
     assert plan.why == "lists of 8-bit codes: 2,056 bytes a row"
 
 
-def test_a_tight_budget_leaves_the_lists_on_the_disk_or_takes_smaller_codes() -> None:
+def test_plan_tight_budget_uses_disk_or_smaller_codes() -> None:
     gallery = GallerySpec(rows=10**7, dimension=2048, budget=4e9, target_recall=0.95)
     assert (plan_index(gallery).factory, plan_index(gallery).refine) == (
         "IVF2048,PQ256x4fs",
@@ -118,20 +118,20 @@ def test_a_tight_budget_leaves_the_lists_on_the_disk_or_takes_smaller_codes() ->
         assert plan.part_rows < gallery.rows, "what does not fit the memory cannot be merged in it"
 
 
-def test_few_strong_directions_are_made_use_of() -> None:
+def test_plan_uses_few_strong_directions() -> None:
     gallery = GallerySpec(rows=10**6, dimension=2048, budget=4e9, target_recall=0.95)
     assert plan_index(replace(gallery, effective_dimension=256)).factory.startswith("PCA256,IVF")
     assert not plan_index(replace(gallery, effective_dimension=1500)).factory.startswith("PCA")
 
 
-def test_recall_beyond_every_family_is_approached_as_far_as_it_goes() -> None:
+def test_plan_unreachable_recall_takes_the_best_family() -> None:
     best = max(family.ceiling for family in FAMILIES)
     gallery = GallerySpec(rows=10**6, dimension=2048, budget=64e9, target_recall=1.0)
     assert plan_index(gallery).expected_recall == best
     assert plan_index(replace(gallery, target_recall=0.99)).factory == "IVF2048,SQfp16"
 
 
-def test_a_factory_of_the_users_is_taken_as_it_is() -> None:
+def test_plan_takes_the_users_factory() -> None:
     plan = plan_factory(
         GallerySpec(rows=10**6, dimension=2048, budget=64e9, target_recall=1.0),
         "IVF16384,PQ64",

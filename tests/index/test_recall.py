@@ -40,12 +40,12 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Index]:
     return table, Index(str(folder / "index"))
 
 
-def test_a_query_is_not_credited_with_itself() -> None:
+def test_recall_excludes_the_querys_own_row() -> None:
     found = np.array([[5, 7, 9], [1, 2, 3], [4, 0, 6]])
     assert without_own_row(found, np.array([7, -1, 4])).tolist() == [[5, 9], [1, 2], [0, 6]]
 
 
-def test_exact_search_is_brute_force_whatever_the_blocks(
+def test_exact_search_equals_brute_force_for_any_blocks(
     built: tuple[str, Index], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     table = open_table(built[0])
@@ -72,7 +72,7 @@ def test_recall_by_hand(built: tuple[str, Index]) -> None:
     assert measure_recall(index, held, most) == (0.5, 0.8)
 
 
-def test_efforts_grow_from_the_least_to_the_most() -> None:
+def test_search_param_grid_grows() -> None:
     lists = list(search_param_grid(new_index("IVF12,SQ8", 32), "none"))
     assert [effort.breadth for effort in lists] == [1, 2, 4, 8, 12]
     graph = list(search_param_grid(new_index("HNSW8,SQ8", 32), "none"))
@@ -90,7 +90,7 @@ def test_efforts_grow_from_the_least_to_the_most() -> None:
     ]
 
 
-def test_the_least_effort_that_reaches_the_target_is_taken(built: tuple[str, Index]) -> None:
+def test_tune_takes_the_least_params_at_target(built: tuple[str, Index]) -> None:
     table, index = built
     queries, gallery = (
         open_table(table).select(Split.QUERY).embeddings(),
@@ -117,7 +117,7 @@ def test_the_least_effort_that_reaches_the_target_is_taken(built: tuple[str, Ind
     assert best in ladder
 
 
-def test_a_sample_has_of_each_part_its_share(built: tuple[str, Index]) -> None:
+def test_sample_takes_a_share_of_each_part(built: tuple[str, Index]) -> None:
     table = open_table(built[0]).select(Split.GALLERY)
     numbers, vectors = sample_rows(table, rows_by_part(table), 30)
     assert numbers.tolist() == [*range(10), *range(200, 210), *range(400, 410)]
@@ -125,7 +125,7 @@ def test_a_sample_has_of_each_part_its_share(built: tuple[str, Index]) -> None:
     assert len(sample_rows(table, rows_by_part(table), 10**6)[0]) == 600
 
 
-def test_directions_are_counted_by_the_length_they_hold() -> None:
+def test_strong_directions_counts_by_length() -> None:
     flat = np.zeros((2_000, 128), np.float32)
     flat[:, 5:20] = clustered(2_000, 15, 3)
     assert effective_dimension(flat) == 32, "15 directions, rounded up"

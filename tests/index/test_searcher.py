@@ -78,7 +78,7 @@ def brute_force(table: str, where: Filter | None, k: int) -> tuple[Floats, list[
     )
 
 
-def test_searching_finds_what_brute_force_finds(table: str, tmp_path: Path) -> None:
+def test_search_equals_brute_force(table: str, tmp_path: Path) -> None:
     index = Index(build(table, tmp_path / "index"))
     queries_QD, keys, scores = brute_force(table, None, 5)
     found = index.search(queries_QD, k=5)
@@ -95,7 +95,7 @@ def test_searching_finds_what_brute_force_finds(table: str, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("factory", FACTORIES)
 @pytest.mark.parametrize("name", FILTERS)
-def test_a_filter_leaves_what_brute_force_leaves(
+def test_search_filter_equals_brute_force(
     table: str, tmp_path_factory: pytest.TempPathFactory, factory: str, name: str
 ) -> None:
     """Few rows are left, so each is scored by the table's own vectors, however rough the index's
@@ -114,7 +114,7 @@ def test_a_filter_leaves_what_brute_force_leaves(
 
 
 @pytest.mark.parametrize("factory", ["Flat", "HNSW16,SQ8", "IVF8,SQ8", "IVF8,PQ16x4fs"])
-def test_a_filter_finds_enough_where_too_many_are_left_to_look_at_each(
+def test_search_wide_filter_still_finds_k(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factory: str
 ) -> None:
     """A third of the rows may answer, and the effort is that for all: lists are looked through
@@ -130,7 +130,7 @@ def test_a_filter_finds_enough_where_too_many_are_left_to_look_at_each(
 
 
 @pytest.mark.parametrize("factory", ["HNSW16,SQ8", "IVF8,SQ8"])
-def test_a_table_that_is_elsewhere_is_answered_by_codes(
+def test_search_without_the_table_uses_codes(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factory: str
 ) -> None:
     """Single vectors cannot be read from an object store: a narrow filter then looks at every code."""
@@ -143,9 +143,7 @@ def test_a_table_that_is_elsewhere_is_answered_by_codes(
     assert np.allclose([[hit.score for hit in hits] for hits in found], scores, atol=0.02)
 
 
-def test_candidates_scored_again_have_exact_scores_and_better_order(
-    table: str, tmp_path: Path
-) -> None:
+def test_search_reranked_scores_are_exact(table: str, tmp_path: Path) -> None:
     out = build(table, tmp_path / "index", factory="IVF4,PQ4x4fs", refine=True, target_recall=0.01)
     queries_QD, keys, scores = brute_force(table, None, 10)
     rough = Index(out).search(queries_QD, 10, effort=SearchParams(breadth=4))
@@ -167,7 +165,7 @@ def test_candidates_scored_again_have_exact_scores_and_better_order(
                 assert hit.score == pytest.approx(exact[best.index(hit.key)], abs=1e-6)
 
 
-def test_plain_faiss_opens_the_index_and_ids_are_row_numbers(table: str, tmp_path: Path) -> None:
+def test_index_is_opened_by_plain_faiss(table: str, tmp_path: Path) -> None:
     out = build(table, tmp_path / "index")
     plain = faiss.read_index(storage.join(out, "index.faiss"))
     vectors = open_table(table).select(Split.GALLERY).embeddings()
@@ -193,7 +191,7 @@ def test_plain_faiss_opens_the_index_and_ids_are_row_numbers(table: str, tmp_pat
     )
 
 
-def test_what_parts_find_is_merged_by_score_then_row() -> None:
+def test_merge_orders_by_score_then_row() -> None:
     one = np.array([[0.9, 0.5, -np.inf]], np.float32), np.array([[4, 2, NO_ROW]])
     other = np.array([[0.9, 0.7, 0.5]], np.float32), np.array([[3, 9, 1]])
     scores, rows = merge_results([one, other], 5)
@@ -202,7 +200,7 @@ def test_what_parts_find_is_merged_by_score_then_row() -> None:
     assert merge_results([one], 3)[1].tolist() == [[4, 2, NO_ROW]]
 
 
-def test_more_rows_than_there_are_cannot_be_found(table: str, tmp_path: Path) -> None:
+def test_search_k_beyond_rows_returns_all(table: str, tmp_path: Path) -> None:
     index = Index(build(table, tmp_path / "index"))
     queries_QD = open_table(table).select(Split.QUERY).embeddings()
     assert [len(hits) for hits in index.search(queries_QD[:3], 1000)] == [600, 600, 600]
@@ -212,7 +210,7 @@ def test_more_rows_than_there_are_cannot_be_found(table: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("shape", [(32,), (1, 31), (2, 3, 32)])
-def test_queries_of_another_network_are_refused(
+def test_search_rejects_queries_of_another_network(
     table: str, tmp_path: Path, shape: tuple[int, ...]
 ) -> None:
     index = Index(build(table, tmp_path / "index"))
@@ -220,6 +218,6 @@ def test_queries_of_another_network_are_refused(
         index.search(np.zeros(shape, np.float32))
 
 
-def test_no_index_is_said_to_be_none(tmp_path: Path) -> None:
+def test_open_index_absent_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no index at"):
         Index(str(tmp_path))

@@ -48,9 +48,7 @@ def keys(out: str, table: Path, k: int = 8) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("factory", FACTORIES)
-def test_new_parts_of_the_table_are_found_as_if_always_there(
-    table: Path, tmp_path: Path, factory: str
-) -> None:
+def test_extend_finds_new_parts(table: Path, tmp_path: Path, factory: str) -> None:
     out = build(table, tmp_path / "index", factory)
     first = (tmp_path / "index" / "index.faiss").stat().st_mtime_ns
     write_gallery(table, parts=2, first=2)
@@ -69,7 +67,7 @@ def test_new_parts_of_the_table_are_found_as_if_always_there(
     build(table, tmp_path / "index", factory)  # complete: does nothing
 
 
-def test_growing_again_does_nothing_and_by_ray_is_the_same(
+def test_extend_rerun_is_a_no_op_and_ray_is_equal(
     table: Path, tmp_path: Path, ray_cluster: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, other = (build(table, tmp_path / name, "IVF8,SQ8") for name in ("one", "other"))
@@ -82,7 +80,7 @@ def test_growing_again_does_nothing_and_by_ray_is_the_same(
     assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
 
 
-def test_a_killed_extension_leaves_the_index_as_it_was(
+def test_extend_killed_leaves_the_index_unchanged(
     table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = build(table, tmp_path / "index", "IVF8,SQ8")
@@ -101,7 +99,7 @@ def test_a_killed_extension_leaves_the_index_as_it_was(
 
 
 @pytest.mark.parametrize("factory", FACTORIES)
-def test_removed_locations_answer_no_more(table: Path, tmp_path: Path, factory: str) -> None:
+def test_remove_filters_out_locations(table: Path, tmp_path: Path, factory: str) -> None:
     out = build(table, tmp_path / "index", factory)
     places = sorted({key for hits in keys(out, table, 1) for key in hits})
     gone = [f"{key.split('-')[1]}{int(key.split('-')[2]):04d}" for key in places[:5]]
@@ -117,9 +115,7 @@ def test_removed_locations_answer_no_more(table: Path, tmp_path: Path, factory: 
     assert Index(out).search(clustered(2, 32, 1), 3, Filter(locations=frozenset(gone))) == [[], []]
 
 
-def test_a_removed_location_that_comes_back_in_a_new_part_is_found(
-    table: Path, tmp_path: Path
-) -> None:
+def test_extend_finds_removed_location_in_new_part(table: Path, tmp_path: Path) -> None:
     out = build(table, tmp_path / "index")
     remove_locations(out, ["10003"])
     write_table_part(table, 7, clustered(1, 32, 77), locations=["10003"])
@@ -132,7 +128,7 @@ def test_a_removed_location_that_comes_back_in_a_new_part_is_found(
     ] == ["gallery-7-0"]
 
 
-def test_nothing_is_removed_where_one_location_is_not_there(table: Path, tmp_path: Path) -> None:
+def test_remove_unknown_location_removes_nothing(table: Path, tmp_path: Path) -> None:
     out = build(table, tmp_path / "index")
     with pytest.raises(
         InputError,
@@ -145,7 +141,7 @@ def test_nothing_is_removed_where_one_location_is_not_there(table: Path, tmp_pat
         remove_locations(out, ["00001"])
 
 
-def test_a_table_of_another_network_is_refused(table: Path, tmp_path: Path) -> None:
+def test_extend_rejects_table_of_another_network(table: Path, tmp_path: Path) -> None:
     out = build(table, tmp_path / "index")
     other = tmp_path / "other"
     write_table_part(other, 9, clustered(5, 32, 9), fingerprint="e" * 64)
@@ -153,7 +149,7 @@ def test_a_table_of_another_network_is_refused(table: Path, tmp_path: Path) -> N
         extend_index(str(other), out)
 
 
-def test_a_table_that_has_changed_is_refused(table: Path, tmp_path: Path) -> None:
+def test_extend_rejects_changed_table(table: Path, tmp_path: Path) -> None:
     out = build(table, tmp_path / "index", "IVF8,SQ8")
     write_table_part(table, 1, clustered(200, 32, 5), shard="another shard")
     with pytest.raises(InputError, match="no longer holds 1 of the 2 parts"):
@@ -170,7 +166,7 @@ def test_a_table_that_has_changed_is_refused(table: Path, tmp_path: Path) -> Non
     )
 
 
-def test_verifying_sees_a_flipped_bit(table: Path, tmp_path: Path) -> None:
+def test_verify_index_finds_a_flipped_bit(table: Path, tmp_path: Path) -> None:
     out = build(table, tmp_path / "index", "IVF8,SQ8")
     assert verify_index(out).rows == 400
     for name in ("index.faiss", "ids.parquet", "ids.arrow", "trained.faiss"):
@@ -185,7 +181,7 @@ def test_verifying_sees_a_flipped_bit(table: Path, tmp_path: Path) -> None:
     verify_index(out)
 
 
-def test_the_index_knows_which_parts_of_the_table_it_holds(table: Path, tmp_path: Path) -> None:
+def test_extend_records_table_parts(table: Path, tmp_path: Path) -> None:
     out = build(table, tmp_path / "index")
     write_gallery(table, parts=1, first=2)
     extend_index(str(table), out)

@@ -109,7 +109,7 @@ def kill_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
 
 
 @pytest.mark.parametrize(("minutes", "epochs", "step"), [(0.0, 1, 4), (60.0, 1, 5), (60.0, 2, 8)])
-def test_a_run_that_was_killed_goes_on_to_the_same_bits(
+def test_train_killed_resumes_to_the_same_bits(
     tiny_shards: str, tmp_path: Path, undisturbed: Path, minutes: float, epochs: int, step: int
 ) -> None:
     changes: dict[str, Any] = {"checkpoint_minutes": minutes, "checkpoint_epochs": epochs}
@@ -125,7 +125,7 @@ def test_a_run_that_was_killed_goes_on_to_the_same_bits(
     assert_same_run(tmp_path, undisturbed)
 
 
-def test_a_process_killed_at_a_random_moment_and_run_again_ends_as_if_nothing_had_happened(
+def test_train_killed_at_random_resumes_to_the_same_end(
     tiny_shards: str, tmp_path: Path, prepared: Launcher
 ) -> None:
     def begin(out: Path) -> RunningJob:
@@ -155,7 +155,7 @@ def test_a_process_killed_at_a_random_moment_and_run_again_ends_as_if_nothing_ha
 
 
 @pytest.mark.parametrize("written", [False, True])
-def test_killed_as_an_epochs_checkpoint_is_written_a_run_has_that_epochs_row_once(
+def test_train_killed_at_checkpoint_writes_one_row_per_epoch(
     tiny_shards: str, tmp_path: Path, undisturbed: Path, written: bool
 ) -> None:
     write = CheckpointWriter.write
@@ -183,7 +183,7 @@ def on_board(out: Path) -> list[int]:
     return [event.step for event in board.Scalars("location_loss")]
 
 
-def test_a_ray_worker_killed_is_replaced_and_the_run_goes_on_from_the_last_checkpoint(
+def test_train_killed_ray_worker_is_replaced(
     tiny_shards: str, tmp_path: Path, ray_cluster: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
     victims: list[int] = []
@@ -210,7 +210,7 @@ def test_a_ray_worker_killed_is_replaced_and_the_run_goes_on_from_the_last_check
     assert_same_run(out, tmp_path / "whole")
 
 
-def test_the_last_checkpoints_are_kept_and_a_damaged_one_gives_way_to_the_one_before(
+def test_find_checkpoint_falls_back_from_damaged_one(
     tiny_shards: str, tmp_path: Path, undisturbed: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
@@ -243,7 +243,7 @@ def made(epoch: int, step: int = 0) -> Checkpoint:
     )
 
 
-def test_checkpoints_are_kept_on_any_storage() -> None:
+def test_checkpoints_on_any_storage() -> None:
     run = RunConfig(shards="nowhere", out="memory://run-folder/run", recipe=tiny(), keep=2)
     assert find_checkpoint(run) is None
     checkpoints = CheckpointWriter(run, None)
@@ -266,7 +266,7 @@ def test_checkpoints_are_kept_on_any_storage() -> None:
         find_checkpoint(run)
 
 
-def test_a_run_that_diverges_stops_with_one_sentence_and_keeps_the_last_good_checkpoint(
+def test_train_diverging_keeps_the_last_good_checkpoint(
     tiny_shards: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = Training.step
@@ -289,7 +289,7 @@ def test_a_run_that_diverges_stops_with_one_sentence_and_keeps_the_last_good_che
     assert (held.epoch, held.step) == (2, 0)
 
 
-def test_a_tally_goes_on_to_the_same_sums_and_tells_what_is_not_finite() -> None:
+def test_metric_accumulator_resumes_and_reports_non_finite() -> None:
     steps = [{"a": torch.tensor(0.1 * n), "b": torch.tensor(1.0 / (n + 1))} for n in range(6)]
     whole, first = MetricAccumulator(), MetricAccumulator()
     for step in steps:
@@ -311,6 +311,6 @@ def test_a_tally_goes_on_to_the_same_sums_and_tells_what_is_not_finite() -> None
 @pytest.mark.parametrize(
     "wrong", [{"keep": 0}, {"checkpoint_epochs": 0}, {"checkpoint_minutes": -1.0}]
 )
-def test_a_conduct_that_keeps_nothing_is_refused(wrong: dict[str, Any]) -> None:
+def test_run_options_reject_keeping_no_checkpoint(wrong: dict[str, Any]) -> None:
     with pytest.raises(InputError, match=r"expected (at least 1|0 or more)"):
         RunOptions(**wrong)

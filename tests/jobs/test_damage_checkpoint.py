@@ -46,7 +46,7 @@ def plain(value: Any) -> Any:
     return value.numpy().tobytes() if isinstance(value, torch.Tensor) else value
 
 
-def test_a_damaged_checkpoint_is_refused(held: Checkpoint, tmp_path: Path) -> None:
+def test_checkpoint_damaged_is_rejected(held: Checkpoint, tmp_path: Path) -> None:
     path = tmp_path / "last.pt"
     path.write_bytes(dumps(held))
     look = raising_if_missing(
@@ -55,7 +55,7 @@ def test_a_damaged_checkpoint_is_refused(held: Checkpoint, tmp_path: Path) -> No
     assert count_detected(path, look, 120, CheckpointError) == 121
 
 
-def test_damaged_bytes_of_the_zips_own_directory_are_found(held: Checkpoint) -> None:
+def test_checkpoint_damaged_zip_directory_is_found(held: Checkpoint) -> None:
     """No checksum of the zip covers them, and torch takes other weights for them without a word."""
     data = dumps(held)
     end = data[zipfile.ZipFile(BytesIO(data)).start_dir :]
@@ -67,9 +67,7 @@ def test_damaged_bytes_of_the_zips_own_directory_are_found(held: Checkpoint) -> 
             assert said is not None, number
 
 
-def test_a_checkpoint_from_before_there_were_seals_is_loaded_and_its_weights_are_checked(
-    held: Checkpoint, tmp_path: Path
-) -> None:
+def test_checkpoint_without_checksum_checks_its_weights(held: Checkpoint, tmp_path: Path) -> None:
     data = unsealed(dumps(held))
     assert plain(loads(data)) == plain(held)
     path = tmp_path / "last.pt"
@@ -80,7 +78,7 @@ def test_a_checkpoint_from_before_there_were_seals_is_loaded_and_its_weights_are
             loads(data[:place] + bytes([data[place] ^ 16]) + data[place + 1 :], "x")
 
 
-def test_others_read_a_sealed_checkpoint(held: Checkpoint, tmp_path: Path) -> None:
+def test_checkpoint_with_checksum_is_read_by_torch(held: Checkpoint, tmp_path: Path) -> None:
     path = tmp_path / "last.pt"
     path.write_bytes(dumps(held))
     for mapped in (False, True):
@@ -88,7 +86,7 @@ def test_others_read_a_sealed_checkpoint(held: Checkpoint, tmp_path: Path) -> No
     assert zipfile.ZipFile(path).testzip() is None
 
 
-def test_damaged_weights_to_start_from_are_refused(held: Checkpoint, tmp_path: Path) -> None:
+def test_weights_damaged_are_rejected(held: Checkpoint, tmp_path: Path) -> None:
     path = tmp_path / "resnet.pth"
     torch.save(held.encoder_weights, path)
     look = raising_if_missing(path, lambda: plain(read_state_dict(str(path))), CheckpointError)

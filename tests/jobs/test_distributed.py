@@ -84,7 +84,7 @@ def work(rank: int, port: int, out: str) -> None:
     torch.distributed.destroy_process_group()
 
 
-def test_gradients_of_two_workers_are_those_of_one_with_all_their_images_and_all_go_on_from_rank_zero(
+def test_two_workers_have_the_gradients_of_one(
     tmp_path: Path,
 ) -> None:
     with socket.socket() as free:

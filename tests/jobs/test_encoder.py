@@ -46,7 +46,7 @@ def images_of(
     return first_images(shards, size, resizer, count)
 
 
-def test_the_images_to_check_by_are_the_same_each_time_and_of_every_split_and_view(
+def test_check_images_are_constant_and_of_every_view(
     tiny_shards: str,
 ) -> None:
     first, again = (images_of(asked(tiny_shards), 32, "torch", 12) for _ in range(2))
@@ -57,7 +57,7 @@ def test_the_images_to_check_by_are_the_same_each_time_and_of_every_split_and_vi
     assert np.array_equal(first, images_of(asked(tiny_shards, split=Split.QUERY), 32, "torch", 12))
 
 
-def test_a_shard_without_one_image_that_can_be_decoded_is_said_beforehand(
+def test_encoder_spec_reports_shard_without_decodable_image(
     tiny_shards: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(encoders, "decode_samples", lambda samples, *given: iter([]))
@@ -65,9 +65,7 @@ def test_a_shard_without_one_image_that_can_be_decoded_is_said_beforehand(
         images_of(asked(tiny_shards), 32, "torch", PROBE_IMAGES)
 
 
-def test_the_fast_encoder_of_a_worker_computes_what_the_plain_one_does(
-    tiny_shards: str, checkpoint: bytes
-) -> None:
+def test_worker_encoder_equals_plain_encoder(tiny_shards: str, checkpoint: bytes) -> None:
     made = make_encoder_spec(checkpoint, "it", asked(tiny_shards)).factory(1)
     images = images_of(asked(tiny_shards), 64, "torch", 5)
     plain = embed(build_encoder(loads(checkpoint)), torch.from_numpy(images)).numpy()
@@ -75,7 +73,7 @@ def test_the_fast_encoder_of_a_worker_computes_what_the_plain_one_does(
     assert "folded encoder in float32: cosine with the plain one 1.0" in made.remarks[-1]  # type: ignore[attr-defined]
 
 
-def test_how_it_was_made_is_in_the_fingerprint_unless_it_makes_no_difference(
+def test_fingerprint_includes_settings_that_change_numbers(
     tiny_shards: str, checkpoint: bytes
 ) -> None:
     def fingerprint(**changes: Any) -> str:
@@ -97,7 +95,7 @@ def test_how_it_was_made_is_in_the_fingerprint_unless_it_makes_no_difference(
     )
 
 
-def test_int8_where_it_cannot_be_had_is_refused_before_any_worker_starts(
+def test_int8_unavailable_is_rejected_before_workers(
     tiny_shards: str, checkpoint: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def without(device: str) -> None:
@@ -108,7 +106,7 @@ def test_int8_where_it_cannot_be_had_is_refused_before_any_worker_starts(
         make_encoder_spec(checkpoint, "it", asked(tiny_shards), EncoderSettings(precision="int8"))
 
 
-def test_what_an_encoder_says_of_itself_reaches_the_terminal(
+def test_encoder_remarks_reach_the_terminal(
     tmp_path: Path,
     tiny_shards: str,
     checkpoint: bytes,

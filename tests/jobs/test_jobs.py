@@ -28,13 +28,13 @@ JOBS = [
 
 
 @pytest.mark.parametrize("job", JOBS)
-def test_every_job_has_help(prepared: Launcher, job: str) -> None:
+def test_job_has_help(prepared: Launcher, job: str) -> None:
     ended = prepared.start(job, ["--help"]).end()
     assert ended.code == 0
     assert "--out" in ended.output
 
 
-def test_every_job_runs_as_a_module_too() -> None:
+def test_job_runs_as_a_module() -> None:
     command = [sys.executable, "-m", "jobs.make_shards", "--help"]
     assert subprocess.run(command, capture_output=True, cwd=ROOT, check=False).returncode == 0
 
@@ -137,7 +137,7 @@ WRONG: list[tuple[str, list[str], str]] = [
 @pytest.mark.parametrize(
     ("job", "arguments", "said"), WRONG, ids=[f"{job}: {said}" for job, _, said in WRONG]
 )
-def test_a_wrong_call_gets_a_sentence_and_exit_code_2(
+def test_job_wrong_call_exits_2_with_a_sentence(
     prepared: Launcher, tmp_path: Path, job: str, arguments: list[str], said: str
 ) -> None:
     ended = prepared.start(job, [argument.format(tmp_path) for argument in arguments]).end()
@@ -147,7 +147,7 @@ def test_a_wrong_call_gets_a_sentence_and_exit_code_2(
     assert not (tmp_path / "o").exists()
 
 
-def test_the_road_by_command_lines_and_again(
+def test_jobs_run_the_road_and_rerun_as_no_ops(
     prepared: Launcher, tmp_path: Path, tiny_shards: str, tiny_world: Path, ray_address: str
 ) -> None:
     """embed, index and evaluate after a training of two steps; then each again, which does nothing

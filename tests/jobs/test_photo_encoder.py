@@ -44,7 +44,7 @@ def photo(seed: int, size: int = 90) -> bytes:
 
 
 @pytest.mark.parametrize(("resizer", "mirror"), [("torch", True), ("pillow", False)])
-def test_photos_get_the_embeddings_that_the_gallery_would_have_given_them(
+def test_photo_encoder_embeds_as_the_gallery(
     checkpoint: bytes, lively_encoder: FeatureEncoder, resizer: Resizer, mirror: bool
 ) -> None:
     photos = [photo(1), photo(2)]
@@ -55,12 +55,12 @@ def test_photos_get_the_embeddings_that_the_gallery_would_have_given_them(
     assert np.allclose(found_QD, embed(lively_encoder, images_B3HW, mirror).numpy(), atol=1e-5)
 
 
-def test_the_precision_is_the_index_s(checkpoint: bytes) -> None:
+def test_photo_encoder_takes_the_precision_of_the_index(checkpoint: bytes) -> None:
     encoder = PhotoEncoder(checkpoint, "last.pt", facts(checkpoint, precision="bfloat16"))
     assert encoder.precision == "bfloat16"
 
 
-def test_a_damaged_photo_is_told_and_the_others_keep_their_order(checkpoint: bytes) -> None:
+def test_photo_encoder_reports_damaged_photo_in_order(checkpoint: bytes) -> None:
     encoder = PhotoEncoder(checkpoint, "last.pt", facts(checkpoint))
     photos = [photo(1), photo(2)[:-40], b"", photo(3)]
     found_QD, rejected = encoder.encode(photos, ["a", "b", "c", "d"])
@@ -72,11 +72,11 @@ def test_a_damaged_photo_is_told_and_the_others_keep_their_order(checkpoint: byt
     ]  # fmt: skip
 
 
-def test_no_photo_gives_no_rows(checkpoint: bytes) -> None:
+def test_photo_encoder_without_photos_gives_no_rows(checkpoint: bytes) -> None:
     encoder = PhotoEncoder(checkpoint, "last.pt", facts(checkpoint))
     assert encoder.encode([])[0].shape == (0, encoder.dimension)
 
 
-def test_another_network_is_refused(checkpoint: bytes) -> None:
+def test_photo_encoder_rejects_another_network(checkpoint: bytes) -> None:
     with pytest.raises(InputError, match=r"last.pt did not make this index.*abcabcabcabc"):
         PhotoEncoder(checkpoint, "last.pt", {"fingerprint": "abc" * 20})

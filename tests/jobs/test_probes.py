@@ -27,21 +27,19 @@ def features(shift: float, count: int = 80, channels: int = 40) -> tuple[Floats,
     return drone, satellite
 
 
-def test_views_that_nothing_tells_apart_have_no_gap() -> None:
+def test_view_gap_of_equal_views_is_zero() -> None:
     gap = view_gap(*features(0.0))
     assert 0.35 < gap["view_gap/accuracy"] < 0.65
     assert gap["view_gap/distance"] < 0.3
 
 
-def test_a_shift_between_the_views_is_found_and_measured() -> None:
+def test_view_gap_measures_a_shift() -> None:
     gap = view_gap(*features(6.0))
     assert gap["view_gap/accuracy"] > 0.95
     assert gap["view_gap/distance"] == pytest.approx(6 / 40**0.5, rel=0.1)
 
 
-def test_the_gap_does_not_depend_on_the_scale_of_the_features_and_constant_channels_are_harmless() -> (
-    None
-):
+def test_view_gap_is_independent_of_scale() -> None:
     drone, satellite = features(1.0)
     drone[:, 7] = satellite[:, 7] = 3.0
     once, again = view_gap(drone, satellite), view_gap(drone * 100, satellite * 100)
@@ -49,15 +47,13 @@ def test_the_gap_does_not_depend_on_the_scale_of_the_features_and_constant_chann
     assert once["view_gap/distance"] == pytest.approx(again["view_gap/distance"], rel=1e-4)
 
 
-def test_views_of_different_counts_are_compared_on_as_many_images_of_each() -> None:
+def test_view_gap_takes_equal_counts_of_both_views() -> None:
     drone, satellite = features(6.0)
     assert view_gap(drone, satellite[:21]) == view_gap(drone[:21], satellite[:21])
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_a_look_at_training_places_leaves_the_encoder_as_it_was(
-    tiny_shards: str, share: float
-) -> None:
+def test_probe_leaves_the_encoder_unchanged(tiny_shards: str, share: float) -> None:
     torch.manual_seed(0)
     encoder = FeatureEncoder(replace(smoke().network, part_dim=16)).train()
     before = {name: tensor.clone() for name, tensor in encoder.state_dict().items()}
@@ -77,7 +73,7 @@ def test_a_look_at_training_places_leaves_the_encoder_as_it_was(
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_a_look_leaves_out_damaged_images_and_says_where_all_are(
+def test_probe_skips_damaged_images(
     tiny_shards: str, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     encoder = FeatureEncoder(replace(smoke().network, part_dim=16))

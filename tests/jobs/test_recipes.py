@@ -47,7 +47,7 @@ def differing(recipe: Recipe) -> set[str]:
     } - {"name"}
 
 
-def test_every_recipe_is_known_by_its_own_name() -> None:
+def test_recipes_are_listed_by_their_names() -> None:
     assert list(RECIPES) == [
         "paper",
         "paper_384",
@@ -61,12 +61,12 @@ def test_every_recipe_is_known_by_its_own_name() -> None:
     assert all((make.__doc__ or "").splitlines()[0].endswith(".") for make in RECIPES.values())
 
 
-def test_paper_384_is_the_paper_on_larger_images() -> None:
+def test_recipe_paper_384_differs_in_image_size_only() -> None:
     assert differing(paper_384()) == {"network"}
     assert paper_384().network == replace(paper().network, image_size=384)
 
 
-def test_lpn_has_no_discriminator_and_ends_after_120_epochs_with_a_tenth_of_its_rates() -> None:
+def test_recipe_lpn_has_no_discriminator_and_120_epochs() -> None:
     recipe = lpn()
     assert not recipe.adversary
     tiny = PVDAConfig(backbone="resnet18", width=0.25, part_dim=8)
@@ -85,7 +85,7 @@ def test_lpn_has_no_discriminator_and_ends_after_120_epochs_with_a_tenth_of_its_
     assert differing(recipe) == {"schedule", "adversary"}
 
 
-def test_constant_alpha_keeps_alpha_and_restarts() -> None:
+def test_recipe_constant_alpha_keeps_alpha_and_restarts() -> None:
     schedule = constant_alpha().schedule
     assert differing(constant_alpha()) == {"schedule"}
     assert {schedule_at(schedule, epoch).alpha for epoch in range(560)} == {0.9}
@@ -94,7 +94,7 @@ def test_constant_alpha_keeps_alpha_and_restarts() -> None:
     ]
 
 
-def test_no_restart_grows_alpha_as_the_paper_does_and_its_rates_only_fall() -> None:
+def test_recipe_no_restart_grows_alpha_and_lowers_rates() -> None:
     schedule = no_restart().schedule
     assert differing(no_restart()) == {"schedule"}
     for epoch in range(560):
@@ -102,7 +102,7 @@ def test_no_restart_grows_alpha_as_the_paper_does_and_its_rates_only_fall() -> N
         assert schedule_at(schedule, epoch).lr_scale == pytest.approx(0.8 ** (epoch // 140))
 
 
-def test_the_control_is_the_paper_with_alpha_zero_throughout() -> None:
+def test_recipe_alpha_zero_is_paper_with_alpha_zero() -> None:
     schedule = alpha_zero().schedule
     assert differing(alpha_zero()) == {"schedule"}
     assert alpha_zero().adversary
@@ -114,7 +114,7 @@ def test_the_control_is_the_paper_with_alpha_zero_throughout() -> None:
 
 
 @pytest.mark.parametrize("name", RECIPES)
-def test_the_table_shows_every_setting_and_marks_none_of_a_recipe_as_it_is(name: str) -> None:
+def test_config_table_shows_every_setting(name: str) -> None:
     recipe = RECIPES[name]()
     text = shown(recipe, shards="s3://bucket/shards", weights=None)
     for part in (recipe, recipe.network, recipe.optimization, recipe.schedule, recipe.augmentation):
@@ -127,7 +127,7 @@ def test_the_table_shows_every_setting_and_marks_none_of_a_recipe_as_it_is(name:
     assert "*" not in text
 
 
-def test_the_table_marks_what_differs_from_the_named_recipe_and_says_from_what() -> None:
+def test_config_table_marks_changed_settings() -> None:
     recipe = paper()
     changed = replace(recipe, batch_size=2, network=replace(recipe.network, image_size=128))
     text = shown(changed)
@@ -138,14 +138,14 @@ def test_the_table_marks_what_differs_from_the_named_recipe_and_says_from_what()
     assert "*epochs=3 (not 80)" in shown(smoke(epochs=3))
 
 
-def test_a_recipe_of_no_known_name_has_nothing_to_differ_from() -> None:
+def test_config_table_of_unknown_recipe_marks_nothing() -> None:
     text = shown(replace(paper(), name="mine", batch_size=2))
     assert "recipe mine, none of the named ones" in text
     assert "batch_size=2" in text
     assert "*" not in text
 
 
-def test_the_table_goes_to_standard_error_and_keeps_to_the_screen(
+def test_config_table_fits_the_screen_on_stderr(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     print_config(paper(), shards="/data/" + "deep/" * 40)
@@ -155,7 +155,7 @@ def test_the_table_goes_to_standard_error_and_keeps_to_the_screen(
     assert max(map(len, said.err.splitlines())) <= 80
 
 
-def test_recipe_paper_trains_a_whole_resnet50_from_torchvisions_weights(
+def test_recipe_paper_starts_from_torchvision_resnet50(
     tmp_path: Path, tiny_shards: str, prepared: Launcher
 ) -> None:
     """Two real steps by command line, on small images and a narrow D; the backbone has all its

@@ -82,7 +82,7 @@ def _hearing_ctrl_c() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
-def test_a_signal_that_a_library_drops_is_raised_again() -> None:
+def test_signal_dropped_by_a_library_is_raised_again() -> None:
     with pytest.raises(KeyboardInterrupt), interruptible() as received:  # noqa: PT012
         with suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGTERM)
@@ -90,7 +90,7 @@ def test_a_signal_that_a_library_drops_is_raised_again() -> None:
     assert received == [signal.SIGTERM]
 
 
-def test_what_tidies_up_after_a_signal_is_left_in_peace() -> None:
+def test_signal_does_not_interrupt_cleanup() -> None:
     tidy = False
     with pytest.raises(KeyboardInterrupt), interruptible():  # noqa: PT012
         try:
@@ -102,7 +102,7 @@ def test_what_tidies_up_after_a_signal_is_left_in_peace() -> None:
     assert tidy
 
 
-def test_an_alarm_that_comes_as_the_timer_is_stopped_does_not_set_it_again(
+def test_alarm_at_the_end_does_not_set_the_timer_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     set_timer = signal.setitimer
@@ -217,7 +217,7 @@ def wait_for(what: Callable[[], bool], seconds: float) -> bool:
 
 
 @pytest.mark.parametrize(("job", "number", "group"), CASES if ALL else NORMALLY)
-def test_a_job_that_is_stopped_says_so_leaves_nothing_running_and_goes_on(
+def test_job_stopped_leaves_nothing_running_and_resumes(
     job: str,
     number: signal.Signals,
     group: bool,
@@ -251,7 +251,7 @@ def test_a_job_that_is_stopped_says_so_leaves_nothing_running_and_goes_on(
     assert ended.code == 0, ended.output
 
 
-def test_ctrl_c_while_the_libraries_are_imported_says_so_too(tmp_path: Path) -> None:
+def test_ctrl_c_during_imports_prints_stopped(tmp_path: Path) -> None:
     process, log = begin(
         "train",
         ["smoke", "--shards", str(tmp_path), "--out", str(tmp_path / "out")],

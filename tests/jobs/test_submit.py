@@ -113,7 +113,7 @@ def answer(submitted: "subprocess.Popen[str]") -> str:
     return said
 
 
-def test_every_job_runs_on_a_cluster_that_was_started_by_hand(
+def test_submit_runs_every_job_on_a_started_cluster(
     submit_environment: dict[str, str], tiny_shards: str, tmp_path: Path
 ) -> None:
     """By twos and threes: most of each is its start."""

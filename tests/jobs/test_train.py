@@ -69,9 +69,7 @@ def weights(path: Path) -> dict[str, torch.Tensor]:
     return loads((path / "last.pt").read_bytes()).encoder_weights
 
 
-def test_a_run_ends_with_a_checkpoint_curves_and_an_encoder(
-    tiny_shards: str, tmp_path: Path
-) -> None:
+def test_train_writes_checkpoint_curves_and_encoder(tiny_shards: str, tmp_path: Path) -> None:
     path = train(settings(tiny_shards, tmp_path, tiny()))
     checkpoint = loads(Path(path).read_bytes())
     assert checkpoint.epoch == 2
@@ -97,7 +95,7 @@ def test_a_run_ends_with_a_checkpoint_curves_and_an_encoder(
     assert [event.step for event in board.Scalars("location_loss")] == [1, 2]
 
 
-def test_the_untrained_network_is_the_one_before_the_first_step_even_when_the_run_is_over(
+def test_initial_checkpoint_is_the_network_before_step_one(
     tiny_shards: str, tmp_path: Path
 ) -> None:
     run = RunConfig(shards=tiny_shards, out=str(tmp_path), recipe=tiny(1))
@@ -114,7 +112,7 @@ def test_the_untrained_network_is_the_one_before_the_first_step_even_when_the_ru
     )
 
 
-def test_a_finished_run_is_left_alone_and_another_recipe_refused(
+def test_train_finished_run_is_a_no_op(
     tiny_shards: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = Path(train(settings(tiny_shards, tmp_path, tiny(1))))
@@ -126,9 +124,7 @@ def test_a_finished_run_is_left_alone_and_another_recipe_refused(
         train(settings(tiny_shards, tmp_path, tiny(3)))
 
 
-def test_a_run_from_before_the_resizer_was_a_setting_goes_on_with_pillows(
-    tiny_shards: str, tmp_path: Path
-) -> None:
+def test_train_old_run_resumes_with_pillow_resizer(tiny_shards: str, tmp_path: Path) -> None:
     path = Path(train(settings(tiny_shards, tmp_path, replace(tiny(1), resizer="pillow"))))
     held = loads(path.read_bytes())
     path.write_bytes(
@@ -143,7 +139,7 @@ def test_a_run_from_before_the_resizer_was_a_setting_goes_on_with_pillows(
         train(settings(tiny_shards, tmp_path, tiny(1)))
 
 
-def test_damaged_images_are_counted_in_the_row_and_said_once_an_epoch(
+def test_train_counts_damaged_images_per_epoch(
     tiny_shards: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert [row["damaged_images"] for row in rows_of(tiny_shards, tmp_path / "whole")] == [0]
@@ -173,7 +169,7 @@ def test_damaged_images_are_counted_in_the_row_and_said_once_an_epoch(
         assert ("the first of them is train-drone-" in note) == (number == 3)
 
 
-def test_ray_train_takes_the_same_steps_as_this_process(
+def test_train_by_ray_takes_the_same_steps(
     tiny_shards: str, tmp_path: Path, ray_cluster: None
 ) -> None:
     train(settings(tiny_shards, tmp_path / "here", tiny(1)))
@@ -190,7 +186,7 @@ def test_ray_train_takes_the_same_steps_as_this_process(
     assert [row["epoch"] for row in rows(tmp_path / "ray")] == [1]
 
 
-def test_synchronised_batchnorm_without_gpus_is_refused(
+def test_train_sync_bn_without_gpus_is_rejected(
     tiny_shards: str, tmp_path: Path, ray_cluster: None
 ) -> None:
     recipe = replace(tiny(1), sync_bn=True)
@@ -198,7 +194,7 @@ def test_synchronised_batchnorm_without_gpus_is_refused(
         train(settings(tiny_shards, tmp_path, recipe, workers=2))
 
 
-def test_what_a_ray_worker_refuses_comes_back_as_it_was_said_and_is_not_tried_again(
+def test_train_worker_input_error_is_not_retried(
     tiny_shards: str, tmp_path: Path, ray_cluster: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
     rates = replace(tiny(1).optimization, backbone_lr=1e30, head_lr=1e30, classifier_lr=1e30)
@@ -216,9 +212,7 @@ def test_what_a_ray_worker_refuses_comes_back_as_it_was_said_and_is_not_tried_ag
     assert not (tmp_path / "last.pt").exists()
 
 
-def test_a_row_tells_each_loss_by_view_and_ring_gradients_and_the_view_gap_and_tensorboard_shows_it(
-    tiny_shards: str, tmp_path: Path
-) -> None:
+def test_train_row_has_losses_gradients_and_view_gap(tiny_shards: str, tmp_path: Path) -> None:
     train(settings(tiny_shards, tmp_path, replace(tiny(2), hold_out=0.5), probe_epochs=2))
     first, second = rows(tmp_path)
     wanted = {
@@ -244,14 +238,14 @@ def test_a_row_tells_each_loss_by_view_and_ring_gradients_and_the_view_gap_and_t
     assert wanted | looked <= set(board.Tags()["scalars"])
 
 
-def test_two_ray_workers_train_one_network(
+def test_train_two_ray_workers_share_one_network(
     tiny_shards: str, tmp_path: Path, ray_cluster: None
 ) -> None:
     path = train(settings(tiny_shards, tmp_path, replace(tiny(1), batch_size=3), workers=2))
     assert loads(Path(path).read_bytes()).history[0]["step"] == 1
 
 
-def test_training_starts_from_given_weights(tiny_shards: str, tmp_path: Path) -> None:
+def test_train_starts_from_given_weights(tiny_shards: str, tmp_path: Path) -> None:
     recipe = tiny(1)
     run = RunConfig(shards=tiny_shards, out=str(tmp_path), recipe=replace(recipe, seed=9))
     other = build_encoder(loads(initial_checkpoint(run))).backbone.state_dict()
@@ -264,15 +258,13 @@ def test_training_starts_from_given_weights(tiny_shards: str, tmp_path: Path) ->
         train(settings(tiny_shards, tmp_path / "run2", recipe, weights=str(tmp_path / "none.pth")))
 
 
-def test_a_damaged_checkpoint_is_named(tiny_shards: str, tmp_path: Path) -> None:
+def test_train_names_damaged_checkpoint(tiny_shards: str, tmp_path: Path) -> None:
     (tmp_path / "last.pt").write_bytes(b"PK\x03\x04 torn")
     with pytest.raises(CheckpointError, match=r"last.pt is damaged .*copy it again"):
         read_checkpoint(RunConfig(shards=tiny_shards, out=str(tmp_path), recipe=tiny()))
 
 
-def test_too_few_images_for_a_batch_are_told_before_anything_starts(
-    tiny_shards: str, tmp_path: Path
-) -> None:
+def test_train_too_few_images_is_rejected_at_once(tiny_shards: str, tmp_path: Path) -> None:
     with pytest.raises(
         InputError,
         match="has 6 satellite and 18 UAV training images; expected at least one batch of 8",
@@ -280,7 +272,7 @@ def test_too_few_images_for_a_batch_are_told_before_anything_starts(
         train(settings(tiny_shards, tmp_path, paper()))
 
 
-def test_expand_of_an_unknown_recipe_names_the_known_ones() -> None:
+def test_train_unknown_recipe_names_the_known_ones() -> None:
     with pytest.raises(
         InputError, match="unknown recipe 'papr', expected one of: paper, paper_384, lpn, "
     ):
@@ -288,7 +280,7 @@ def test_expand_of_an_unknown_recipe_names_the_known_ones() -> None:
     assert expand(main, ["--help"], RECIPE, None) == (None, ["--help"])
 
 
-def test_the_paper_recipe_is_the_papers() -> None:
+def test_recipe_paper_has_the_papers_settings() -> None:
     recipe = paper()
     assert (
         recipe.network.backbone,
@@ -327,7 +319,7 @@ def test_the_paper_recipe_is_the_papers() -> None:
     assert (recipe.batch_size, recipe.augmentation.pad, recipe.augmentation.rotation) == (8, 10, 90)
 
 
-def test_whoever_tells_a_queue_that_is_being_ended_hears_of_it(ray_cluster: None) -> None:
+def test_queue_put_after_shutdown_raises(ray_cluster: None) -> None:
     """SIGTERM lets an actor finish what it was asked; asked without an end, it neither went nor
     answered (seed 22).
     """

@@ -41,7 +41,7 @@ def saved(value: Any) -> bytes:
     return buffer.getvalue()
 
 
-def test_all_that_goes_into_a_checkpoint_comes_out_again(held: Checkpoint) -> None:
+def test_checkpoint_round_trip(held: Checkpoint) -> None:
     found = loads(dumps(held))
     assert (found.network, found.recipe, found.locations) == (
         held.network,
@@ -54,9 +54,7 @@ def test_all_that_goes_into_a_checkpoint_comes_out_again(held: Checkpoint) -> No
         assert torch.equal(found.encoder_weights[name], tensor)
 
 
-def test_a_checkpoint_on_disk_gives_the_encoder_that_it_was_made_of(
-    held: Checkpoint, tmp_path: Path
-) -> None:
+def test_checkpoint_file_restores_the_encoder(held: Checkpoint, tmp_path: Path) -> None:
     (tmp_path / "last.pt").write_bytes(dumps(held))
     encoder = load_encoder(str(tmp_path / "last.pt"))
     assert not any(module.training for module in encoder.modules())
@@ -85,7 +83,7 @@ NONE_OF_OURS: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize("spoil", NONE_OF_OURS.values(), ids=NONE_OF_OURS)
-def test_what_is_no_checkpoint_is_refused_in_one_sentence_that_names_it(
+def test_loads_rejects_other_files_by_name(
     held: Checkpoint, spoil: Callable[[bytes], bytes]
 ) -> None:
     with pytest.raises(CheckpointError) as caught:
@@ -106,7 +104,7 @@ class Trap:
         return Path.touch, (self.path,)
 
 
-def test_code_in_a_checkpoint_is_refused_and_not_run(held: Checkpoint, tmp_path: Path) -> None:
+def test_checkpoint_with_code_is_rejected(held: Checkpoint, tmp_path: Path) -> None:
     sprung = tmp_path / "sprung"
     plain = torch.load(io.BytesIO(dumps(held)))
     for data in (
@@ -120,14 +118,14 @@ def test_code_in_a_checkpoint_is_refused_and_not_run(held: Checkpoint, tmp_path:
     assert sprung.exists()  # the trap itself works
 
 
-def test_the_fingerprint_is_64_digits_and_the_same_after_a_round_trip(held: Checkpoint) -> None:
+def test_fingerprint_survives_a_round_trip(held: Checkpoint) -> None:
     found = fingerprint(held, "bicubic")
     assert len(found) == 64
     assert set(found) <= set("0123456789abcdef")
     assert fingerprint(loads(dumps(held)), "bicubic") == found
 
 
-def test_the_fingerprint_changes_with_any_weight(held: Checkpoint) -> None:
+def test_fingerprint_changes_with_any_weight(held: Checkpoint) -> None:
     found = {fingerprint(held, "bicubic")}
     weights = held.encoder_weights
     for name in weights:
@@ -137,7 +135,7 @@ def test_the_fingerprint_changes_with_any_weight(held: Checkpoint) -> None:
     assert len(found) == 1 + len(weights)
 
 
-def test_the_fingerprint_changes_with_the_networks_config_and_the_preprocessing(
+def test_fingerprint_changes_with_config_and_encoding(
     held: Checkpoint,
 ) -> None:
     found = {
@@ -149,7 +147,7 @@ def test_the_fingerprint_changes_with_the_networks_config_and_the_preprocessing(
     assert len(found) == 4
 
 
-def test_the_fingerprint_knows_nothing_of_history_recipe_and_the_layout_in_memory(
+def test_fingerprint_ignores_history_recipe_and_layout(
     held: Checkpoint,
 ) -> None:
     found = fingerprint(held, "bicubic")
@@ -164,7 +162,7 @@ def test_the_fingerprint_knows_nothing_of_history_recipe_and_the_layout_in_memor
     assert fingerprint(replace(held, state=optimised), "bicubic") == found
 
 
-def test_recipe_and_history_are_kept_as_json_so_that_they_open_without_our_code(
+def test_checkpoint_keeps_recipe_and_history_as_json(
     held: Checkpoint,
 ) -> None:
     plain = torch.load(io.BytesIO(dumps(held)), weights_only=True)

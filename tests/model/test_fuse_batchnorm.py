@@ -16,7 +16,7 @@ def images(count: int) -> Tensor:
 
 
 @torch.no_grad()
-def test_a_folded_encoder_has_no_batch_norm_and_computes_the_same(
+def test_fuse_computes_the_same_without_batchnorm(
     lively_encoder: FeatureEncoder,
 ) -> None:
     folded = fuse_batchnorm(lively_encoder)
@@ -27,7 +27,7 @@ def test_a_folded_encoder_has_no_batch_norm_and_computes_the_same(
 
 
 @torch.no_grad()
-def test_every_batch_norm_is_felt_so_that_folding_one_wrongly_would_show(
+def test_fuse_test_encoder_feels_every_batchnorm(
     lively_encoder: FeatureEncoder,
 ) -> None:
     expected_BPD = lively_encoder(images(2))[1]
@@ -41,7 +41,7 @@ def test_every_batch_norm_is_felt_so_that_folding_one_wrongly_would_show(
 
 
 @torch.no_grad()
-def test_bottlenecks_are_folded_too() -> None:
+def test_fuse_bottleneck_blocks() -> None:
     torch.manual_seed(0)
     encoder = FeatureEncoder(
         PVDAConfig(backbone="resnet50", width=0.25, image_size=64, parts=2, part_dim=8)
@@ -53,7 +53,7 @@ def test_bottlenecks_are_folded_too() -> None:
     )
 
 
-def test_folding_leaves_the_encoder_as_it_was(lively_encoder: FeatureEncoder) -> None:
+def test_fuse_leaves_the_encoder_unchanged(lively_encoder: FeatureEncoder) -> None:
     before = {name: tensor.clone() for name, tensor in lively_encoder.state_dict().items()}
     fuse_batchnorm(lively_encoder)
     after = lively_encoder.state_dict()
@@ -62,7 +62,7 @@ def test_folding_leaves_the_encoder_as_it_was(lively_encoder: FeatureEncoder) ->
     assert all(parameter.requires_grad for parameter in lively_encoder.parameters())
 
 
-def test_an_encoder_in_training_mode_and_a_norm_that_cannot_be_folded_are_refused(
+def test_fuse_rejects_training_mode_and_lone_norms(
     lively_encoder: FeatureEncoder,
 ) -> None:
     with pytest.raises(ValueError, match=r"is in training mode, .*; call eval\(\)"):
@@ -79,9 +79,7 @@ def test_an_encoder_in_training_mode_and_a_norm_that_cannot_be_folded_are_refuse
     ("name", "convolutions"),
     [("resnet18", 20), ("resnet34", 36), ("resnet50", 53), ("resnet101", 104)],
 )
-def test_each_relu_is_a_module_of_its_own_and_has_no_name_in_the_state_dict(
-    name: str, convolutions: int
-) -> None:
+def test_backbone_relus_are_separate_modules(name: str, convolutions: int) -> None:
     """A quantiser tells them apart by the module. The names are torchvision's: nothing but
     convolutions and norms.
     """

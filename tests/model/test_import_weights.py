@@ -215,7 +215,7 @@ def imported(tmp_path: Path, state: State, image_size: int = 128) -> Checkpoint:
     [((2, 2, 2, 2), 1, 4, 128), ((2, 2, 2, 2), 1, 3, 256), ((3, 4, 6, 3), 4, 4, 128)],
     ids=["ResNet-18", "three rings", "ResNet-50"],
 )
-def test_an_lpn_checkpoint_embeds_as_the_original_does(
+def test_import_lpn_embeds_as_the_original(
     tmp_path: Path, tiny_shards: str, blocks: tuple[int, ...], grown: int, parts: int, size: int
 ) -> None:
     state = three_view_net(made_up(blocks, grown), parts)
@@ -231,7 +231,7 @@ def test_an_lpn_checkpoint_embeds_as_the_original_does(
     assert expected[0] @ expected[1] < 0.999  # the test would see a difference
 
 
-def test_an_lpn_checkpoint_classifies_as_the_original_does(tmp_path: Path) -> None:
+def test_import_lpn_classifies_as_the_original(tmp_path: Path) -> None:
     state = three_view_net(made_up())
     checkpoint = imported(tmp_path, state)
     classifier = LocationClassifier(checkpoint.network, len(checkpoint.locations)).eval()
@@ -244,9 +244,7 @@ def test_an_lpn_checkpoint_classifies_as_the_original_does(tmp_path: Path) -> No
         assert torch.allclose(logits_BPL[:, part], expected, atol=1e-4)
 
 
-def test_an_lpn_checkpoint_says_what_it_is_and_where_it_came_from(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_import_lpn_records_its_source(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     checkpoint = imported(tmp_path, three_view_net(made_up()))
     network = checkpoint.network
     assert (network.backbone, network.width, network.image_size) == ("resnet18", 0.25, 128)
@@ -265,7 +263,7 @@ def without(state: State, start: str) -> State:
     return {key: value for key, value in state.items() if not key.startswith(start)}
 
 
-def test_backbones_that_are_shared_or_absent_or_without_their_imagenet_classifier_give_the_same(
+def test_import_lpn_variants_of_backbones_are_equal(
     tmp_path: Path,
 ) -> None:
     state = three_view_net(made_up())
@@ -339,7 +337,7 @@ REFUSED: dict[str, tuple[Callable[[State], State], str]] = {
 
 
 @pytest.mark.parametrize(("spoil", "sentence"), REFUSED.values(), ids=REFUSED)
-def test_what_is_no_shared_three_view_net_is_refused_by_what_is_wrong_with_it(
+def test_import_lpn_rejects_other_networks_by_name(
     tmp_path: Path, spoil: Callable[[State], State], sentence: str
 ) -> None:
     with pytest.raises(CheckpointError, match=sentence) as caught:
@@ -349,7 +347,7 @@ def test_what_is_no_shared_three_view_net_is_refused_by_what_is_wrong_with_it(
 
 
 @pytest.mark.parametrize("ending", ["pth", "safetensors"])
-def test_torchvisions_weights_become_a_checkpoint_whose_refinement_is_said_to_be_untrained(
+def test_import_torchvision_reports_untrained_refinement(
     tmp_path: Path, tiny_shards: str, ending: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     state, path = made_up() | {"fc.weight": torch.ones(9, 128)}, tmp_path / f"resnet18.{ending}"
@@ -393,7 +391,7 @@ def test_torchvisions_weights_become_a_checkpoint_whose_refinement_is_said_to_be
     assert networks[0].resizer == "pillow"
 
 
-def test_another_depths_names_are_listed(tmp_path: Path) -> None:
+def test_import_weights_lists_names_of_another_depth(tmp_path: Path) -> None:
     state = made_up()
     given = saved(state | {"layer1.0.conv9.weight": torch.ones(1)}, tmp_path / "odd.pth")
     with pytest.raises(
@@ -403,7 +401,7 @@ def test_another_depths_names_are_listed(tmp_path: Path) -> None:
         import_weights(ImportWeightsSettings(torchvision=given, out=str(tmp_path / "o.pt")))
 
 
-def test_an_imported_checkpoint_is_what_embed_gallery_takes(
+def test_import_weights_feeds_embed_gallery(
     tmp_path: Path, tiny_shards: str, ray_cluster: None
 ) -> None:
     imported(tmp_path, three_view_net(made_up()))
@@ -420,7 +418,7 @@ def test_an_imported_checkpoint_is_what_embed_gallery_takes(
     assert open_table(table).embeddings().shape == (3, 96)
 
 
-def test_a_finished_import_is_left_alone_and_anything_else_there_is_kept(
+def test_import_weights_finished_is_a_no_op(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     imported(tmp_path, three_view_net(made_up()))
@@ -441,7 +439,7 @@ def test_a_finished_import_is_left_alone_and_anything_else_there_is_kept(
     assert out.read_bytes() == b"somebody's thesis"
 
 
-def test_a_wrong_call_is_answered_with_the_remedy(tmp_path: Path) -> None:
+def test_import_weights_wrong_call_names_the_remedy(tmp_path: Path) -> None:
     out = str(tmp_path / "o.pt")
     with pytest.raises(InputError, match="neither of --torchvision and --lpn given"):
         ImportWeightsSettings(out=out)

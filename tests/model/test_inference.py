@@ -49,9 +49,7 @@ def rolled() -> Callable[[MirroredEncoder, Tensor], Tensor]:
 
 
 @pytest.mark.parametrize("mirror", [True, False])
-def test_the_folded_encoder_embeds_as_the_plain_one_does(
-    lively_encoder: FeatureEncoder, mirror: bool
-) -> None:
+def test_folded_encoder_equals_plain(lively_encoder: FeatureEncoder, mirror: bool) -> None:
     """With `mirror` this is one batch of images and mirror images against two passes; 6 images are
     a batch and a half.
     """
@@ -71,7 +69,7 @@ def test_the_folded_encoder_embeds_as_the_plain_one_does(
     assert encoder(images(0)).shape == (0, 32)
 
 
-def test_a_fast_encoder_that_computes_something_else_is_found_and_the_plain_one_used(
+def test_optimise_falls_back_to_plain_encoder(
     lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(MirroredEncoder, "forward", rolled())
@@ -86,7 +84,7 @@ def test_a_fast_encoder_that_computes_something_else_is_found_and_the_plain_one_
     )
 
 
-def test_a_compiled_encoder_that_computes_something_else_is_found_and_the_folded_one_used(
+def test_optimise_falls_back_from_wrong_compiled_encoder(
     lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def wrong(module: MirroredEncoder, batch_B3HW: Tensor) -> Callable[[Tensor], Tensor]:
@@ -104,7 +102,7 @@ def test_a_compiled_encoder_that_computes_something_else_is_found_and_the_folded
 @pytest.mark.parametrize(
     ("least", "error"), [(0.999, None), (1.1, "bfloat16 embeddings agree .* by a cosine of")]
 )
-def test_bfloat16_is_a_precision_of_its_own_and_never_falls_back_to_float32(
+def test_bfloat16_never_falls_back_to_float32(
     lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch, least: float, error: str | None
 ) -> None:
     monkeypatch.setitem(MIN_COSINE, "bfloat16", least)
@@ -121,7 +119,7 @@ def test_bfloat16_is_a_precision_of_its_own_and_never_falls_back_to_float32(
     assert plain.agreement < 1 - 1e-7
 
 
-def test_compiling_is_left_out_where_it_does_not_pay_and_the_reason_told_where_it_fails(
+def test_compile_is_skipped_where_it_does_not_pay(
     lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: Any, **__: Any) -> None:
@@ -141,7 +139,7 @@ def test_compiling_is_left_out_where_it_does_not_pay_and_the_reason_told_where_i
 
 
 @needs_compiler
-def test_a_compiled_encoder_embeds_as_the_plain_one_does(lively_encoder: FeatureEncoder) -> None:
+def test_compiled_encoder_equals_plain(lively_encoder: FeatureEncoder) -> None:
     encoder, said = fast(lively_encoder, compiled=True)
     assert (encoder.kind, encoder.precision) == ("compiled", "float32")
     assert encoder.agreement > 1 - 1e-5
@@ -158,7 +156,7 @@ def test_a_compiled_encoder_embeds_as_the_plain_one_does(lively_encoder: Feature
     torch.testing.assert_close(one_BE, embed(lively_encoder, images(1, seed=9)), rtol=0, atol=1e-5)
 
 
-def test_a_missing_compiler_is_a_reason_in_one_line(lively_encoder: FeatureEncoder) -> None:
+def test_compile_without_compiler_gives_one_reason(lively_encoder: FeatureEncoder) -> None:
     module = MirroredEncoder(lively_encoder, mirror=False)
     with (
         torch._inductor.config.patch(
@@ -170,7 +168,7 @@ def test_a_missing_compiler_is_a_reason_in_one_line(lively_encoder: FeatureEncod
 
 
 @needs_compiler
-def test_int8_agrees_on_images_it_was_not_calibrated_by(lively_encoder: FeatureEncoder) -> None:
+def test_int8_agrees_on_other_images(lively_encoder: FeatureEncoder) -> None:
     pytest.importorskip("torchao", reason="int8 is optional: pip install 'pvda[int8]'")
     if not any(torch.cpu.get_capabilities().get(name) for name in INT8_INSTRUCTIONS):
         pytest.skip("this CPU has no VNNI and no AMX")
@@ -185,7 +183,7 @@ def test_int8_agrees_on_images_it_was_not_calibrated_by(lively_encoder: FeatureE
     assert (found_BE * embed(lively_encoder, images(5, seed=5))).sum(1).mean() > 0.99
 
 
-def test_int8_has_the_same_ranges_whatever_the_number_of_threads(
+def test_int8_ranges_do_not_depend_on_threads(
     lively_encoder: FeatureEncoder,
 ) -> None:
     """Two workers that round differently would differ from each other as much as from float32."""
@@ -204,7 +202,7 @@ def test_int8_has_the_same_ranges_whatever_the_number_of_threads(
     assert found[0] == found[1]
 
 
-def test_int8_is_refused_where_it_cannot_be_had_with_the_remedy(
+def test_int8_unavailable_is_rejected_with_the_remedy(
     lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(
@@ -234,7 +232,7 @@ def test_int8_is_refused_where_it_cannot_be_had_with_the_remedy(
         fast(lively_encoder, precision="int8")
 
 
-def test_int8_that_agrees_too_little_stops_with_a_sentence(
+def test_int8_with_low_agreement_is_rejected(
     lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither a slow table nor a wrong one is what was asked for."""
@@ -250,7 +248,7 @@ def test_int8_that_agrees_too_little_stops_with_a_sentence(
         fast(lively_encoder, precision="int8", calibration_B3HW=images(4))
 
 
-def test_precisions_that_change_the_embeddings_have_fingerprints_of_their_own() -> None:
+def test_precision_changes_the_fingerprint() -> None:
     one, other = calibration_digest(images(2)), calibration_digest(images(2, seed=1))
     texts = [
         describe_preprocessing("resized", "float32"),
@@ -264,7 +262,7 @@ def test_precisions_that_change_the_embeddings_have_fingerprints_of_their_own() 
         describe_preprocessing("resized", "int8")
 
 
-def test_auto_is_decided_by_the_kind_of_device_alone() -> None:
+def test_precision_auto_depends_on_device_only() -> None:
     assert [effective_precision("auto", device) for device in ("cpu", "cuda")] == [
         "float32",
         "bfloat16",

@@ -19,9 +19,7 @@ def labels(*numbers: int) -> Tensor:
     return torch.tensor(numbers)
 
 
-def test_equation_1_sums_the_locations_cross_entropy_over_rings_and_views_and_averages_it_over_images() -> (
-    None
-):
+def test_equation_1_location_loss() -> None:
     drones_BPL = torch.tensor([[THREE, EVEN], [THREE, SEVEN]])
     satellites_BPL = torch.tensor([[SEVEN, SEVEN]])
     found = location_loss(drones_BPL, labels(0, 1), satellites_BPL, labels(0))
@@ -29,12 +27,12 @@ def test_equation_1_sums_the_locations_cross_entropy_over_rings_and_views_and_av
     assert float(found) == pytest.approx(drones + (log(8) + log(8)), rel=1e-6)
 
 
-def test_equation_2_is_the_cross_entropy_of_the_true_views_drone_0_and_satellite_1() -> None:
+def test_equation_2_view_loss() -> None:
     found = view_loss(torch.tensor([THREE]), torch.tensor([SEVEN]))
     assert float(found) == pytest.approx(log(4 / 3) + log(8 / 7), rel=1e-6)
 
 
-def test_equation_3_is_the_cross_entropy_of_the_swapped_views() -> None:
+def test_equation_3_adversarial_loss() -> None:
     drones_B2, satellites_B2 = torch.tensor([THREE]), torch.tensor([SEVEN])
     assert float(adversarial_loss(drones_B2, satellites_B2)) == pytest.approx(
         log(4) + log(8), rel=1e-6
@@ -44,20 +42,20 @@ def test_equation_3_is_the_cross_entropy_of_the_swapped_views() -> None:
     )
 
 
-def test_equation_4_adds_alpha_times_the_adversarial_loss() -> None:
+def test_equation_4_total_loss() -> None:
     assert float(feature_loss(torch.tensor(3.0), torch.tensor(2.0), alpha=0.9)) == pytest.approx(
         4.8
     )
     assert float(feature_loss(torch.tensor(3.0), torch.tensor(2.0), alpha=0.0)) == 3.0
 
 
-def test_a_discriminator_that_cannot_tell_costs_ln_2_a_view_under_either_labels() -> None:
+def test_view_losses_of_undecided_discriminator_are_ln_2() -> None:
     even_B2 = torch.zeros(5, 2)
     for loss in (view_loss, adversarial_loss):
         assert float(loss(even_B2, even_B2)) == pytest.approx(2 * log(2))
 
 
-def test_fifty_four_uav_images_weigh_as_much_as_one_satellite_image() -> None:
+def test_view_losses_weigh_both_views_equally() -> None:
     many_B2, one_B2 = torch.tensor([THREE] * 54), torch.tensor([SEVEN])
     for loss in (view_loss, adversarial_loss):
         assert float(loss(many_B2, one_B2)) == pytest.approx(
@@ -70,9 +68,7 @@ def test_fifty_four_uav_images_weigh_as_much_as_one_satellite_image() -> None:
     assert float(many) == pytest.approx(float(once), rel=1e-6)
 
 
-def test_swapped_labels_push_hardest_where_the_discriminator_is_sure_which_a_reversed_gradient_would_not() -> (
-    None
-):
+def test_swapped_labels_push_hardest_against_certainty() -> None:
     sure_B2 = torch.tensor(
         [[log(9), 0.0]], requires_grad=True
     )  # probabilities .9 and .1; it is a UAV's

@@ -73,7 +73,7 @@ def torchvision_resnet50() -> dict[str, tuple[int, ...]]:
     return found
 
 
-def test_the_backbone_has_the_names_and_shapes_of_torchvisions_resnet50() -> None:
+def test_resnet50_has_torchvisions_names_and_shapes() -> None:
     with torch.device("meta"):
         own = {
             name: tuple(tensor.shape) for name, tensor in ResNet("resnet50").state_dict().items()
@@ -92,14 +92,12 @@ def test_the_backbone_has_the_names_and_shapes_of_torchvisions_resnet50() -> Non
         ("resnet101", 42_500_160),
     ],
 )
-def test_each_depth_has_as_many_parameters_as_published_without_its_classifier(
-    name: str, count: int
-) -> None:
+def test_resnet_parameter_counts_as_published(name: str, count: int) -> None:
     with torch.device("meta"):
         assert parameters(ResNet(name)) == count
 
 
-def test_layer4_keeps_its_resolution_in_the_main_path_and_the_shortcut_without_dilation() -> None:
+def test_resnet_layer4_has_stride_1_without_dilation() -> None:
     with torch.device("meta"):
         modules = dict(ResNet("resnet50").named_modules())
     strided = {
@@ -120,7 +118,7 @@ def test_layer4_keeps_its_resolution_in_the_main_path_and_the_shortcut_without_d
 
 
 @pytest.mark.parametrize(("size", "cells", "giga_macs"), [(256, 16, 8.1), (384, 24, 18.2)])
-def test_maps_are_a_sixteenth_of_the_image_and_cost_what_they_should(
+def test_resnet_maps_have_stride_16_and_known_flops(
     size: int, cells: int, giga_macs: float
 ) -> None:
     encoder = on_meta(PVDAConfig(image_size=size))[0].eval()
@@ -132,7 +130,7 @@ def test_maps_are_a_sixteenth_of_the_image_and_cost_what_they_should(
     assert counter.get_total_flops() / 2e9 == pytest.approx(giga_macs, abs=0.05)
 
 
-def test_the_networks_have_the_papers_sizes() -> None:
+def test_networks_have_the_papers_sizes() -> None:
     encoder, classifier, discriminator = on_meta(PAPER)
     assert parameters(encoder) == 23_508_032 + 4 * (2048 * 512 + 512 + 2 * 512) == 27_708_480
     assert parameters(encoder, classifier) == 27_708_480 + 4 * (512 * 701 + 701) == 29_146_932
@@ -144,7 +142,7 @@ def test_the_networks_have_the_papers_sizes() -> None:
     assert PAPER.embedding_dim == 2048
 
 
-def test_the_discriminator_is_three_convolutions_two_pools_one_relu_and_a_linear_layer() -> None:
+def test_discriminator_layers_as_in_figure_2() -> None:
     discriminator = on_meta(PAPER)[2]
     kinds = [
         type(module).__name__ for module in discriminator.modules() if not list(module.children())
@@ -158,9 +156,7 @@ def test_the_discriminator_is_three_convolutions_two_pools_one_relu_and_a_linear
 
 
 @pytest.mark.parametrize(("cells", "left"), [(16, 4), (24, 6)])
-def test_the_discriminator_halves_the_maps_twice_and_gives_one_verdict_an_image(
-    cells: int, left: int
-) -> None:
+def test_discriminator_gives_one_verdict_per_image(cells: int, left: int) -> None:
     discriminator = on_meta(PAPER)[2]
     maps_BCHW = torch.empty(3, 2048, cells, cells, device="meta")
     assert discriminator.blocks(maps_BCHW).shape == (3, 1024, left, left)
@@ -168,7 +164,7 @@ def test_the_discriminator_halves_the_maps_twice_and_gives_one_verdict_an_image(
 
 
 @torch.no_grad()
-def test_a_refinement_is_a_linear_layer_and_a_batch_norm_initialised_as_lpns() -> None:
+def test_refinement_is_initialised_as_lpns() -> None:
     torch.manual_seed(0)
     linear, norm = refinement(2048, 512)
     assert isinstance(linear, nn.Linear)
@@ -184,7 +180,7 @@ def test_a_refinement_is_a_linear_layer_and_a_batch_norm_initialised_as_lpns() -
 
 
 @torch.no_grad()
-def test_a_classifier_starts_almost_at_zero_so_that_all_locations_are_equally_likely() -> None:
+def test_classifier_starts_with_equal_probabilities() -> None:
     torch.manual_seed(0)
     classifier = LocationClassifier(PAPER, 701)
     assert classifier.dropout.p == 0.75
@@ -195,7 +191,7 @@ def test_a_classifier_starts_almost_at_zero_so_that_all_locations_are_equally_li
         assert not branch.bias.any()
 
 
-def test_the_classifier_drops_numbers_in_training_and_none_in_evaluation() -> None:
+def test_classifier_drops_out_in_training_only() -> None:
     torch.manual_seed(0)
     classifier = LocationClassifier(PVDAConfig(part_dim=512), 3)
     g_BPD = torch.ones(1, 4, 512)
@@ -207,7 +203,7 @@ def test_the_classifier_drops_numbers_in_training_and_none_in_evaluation() -> No
     assert torch.equal(seen[1], g_BPD)
 
 
-def test_each_ring_has_its_own_refinement_and_its_own_classifier() -> None:
+def test_rings_have_own_refinement_and_classifier() -> None:
     torch.manual_seed(0)
     encoder, classifier = FeatureEncoder(TINY).eval(), LocationClassifier(TINY, 3).eval()
     photo_B3HW = images(1, 3, 64, 64)
@@ -223,7 +219,7 @@ def test_each_ring_has_its_own_refinement_and_its_own_classifier() -> None:
     assert changed_BPL.any(2).tolist() == [[True, False]]
 
 
-def test_bytes_are_normalised_by_imagenets_mean_and_deviation() -> None:
+def test_encoder_normalises_by_imagenet() -> None:
     encoder = FeatureEncoder(TINY).eval()
     seen: list[Tensor] = []
     encoder.backbone.register_forward_pre_hook(lambda module, given: seen.append(given[0]))
@@ -236,7 +232,7 @@ def test_bytes_are_normalised_by_imagenets_mean_and_deviation() -> None:
 
 
 @pytest.mark.parametrize("divisor", ["box", "ring"])
-def test_the_ring_divisor_is_a_setting_of_the_encoder(divisor: Literal["box", "ring"]) -> None:
+def test_encoder_takes_the_ring_divisor(divisor: Literal["box", "ring"]) -> None:
     torch.manual_seed(0)
     encoder = FeatureEncoder(PVDAConfig(**{**vars(TINY), "ring_divisor": divisor})).eval()
     seen: list[Tensor] = []
@@ -264,15 +260,13 @@ def test_the_ring_divisor_is_a_setting_of_the_encoder(divisor: Literal["box", "r
         ({"backbone": "resnet20"}, "backbone is 'resnet20', expected one of resnet18, .*resnet101"),
     ],
 )
-def test_sizes_that_cannot_be_built_are_refused_with_the_remedy(
-    wrong: dict[str, int], sentence: str
-) -> None:
+def test_config_rejects_impossible_sizes(wrong: dict[str, int], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         FeatureEncoder(PVDAConfig(**wrong))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 4])
-def test_the_smallest_images_that_a_config_allows_pass_through_all_networks(parts: int) -> None:
+def test_networks_take_the_smallest_allowed_images(parts: int) -> None:
     least = {1: 64, 2: 64, 3: 96, 4: 128}[parts]
     config = PVDAConfig(**{**vars(TINY), "parts": parts, "image_size": least})
     encoder, classifier, discriminator = (module.eval() for module in on_meta(config))
@@ -282,9 +276,7 @@ def test_the_smallest_images_that_a_config_allows_pass_through_all_networks(part
 
 
 @pytest.mark.parametrize(("parts", "part_dim"), [(4, 512), (1, 8), (3, 7)])
-def test_an_embedding_has_length_one_and_each_part_one_over_the_root_of_their_number(
-    parts: int, part_dim: int
-) -> None:
+def test_unit_embedding_parts_have_equal_length(parts: int, part_dim: int) -> None:
     g_BPD = 100 * torch.randn(5, parts, part_dim, generator=torch.Generator().manual_seed(0))
     found_BE = unit_embedding(g_BPD)
     assert found_BE.shape == (5, parts * part_dim)
@@ -293,14 +285,14 @@ def test_an_embedding_has_length_one_and_each_part_one_over_the_root_of_their_nu
     torch.testing.assert_close(lengths_BP, torch.full((5, parts), parts**-0.5))
 
 
-def test_a_unit_embedding_worked_by_hand() -> None:
+def test_unit_embedding_by_hand() -> None:
     g_BPD = torch.tensor([[[3.0, 4.0], [0.0, 0.5]]])
     assert unit_embedding(g_BPD)[0].tolist() == pytest.approx(
         [0.6 / 2**0.5, 0.8 / 2**0.5, 0, 1 / 2**0.5]
     )
 
 
-def test_an_image_and_its_mirror_image_have_one_embedding_unless_it_is_asked_otherwise() -> None:
+def test_embed_image_equals_its_mirror_image() -> None:
     torch.manual_seed(0)
     encoder = FeatureEncoder(TINY).eval()
     photos_B3HW = images(3, 3, 64, 64)
@@ -310,7 +302,7 @@ def test_an_image_and_its_mirror_image_have_one_embedding_unless_it_is_asked_oth
     )
 
 
-def test_the_mirror_images_vector_is_added_before_the_parts_are_normalised() -> None:
+def test_embed_adds_mirror_before_normalising() -> None:
     torch.manual_seed(0)
     encoder = FeatureEncoder(TINY).eval()
     photos_B3HW = images(2, 3, 64, 64)

@@ -41,9 +41,7 @@ def lpn_averages(maps_BCHW: Tensor, parts: int) -> Tensor:
         (24, [(9, 15), (6, 18), (3, 21), (0, 24)]),
     ],
 )
-def test_the_rings_of_256_and_384_pixels_are_the_boxes_of_lpn(
-    side: int, boxes: list[tuple[int, int]]
-) -> None:
+def test_ring_masks_equal_lpns_at_256_and_384(side: int, boxes: list[tuple[int, int]]) -> None:
     seen_HW = torch.zeros(side, side)
     for mask_HW, (start, stop) in zip(ring_masks(side, side, 4), boxes, strict=True):
         box_HW = torch.zeros(side, side)
@@ -54,9 +52,7 @@ def test_the_rings_of_256_and_384_pixels_are_the_boxes_of_lpn(
 
 @settings(max_examples=50)
 @given(parts=PARTS, tall=BEYOND, wide=BEYOND)
-def test_each_cell_of_a_map_of_any_size_lies_in_exactly_one_ring_and_no_ring_is_empty(
-    parts: int, tall: int, wide: int
-) -> None:
+def test_ring_masks_partition_any_map(parts: int, tall: int, wide: int) -> None:
     masks_PHW = ring_masks(2 * parts + tall, 2 * parts + wide, parts)
     assert masks_PHW.shape == (parts, 2 * parts + tall, 2 * parts + wide)
     assert torch.equal(masks_PHW.sum(0), torch.ones(masks_PHW.shape[1:]))
@@ -65,9 +61,7 @@ def test_each_cell_of_a_map_of_any_size_lies_in_exactly_one_ring_and_no_ring_is_
 
 @settings(max_examples=50)
 @given(parts=PARTS, tall=BEYOND, wide=BEYOND)
-def test_the_rings_stay_centred_so_a_flipped_map_has_the_same_rings(
-    parts: int, tall: int, wide: int
-) -> None:
+def test_ring_masks_of_flipped_map_are_equal(parts: int, tall: int, wide: int) -> None:
     masks_PHW = ring_masks(2 * parts + tall, 2 * parts + wide, parts)
     assert torch.equal(masks_PHW, masks_PHW.flip(1))
     assert torch.equal(masks_PHW, masks_PHW.flip(2))
@@ -75,19 +69,19 @@ def test_the_rings_stay_centred_so_a_flipped_map_has_the_same_rings(
 
 @settings(max_examples=50)
 @given(parts=PARTS, tall=BEYOND)
-def test_a_map_on_its_side_has_its_rings_on_their_side(parts: int, tall: int) -> None:
+def test_ring_masks_of_transposed_map_are_transposed(parts: int, tall: int) -> None:
     upright_PHW = ring_masks(2 * parts + tall, 2 * parts + 3, parts)
     assert torch.equal(
         upright_PHW.transpose(1, 2), ring_masks(2 * parts + 3, 2 * parts + tall, parts)
     )
 
 
-def test_a_box_is_wider_by_one_cell_on_an_odd_map_and_not_off_centre() -> None:
+def test_ring_masks_of_odd_map_are_centred() -> None:
     rows = [mask_HW.any(1).nonzero().flatten().tolist() for mask_HW in ring_masks(17, 17, 4)]
     assert [(row[0], row[-1] + 1) for row in rows] == [(6, 11), (4, 13), (2, 15), (0, 17)]
 
 
-def test_the_box_divisor_gives_published_fractions_of_the_true_mean() -> None:
+def test_ring_average_box_divisor_fractions() -> None:
     ones_BCHW = torch.ones(1, 1, 16, 16)
     assert ring_average(ones_BCHW, 4, "box").flatten().tolist() == pytest.approx(
         [1, 3 / 4, 5 / 9, 7 / 16]
@@ -99,27 +93,25 @@ def test_the_box_divisor_gives_published_fractions_of_the_true_mean() -> None:
 @pytest.mark.parametrize(
     ("side", "parts"), [(16, 4), (24, 4), (18, 4), (8, 4), (4, 2), (12, 3), (6, 1)]
 )
-def test_on_even_maps_the_averages_are_those_of_lpns_zero_filled_boxes(
-    side: int, parts: int
-) -> None:
+def test_ring_average_equals_lpns_boxes(side: int, parts: int) -> None:
     maps_BCHW = torch.randn(2, 3, side, side, generator=torch.Generator().manual_seed(side))
     torch.testing.assert_close(
         ring_average(maps_BCHW, parts, "box"), lpn_averages(maps_BCHW, parts)
     )
 
 
-def test_averages_come_per_ring_and_channel_from_the_centre_outwards() -> None:
+def test_ring_average_orders_rings_from_the_centre() -> None:
     rings_PHW = ring_masks(9, 12, 2)
     maps_BCHW = torch.stack([rings_PHW[0] * 5, rings_PHW[1] * 7])[None]
     assert ring_average(maps_BCHW, 2, "ring")[0].tolist() == [[5, 0], [0, pytest.approx(7)]]
 
 
-def test_averages_are_taken_in_the_precision_of_the_maps() -> None:
+def test_ring_average_keeps_the_dtype() -> None:
     assert ring_average(torch.ones(1, 1, 4, 4, dtype=torch.bfloat16), 2).dtype == torch.bfloat16
 
 
 @pytest.mark.parametrize(("height", "width"), [(7, 16), (16, 7), (1, 1)])
-def test_a_map_too_small_for_its_rings_is_refused_with_the_remedy(height: int, width: int) -> None:
+def test_ring_masks_reject_small_map(height: int, width: int) -> None:
     with pytest.raises(
         ValueError,
         match=rf"{height} x {width} cells cannot hold 4 .*at least 8 .*larger images or fewer",

@@ -15,25 +15,23 @@ PAPER = Schedule()
     ("epoch", "alpha"),
     [(0, 0.9), (139, 0.9), (140, 1.0), (279, 1.0), (280, 1.1), (419, 1.1), (420, 1.2), (559, 1.2)],
 )
-def test_alpha_starts_at_nine_tenths_and_grows_by_a_tenth_every_140_epochs(
-    epoch: int, alpha: float
-) -> None:
+def test_schedule_alpha_grows_every_140_epochs(epoch: int, alpha: float) -> None:
     assert schedule_at(PAPER, epoch).alpha == alpha
 
 
 @pytest.mark.parametrize("start", [0, 140, 280, 420])
-def test_the_rates_fall_to_four_fifths_after_60_and_120_epochs_of_each_period_and_start_anew_with_the_next(
+def test_schedule_rates_fall_and_restart_each_period(
     start: int,
 ) -> None:
     scales = [schedule_at(PAPER, start + within).lr_scale for within in (0, 59, 60, 119, 120, 139)]
     assert scales == pytest.approx([1, 1, 0.8, 0.8, 0.64, 0.64])
 
 
-def test_the_schedule_ends_with_the_fourth_alpha() -> None:
+def test_schedule_ends_with_the_fourth_alpha() -> None:
     assert PAPER.epochs == 560
 
 
-def test_without_restarts_the_rates_only_fall_at_140_280_and_420_while_alpha_grows() -> None:
+def test_schedule_without_restarts_only_lowers_rates() -> None:
     ablation = Schedule(restart=False, decay_epochs=(140, 280, 420))
     found = [schedule_at(ablation, epoch) for epoch in (0, 139, 140, 279, 280, 419, 420, 559)]
     assert [now.lr_scale for now in found] == pytest.approx(
@@ -42,14 +40,14 @@ def test_without_restarts_the_rates_only_fall_at_140_280_and_420_while_alpha_gro
     assert [now.alpha for now in found] == [0.9, 0.9, 1.0, 1.0, 1.1, 1.1, 1.2, 1.2]
 
 
-def test_a_constant_alpha_keeps_the_restarts() -> None:
+def test_schedule_constant_alpha_keeps_the_restarts() -> None:
     ablation = Schedule(alpha_step=0.0)
     assert [schedule_at(ablation, epoch) for epoch in (0, 60, 140, 200, 420)] == [
         ScheduleState(alpha=0.9, lr_scale=scale) for scale in (1.0, 0.8, 1.0, 0.8, 1.0)
     ]
 
 
-def test_the_control_without_an_adversary_has_the_rates_of_the_paper() -> None:
+def test_schedule_without_adversary_keeps_the_rates() -> None:
     control = Schedule(alpha=0.0, alpha_step=0.0)
     for epoch in range(0, 560, 7):
         assert schedule_at(control, epoch) == ScheduleState(
@@ -57,18 +55,18 @@ def test_the_control_without_an_adversary_has_the_rates_of_the_paper() -> None:
         )
 
 
-def test_steps_within_an_epoch_change_nothing_on_the_papers_schedule() -> None:
+def test_schedule_of_the_paper_is_constant_within_epochs() -> None:
     assert schedule_at(PAPER, 59.99) == schedule_at(PAPER, 59)
     assert schedule_at(PAPER, 139.99) == schedule_at(PAPER, 139)
 
 
-def test_a_cosine_falls_from_one_over_a_half_to_zero() -> None:
+def test_schedule_cosine_falls_from_one_to_zero() -> None:
     cosine = Schedule(epochs=80, lr_schedule="cosine")
     scales = [schedule_at(cosine, epoch).lr_scale for epoch in (0, 20, 40, 60, 80)]
     assert scales == pytest.approx([1, (1 + 0.5**0.5) / 2, 0.5, (1 - 0.5**0.5) / 2, 0])
 
 
-def test_warm_up_grows_from_zero_by_steps_and_then_leaves_the_shape_as_it_is() -> None:
+def test_schedule_warm_up_grows_by_steps() -> None:
     warm, cold = Schedule(warmup_epochs=4), Schedule()
     assert [schedule_at(warm, epoch).lr_scale for epoch in (0, 1, 2.5, 4, 60)] == pytest.approx(
         [0, 0.25, 0.625, 1, 0.8]
@@ -94,9 +92,7 @@ def test_warm_up_grows_from_zero_by_steps_and_then_leaves_the_shape_as_it_is() -
     ),
     share=st.floats(0, 1),
 )
-def test_the_rates_never_leave_zero_to_one_and_alpha_never_falls(
-    schedule: Schedule, share: float
-) -> None:
+def test_schedule_rates_and_alpha_stay_in_range(schedule: Schedule, share: float) -> None:
     now, later = (
         schedule_at(schedule, share * schedule.epochs),
         schedule_at(schedule, schedule.epochs),
@@ -107,7 +103,7 @@ def test_the_rates_never_leave_zero_to_one_and_alpha_never_falls(
 
 
 @pytest.mark.parametrize("wrong", [{"epochs": 0}, {"period": 0}, {"alpha": -0.1}])
-def test_settings_without_a_meaning_are_refused_with_the_value_found(
+def test_schedule_rejects_invalid_settings(
     wrong: dict[str, float],
 ) -> None:
     with pytest.raises(ValueError, match=str(next(iter(wrong.values()))).replace(".", r"\.")):

@@ -101,15 +101,13 @@ def watched_step(training: Training) -> list[dict[str, dict[str, Tensor]]]:
     return seen
 
 
-def test_the_first_step_moves_the_discriminator_alone_and_the_second_all_but_the_discriminator() -> (
-    None
-):
+def test_two_steps_move_disjoint_networks() -> None:
     before, between, after = watched_step(make())
     assert changed(before, between) == {"discriminator"}
     assert changed(between, after) == {"encoder", "classifier"}
 
 
-def test_the_discriminator_can_be_trained_again_after_the_step_that_holds_it() -> None:
+def test_discriminator_is_trainable_after_the_step() -> None:
     training = make()
     training.step(*batch(), NOW)
     assert training.discriminator is not None
@@ -136,9 +134,7 @@ def reference(
     return dict(zip(names, torch.autograd.grad(total, parameters), strict=True))
 
 
-def test_the_gradient_of_encoder_and_classifier_is_that_of_equation_4_against_the_discriminator_just_trained() -> (
-    None
-):
+def test_second_step_gradient_is_equation_4() -> None:
     training = make()
     learner = copy.deepcopy(training.model)
     training.step(*batch(), NOW)
@@ -149,7 +145,7 @@ def test_the_gradient_of_encoder_and_classifier_is_that_of_equation_4_against_th
         torch.testing.assert_close(parameter.grad, by_hand[name], rtol=1e-4, atol=1e-6)
 
 
-def test_no_gradient_reaches_the_discriminator_from_the_second_step() -> None:
+def test_second_step_gives_discriminator_no_gradient() -> None:
     training = make()
     seen: list[dict[str, Tensor]] = []
 
@@ -170,7 +166,7 @@ def test_no_gradient_reaches_the_discriminator_from_the_second_step() -> None:
     assert_same(seen[0], seen[1])
 
 
-def test_the_encoder_is_pushed_by_swapped_labels_and_not_by_a_reversed_gradient() -> None:
+def test_encoder_gradient_is_of_swapped_labels() -> None:
     adversary, plain = (reference(make().model, _discriminator(), alpha) for alpha in (1.0, 0.0))
     training = make()
     maps1_BCHW, maps2_BCHW, *_ = training.model(batch()[0], batch()[2])
@@ -193,9 +189,7 @@ def _discriminator() -> nn.Module:
     return discriminator
 
 
-def test_the_discriminator_sees_both_views_in_one_batch_in_training_mode_twice_an_iteration() -> (
-    None
-):
+def test_discriminator_sees_both_views_twice_per_step() -> None:
     training = make()
     assert training.discriminator is not None
     seen: list[tuple[int, bool, bool]] = []
@@ -209,7 +203,7 @@ def test_the_discriminator_sees_both_views_in_one_batch_in_training_mode_twice_a
     ]  # detached from the encoder first, attached to it second
 
 
-def test_the_encoder_runs_once_on_each_view_alone() -> None:
+def test_encoder_runs_once_per_view() -> None:
     training = make()
     seen: list[int] = []
     training.model.encoder.register_forward_pre_hook(
@@ -220,13 +214,13 @@ def test_the_encoder_runs_once_on_each_view_alone() -> None:
 
 
 @pytest.mark.parametrize(("drones", "satellites"), [(2, 6), (5, 2)])
-def test_views_may_come_in_batches_of_different_sizes(drones: int, satellites: int) -> None:
+def test_step_takes_views_of_different_batch_sizes(drones: int, satellites: int) -> None:
     losses = make().step(*batch(0, drones, satellites), NOW)
     assert all(bool(torch.isfinite(loss)) for loss in losses.values())
 
 
 @pytest.mark.parametrize("dropout", [0.0, 0.5])
-def test_with_alpha_zero_encoder_and_classifier_become_what_they_are_without_an_adversary(
+def test_alpha_zero_equals_no_adversary(
     dropout: float,
 ) -> None:
     config = replace(TINY, dropout=dropout)
@@ -241,7 +235,7 @@ def test_with_alpha_zero_encoder_and_classifier_become_what_they_are_without_an_
         torch.testing.assert_close(tensor, learned[1][name], rtol=1e-5, atol=1e-7)
 
 
-def test_without_an_adversary_there_is_no_discriminator() -> None:
+def test_training_without_adversary_has_no_discriminator() -> None:
     plain = make(adversary=False)
     assert {name.split("/")[0] for name in plain.step(*batch(), NOW)} == {
         "location_loss",
@@ -252,14 +246,14 @@ def test_without_an_adversary_there_is_no_discriminator() -> None:
     assert set(plain.modules) == {"encoder", "classifier"}
 
 
-def test_alpha_moves_the_encoder_and_leaves_the_classifiers_first_step_alone() -> None:
+def test_alpha_moves_the_encoder_only() -> None:
     gentle, strong = make(), make()
     gentle.step(*batch(), ScheduleState(alpha=0.0, lr_scale=1.0))
     strong.step(*batch(), ScheduleState(alpha=1.0, lr_scale=1.0))
     assert changed(weights(gentle), weights(strong)) == {"encoder"}
 
 
-def test_each_group_moves_at_its_own_rate_scaled_by_the_schedule() -> None:
+def test_step_scales_each_groups_rate() -> None:
     training = make()
     training.step(*batch(), ScheduleState(alpha=0.9, lr_scale=0.8))
     assert training.learning_rates == pytest.approx(
@@ -268,7 +262,7 @@ def test_each_group_moves_at_its_own_rate_scaled_by_the_schedule() -> None:
     assert {len(g["params"]) for g in training.optimizers[0].param_groups} == {60, 2 * 4, 2 * 2}
 
 
-def test_the_optimisers_are_those_of_the_paper_unless_a_short_run_asks_for_adamw() -> None:
+def test_optimizers_are_sgd_or_adamw() -> None:
     of_encoder, of_discriminator = make().optimizers
     assert type(of_encoder) is SGD
     assert type(of_discriminator) is Adam
@@ -279,7 +273,7 @@ def test_the_optimisers_are_those_of_the_paper_unless_a_short_run_asks_for_adamw
     assert type(make(optimization=Optimization(optimizer="adamw")).optimizers[0]) is AdamW
 
 
-def test_a_step_tells_its_losses_and_how_often_the_discriminator_was_right() -> None:
+def test_step_reports_losses_and_accuracy() -> None:
     training = make()
     measures = training.step(*batch(), NOW)
     whole = {"location_loss", "view_loss", "adversarial_loss", "discriminator_accuracy"}
@@ -297,7 +291,7 @@ def test_a_step_tells_its_losses_and_how_often_the_discriminator_was_right() -> 
         assert float(measures[name]) == 1.0
 
 
-def test_the_losses_of_views_and_rings_add_up_to_the_whole() -> None:
+def test_losses_by_view_and_ring_add_up() -> None:
     measures = {name: float(value) for name, value in make().step(*batch(0, 2, 4), NOW).items()}
     for name in ("location_loss", "view_loss", "adversarial_loss"):
         assert measures[f"{name}/drone"] + measures[f"{name}/satellite"] == pytest.approx(
@@ -310,7 +304,7 @@ def test_the_losses_of_views_and_rings_add_up_to_the_whole() -> None:
     assert measures["discriminator_accuracy"] == pytest.approx((2 * right[0] + 4 * right[1]) / 6)
 
 
-def test_the_length_of_each_networks_gradient_is_told() -> None:
+def test_step_reports_gradient_norms() -> None:
     training = make()
     measures = training.step(*batch(), NOW)
     for name, module in training.modules.items():
@@ -321,7 +315,7 @@ def test_the_length_of_each_networks_gradient_is_told() -> None:
         torch.testing.assert_close(measures[f"gradient_norm/{name}"], length, rtol=1e-3, atol=0.0)
 
 
-def test_in_bfloat16_weights_and_losses_stay_float32_and_the_step_is_nearly_the_same() -> None:
+def test_step_in_bfloat16_keeps_float32_weights() -> None:
     torch.manual_seed(0)
     half = Training(TINY, Optimization(), LOCATIONS, precision="bfloat16")
     whole = make()
@@ -333,7 +327,7 @@ def test_in_bfloat16_weights_and_losses_stay_float32_and_the_step_is_nearly_the_
     assert not Training(TINY, Optimization(), LOCATIONS, precision="auto").bfloat16  # on a CPU
 
 
-def test_networks_that_cannot_be_compiled_are_as_they_were_and_the_reason_is_told(
+def test_compile_failure_keeps_networks_and_reports(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def broken(self: nn.Module) -> None:
@@ -355,14 +349,14 @@ def test_networks_that_cannot_be_compiled_are_as_they_were_and_the_reason_is_tol
     assert_same(uncompiled.state_dict(), plain.state_dict())
 
 
-def test_the_location_loss_falls_when_the_same_images_come_again_and_again() -> None:
+def test_training_overfits_repeated_images() -> None:
     training = make()
     first, *_, last = [float(training.step(*batch(), NOW)["location_loss"]) for _ in range(30)]
     assert last < first / 2
 
 
 @pytest.mark.parametrize("kind", ["sgd", "adamw"])
-def test_a_run_saved_and_loaded_goes_on_to_the_last_bit(kind: Any) -> None:
+def test_training_state_resumes_bit_by_bit(kind: Any) -> None:
     config, optimization = replace(TINY, dropout=0.5), Optimization(optimizer=kind)
     whole = make(config, optimization)
     for seed in range(2):
@@ -382,12 +376,12 @@ def test_a_run_saved_and_loaded_goes_on_to_the_last_bit(kind: Any) -> None:
     assert_same(resumed.state_dict(), whole.state_dict())
 
 
-def test_a_run_of_one_adversary_does_not_take_the_state_of_none() -> None:
+def test_load_state_rejects_another_adversary() -> None:
     with pytest.raises(KeyError, match="discriminator"):
         make().load_state_dict(make(adversary=False).state_dict())
 
 
-def test_joint_batchnorm_is_the_encoder_on_both_views_at_once() -> None:
+def test_joint_bn_encodes_both_views_in_one_batch() -> None:
     torch.manual_seed(0)
     learner = EncoderWithClassifier(TINY, 3, joint_bn=True)
     images_B3HW = torch.randint(0, 256, (5, 3, 64, 64), dtype=torch.uint8)

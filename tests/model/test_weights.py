@@ -24,9 +24,7 @@ def foreign() -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("name", ["resnet.pth", "resnet.safetensors"])
-def test_a_state_dict_with_torchvisions_names_loads_and_its_classifier_is_left_out(
-    tmp_path: Path, name: str
-) -> None:
+def test_load_backbone_drops_torchvisions_classifier(tmp_path: Path, name: str) -> None:
     path = str(tmp_path / name)
     if name.endswith(".safetensors"):
         safetensors.torch.save_file(foreign(), path)
@@ -38,7 +36,7 @@ def test_a_state_dict_with_torchvisions_names_loads_and_its_classifier_is_left_o
         assert torch.equal(tensor, expected[key])
 
 
-def test_files_from_before_batch_norm_counted_its_batches_load_too() -> None:
+def test_load_backbone_without_batch_counts() -> None:
     old = {
         name: tensor
         for name, tensor in foreign().items()
@@ -49,9 +47,7 @@ def test_files_from_before_batch_norm_counted_its_batches_load_too() -> None:
     assert torch.equal(backbone.conv1.weight, foreign()["conv1.weight"])
 
 
-def test_all_that_is_missing_unexpected_or_of_another_shape_is_listed_and_nothing_is_loaded() -> (
-    None
-):
+def test_load_backbone_lists_all_mismatches() -> None:
     state = foreign() | {
         "conv1.weight": torch.ones(16, 3, 3, 3),
         "module.bn1.weight": torch.ones(16),
@@ -74,13 +70,13 @@ def test_all_that_is_missing_unexpected_or_of_another_shape_is_listed_and_nothin
         assert torch.equal(tensor, untouched[key])
 
 
-def test_an_absent_file_is_refused_with_the_way_to_make_one(tmp_path: Path) -> None:
+def test_read_state_dict_absent_file_names_the_remedy(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"no weights at .*none\.pth; expected .*torchvision"):
         read_state_dict(str(tmp_path / "none.pth"))
 
 
 @pytest.mark.parametrize("name", ["broken.pth", "broken.safetensors"])
-def test_a_damaged_file_is_refused_by_name(tmp_path: Path, name: str) -> None:
+def test_read_state_dict_rejects_damaged_file(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"not weights at all")
     with pytest.raises(
         CheckpointError, match=rf"{name} is no state dict \(.*expected \.pth or \.safetensors"
@@ -91,9 +87,7 @@ def test_a_damaged_file_is_refused_by_name(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize(
     "value", [[1, 2], torch.ones(3), {"state_dict": {"conv1.weight": torch.ones(1)}, "epoch": 3}]
 )
-def test_a_file_that_holds_something_else_is_refused_with_the_remedy(
-    tmp_path: Path, value: object
-) -> None:
+def test_read_state_dict_rejects_other_content(tmp_path: Path, value: object) -> None:
     torch.save(value, tmp_path / "else.pth")
     with pytest.raises(
         CheckpointError, match=r"else\.pth has other values than tensors by name.*save model"
@@ -101,7 +95,7 @@ def test_a_file_that_holds_something_else_is_refused_with_the_remedy(
         read_state_dict(str(tmp_path / "else.pth"))
 
 
-def test_a_folder_is_refused_in_one_sentence(tmp_path: Path) -> None:
+def test_read_state_dict_rejects_a_folder(tmp_path: Path) -> None:
     with pytest.raises(
         CheckpointError, match=r"is no state dict \(.*directory.*expected \.pth or \.safetensors"
     ):
@@ -122,7 +116,7 @@ def published(backbone: str) -> dict[str, Tensor]:
     ("name", "tensors"),
     [("resnet18", 122), ("resnet34", 218), ("resnet50", 320), ("resnet101", 626)],
 )
-def test_a_state_dict_of_each_depth_loads_and_tells_its_depth(name: str, tensors: int) -> None:
+def test_load_backbone_of_each_depth(name: str, tensors: int) -> None:
     state = published(name)
     assert len(state) == tensors  # as torchvision's have them, the classifier's two included
     assert infer_backbone(state, "resnet.pth") == (name, 1.0)
@@ -133,7 +127,7 @@ def test_a_state_dict_of_each_depth_loads_and_tells_its_depth(name: str, tensors
 
 @pytest.mark.parametrize("name", BACKBONES)
 @pytest.mark.parametrize("other", BACKBONES)
-def test_a_state_dict_of_another_depth_is_refused(name: str, other: str) -> None:
+def test_load_backbone_rejects_another_depth(name: str, other: str) -> None:
     with torch.device("meta"):
         backbone = ResNet(name)
     if name == other:
@@ -146,7 +140,7 @@ def test_a_state_dict_of_another_depth_is_refused(name: str, other: str) -> None
         load_backbone(backbone, published(other), "resnet.pth")
 
 
-def test_the_width_is_told_too_and_what_is_no_resnet_of_ours_is_refused_by_what_it_has() -> None:
+def test_measure_backbone_finds_width_or_rejects() -> None:
     assert infer_backbone(foreign(), "thin.pth") == ("resnet18", 0.25)
     resnet152 = published("resnet101") | {
         f"layer2.{block}.conv3.weight": torch.ones(1) for block in range(4, 8)
