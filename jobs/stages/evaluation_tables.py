@@ -71,7 +71,7 @@ def print_published(tasks: list[str]) -> None:
         for heading in ("pixels", "R@1", "AP"):
             table.add_column(heading, justify="right", no_wrap=True)
         for line in (*PUBLISHED_TABLE, *PUBLISHED_ABLATION):
-            if figures := line.of(task):
+            if figures := line.for_task(task):
                 table.add_row(
                     line.method, str(line.pixels), *(f"{figure:.2f}" for figure in figures)
                 )

@@ -1,8 +1,7 @@
-"""Measures of the queries by what is known of their images: per-query rows and shard records in,
-one row per group out.
+"""Metrics by group: per-query rows and a column of the shards' records in, one row per group out.
 
-The records are those beside the shards (pipeline/shards/record_table.py), joined by key. Numbers
-fall into bins with round edges, directions into eight sectors, anything else into its own values.
+The records are those beside the shards (shards/record_table.py), joined by key. Numbers fall into
+bins with round edges, headings into eight sectors; any other value is a group of its own.
 """
 
 from collections.abc import Sequence
@@ -10,39 +9,37 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipeline.core.errors import InputError
+from pipeline.core.arrays import Strings
+from pipeline.core.errors import require
+from pipeline.report.charts import nice_ticks
 from pipeline.retrieval.bootstrap import metrics_with_intervals
 from pipeline.shards import record_table
 from pipeline.shards.shard_set import ShardSet
 
 SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
-MAX_VALUES = 12  # a number with more values than a table shows well is binned
+MAX_VALUES = 12  # numbers with more distinct values are binned
 MAX_BINS = 6
 UNKNOWN = "unknown"
 
 
 def read_column(shards: ShardSet, column: str) -> dict[str, Any]:
-    """What the records say of each key under one column.
+    """The value of one column of the shards' records, by key.
 
-    Raises InputError when there is no such column.
+    Raises InputError if there is no such column.
     """
     usable = [name for name in record_table.SCHEMA.names if name not in ("key", "footprint")]
-    if column not in usable:
-        raise InputError(
-            f"--by is {column}, expected a column of the shards' records: {', '.join(usable)}"
-        )
+    expected = f"a column of the shards' records: {', '.join(usable)}"
+    require(column in usable, "by", (column,), expected)
     return shards.column(column)
 
 
-def break_down(results: pa.Table, column: str, known: dict[str, Any]) -> list[dict[str, Any]]:
-    """R@1, R@5 and AP of each group of each single-query task, with the 95 % interval of R@1 and
-    AP.
+def break_down(results: pa.Table, column: str, values: dict[str, Any]) -> list[dict[str, Any]]:
+    """R@1, R@5 and AP of each group of each single-query task, R@1 and AP with 95 % intervals.
 
-    `results`: rows of retrieval.RESULTS_SCHEMA. `known`: the column's value of each key.
+    `results`: rows of tasks.RESULTS_SCHEMA. `values`: the column's value by key.
     """
     single = results.filter(pc.invert(results["multi_query"]))
     rows: list[dict[str, Any]] = []
@@ -52,22 +49,24 @@ def break_down(results: pa.Table, column: str, known: dict[str, Any]) -> list[di
         mask = pc.and_(
             *(pc.equal(single[n], v) for n, v in zip(("task", "protocol"), task, strict=True))
         )
-        mine = single.filter(mask)
-        groups = group_names(column, [known.get(key) for key in mine["query"].to_pylist()])
-        first_Q = mine["first_match_rank"].fill_null(0).to_numpy()
-        ap_Q, locations_Q = mine["ap"].to_numpy(), np.asarray(mine["location"].to_pylist(), np.str_)
-        for name in dict.fromkeys(groups[1]):
-            here = groups[0] == name
-            if here.any():
+        own = single.filter(mask)
+        group_Q, order = group_names(column, [values.get(key) for key in own["query"].to_pylist()])
+        first_Q = own["first_match_rank"].fill_null(0).to_numpy()
+        ap_Q, locations_Q = own["ap"].to_numpy(), np.asarray(own["location"].to_pylist(), np.str_)
+        for name in dict.fromkeys(order):
+            in_group = group_Q == name
+            if in_group.any():
                 rows.append(
                     {"task": task[0], "protocol": task[1], "by": column, "value": name}
-                    | metrics_with_intervals(first_Q[here], ap_Q[here], locations_Q[here])
+                    | metrics_with_intervals(
+                        first_Q[in_group], ap_Q[in_group], locations_Q[in_group]
+                    )
                 )
     return rows
 
 
-def group_names(column: str, values: Sequence[Any]) -> tuple[npt.NDArray[np.str_], list[str]]:
-    """The group of each value, and all groups in the order in which to show them."""
+def group_names(column: str, values: Sequence[Any]) -> tuple[Strings, list[str]]:
+    """The group of each value, and all groups in display order."""
     given = [value for value in values if value is not None]
     numeric = all(isinstance(value, int | float) for value in given)
     if column == "heading_deg":
@@ -82,23 +81,11 @@ def group_names(column: str, values: Sequence[Any]) -> tuple[npt.NDArray[np.str_
             *(f"{v:g}" if isinstance(v, float) else str(v) for v in in_order),
             UNKNOWN,
         ]
-    edges = round_edges(min(given), max(given))
+    edges = nice_ticks(min(given), max(given), MAX_BINS)
     labels = [f"{low:g} to {high:g}" for low, high in pairwise(edges)]
-    at = [
-        -1 if v is None else min(int(np.searchsorted(edges, v, side="right")) - 1, len(labels) - 1)
+    # Inner edges only, so that the outer bins take values that rounding puts beside the edges.
+    names = [
+        UNKNOWN if v is None else labels[int(np.searchsorted(edges[1:-1], v, side="right"))]
         for v in values
     ]
-    return np.array([UNKNOWN if i < 0 else labels[i] for i in at], np.str_), [*labels, UNKNOWN]
-
-
-def round_edges(low: float, high: float) -> list[float]:
-    """Edges of at most BINS bins of equal, round width (1, 2 or 5 times a power of ten) that
-    enclose [low, high].
-    """
-    for exponent in range(int(np.floor(np.log10((high - low) / MAX_BINS))), 400):
-        for unit in (1, 2, 5):
-            width = unit * 10.0**exponent
-            first, last = int(np.floor(low / width)), int(np.ceil(high / width))
-            if last - first <= MAX_BINS:
-                return [float(f"{i * width:.12g}") for i in range(first, last + 1)]
-    raise AssertionError("unreachable: some width spans the whole range")
+    return np.array(names, np.str_), [*labels, UNKNOWN]

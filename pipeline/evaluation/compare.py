@@ -1,8 +1,8 @@
-"""Finished evaluations side by side: their folders in; a table of figures, differences and how sure
-they are out.
+"""Finished evaluations side by side: their folders in; tables of figures, differences and p values
+out, with the figures that papers published.
 
 The first run is the baseline. Runs are compared on the same queries, resampled by location
-(pipeline/retrieval/bootstrap.py).
+(retrieval/bootstrap.py).
 """
 
 from collections.abc import Sequence
@@ -23,17 +23,67 @@ MAIN_TASKS = ("drone->satellite", "satellite->drone")
 TASK_HEADINGS = {"drone->satellite": "UAV to satellite", "satellite->drone": "satellite to UAV"}
 
 
+@dataclass(frozen=True, kw_only=True)
+class PublishedResult:
+    """One row of the paper's tables; R@1 and AP in percent."""
+
+    method: str
+    pixels: int
+    drone_to_satellite: tuple[float, float]
+    satellite_to_drone: tuple[float, float]
+
+    def for_task(self, task: str) -> tuple[float, float] | None:
+        """R@1 and AP of a task by its name; None if the paper has none."""
+        figures = {
+            "drone->satellite": self.drone_to_satellite,
+            "satellite->drone": self.satellite_to_drone,
+        }
+        return figures.get(task)
+
+
+def _published(method: str, pixels: int, *figures: float) -> PublishedResult:
+    a, b, c, d = figures
+    return PublishedResult(
+        method=method, pixels=pixels, drone_to_satellite=(a, b), satellite_to_drone=(c, d)
+    )
+
+
+PUBLISHED_TABLE = (
+    _published("Instance loss", 256, 58.49, 63.31, 71.18, 58.74),
+    _published("LPN", 256, 75.93, 79.14, 86.45, 74.79),
+    _published("USAM", 256, 77.60, 80.55, 86.59, 75.96),
+    _published("PCL", 256, 79.47, 83.63, 87.69, 78.51),
+    _published("FSRA", 256, 82.25, 84.82, 87.87, 81.53),
+    _published("MSBA", 256, 82.33, 84.78, 90.58, 81.61),
+    _published("PVDA", 256, 82.73, 85.19, 92.30, 82.48),
+    _published("Instance loss", 384, 62.99, 67.69, 75.75, 62.09),
+    _published("LCM", 384, 66.65, 70.82, 79.89, 65.38),
+    _published("LPN", 384, 78.02, 80.99, 86.16, 76.56),
+    _published("PCL", 384, 81.63, 85.46, 89.73, 80.84),
+    _published("FSRA", 384, 84.82, 87.03, 87.59, 83.37),
+    _published("MSBA", 384, 86.61, 88.55, 92.15, 84.45),
+    _published("PVDA", 384, 87.34, 89.26, 93.72, 86.04),
+)
+PUBLISHED_ABLATION = (
+    _published("PVDA, constant alpha", 256, 82.00, 84.55, 91.73, 81.96),
+    _published("PVDA, no restart", 256, 81.54, 84.09, 92.30, 81.05),
+)
+PUBLISHED_MULTI_QUERY = {256: (92.01, 98.00, 93.30), 384: (95.29, 98.43, 95.99)}
+"PVDA, drone->satellite with a location's images as one query: R@1, R@5, AP by image size."
+
+
 def compare(runs: Sequence[EvaluationResults]) -> list[dict[str, Any]]:
-    """One row per run and task that the first run has: its measures and, of every later run, the
+    """One row per run and task of the first run: its metrics and, for every later run, the
     differences of R@1 and AP with their 95 % intervals and p.
 
-    Raises InputError when there are not two runs, two have one name, none shares a task with the
-    first, or a shared task was run on other queries or another gallery.
+    Raises InputError if there are fewer than two runs, two have one name, none shares a task with
+    the first, or a shared task was run on other queries or another gallery.
     """
     names = [run.name for run in runs]
     if len(runs) < 2 or len(set(names)) < len(names):
         raise InputError(
-            f"found the runs {', '.join(names)}; expected two or more of different names; rename or add folders"
+            f"found the runs {', '.join(names)}; expected two or more of different names; "
+            "rename or add folders"
         )
     baseline, rows = runs[0], []
     for base in baseline.metrics:
@@ -48,7 +98,8 @@ def compare(runs: Sequence[EvaluationResults]) -> list[dict[str, Any]]:
             for run in runs
         )
         raise InputError(
-            f"no run shares a task and protocol with the first ({found}); expected the same evaluations"
+            f"no run shares a task and protocol with the first ({found}); "
+            "expected the same evaluations"
         )
     return rows
 
@@ -56,16 +107,16 @@ def compare(runs: Sequence[EvaluationResults]) -> list[dict[str, Any]]:
 def _differences(
     run: EvaluationResults, baseline: EvaluationResults, base: dict[str, Any]
 ) -> dict[str, Any]:
-    ours, theirs = (_by_query(each, base) for each in (run, baseline))
-    if ours["query"].to_pylist() != theirs["query"].to_pylist():
+    own, other = (_by_query(each, base) for each in (run, baseline))
+    if own["query"].to_pylist() != other["query"].to_pylist():
         raise InputError(
-            f"{run.name} and {baseline.name} ranked different queries for {base['task']}; expected the same images; embed and "
-            "evaluate both on the same shards"
+            f"{run.name} and {baseline.name} ranked different queries for {base['task']}; "
+            "expected the same images; embed and evaluate both on the same shards"
         )
-    locations_Q = np.asarray(theirs["location"].to_pylist(), np.str_)
+    locations_Q = np.asarray(other["location"].to_pylist(), np.str_)
     found: dict[str, Any] = {}
     for name in COMPARED_METRICS:
-        difference = paired_difference(_values(ours, name), _values(theirs, name), locations_Q)
+        difference = paired_difference(_values(own, name), _values(other, name), locations_Q)
         found |= {f"{name}_difference_{key}": value for key, value in asdict(difference).items()}
     return found
 
@@ -125,8 +176,8 @@ def latex(rows: Sequence[dict[str, Any]], published: bool = False) -> str:
 def _tables(
     rows: Sequence[dict[str, Any]], published: bool
 ) -> list[tuple[str, list[str], list[list[str]]]]:
-    """Title, headings and lines of: both directions, multi-query, differences; those that have
-    lines.
+    """Title, headings and lines of the tables that have lines: both directions, multi-query,
+    differences.
     """
     runs = list(dict.fromkeys(row["run"] for row in rows))
     protocols = ", ".join(dict.fromkeys(f"{row['protocol']} protocol" for row in rows))
@@ -150,15 +201,15 @@ def _tables(
         for run in runs
     ]
     for line in (*PUBLISHED_TABLE, *PUBLISHED_ABLATION) if published else ():
-        figures = [line.of(task) or (None, None) for task in tasks]
+        figures = [line.for_task(task) or (None, None) for task in tasks]
         cells = ["-" if value is None else f"{value:.2f}" for pair in figures for value in pair]
         lines.append([f"{line.method}, {line.pixels} px (published)", *cells])
     tables = [(f"Both directions, percent, {protocols}", heading, lines)]
-    several = {
+    merged = {
         row["run"]: row for row in rows if row["multi_query"] and row["task"] == MAIN_TASKS[0]
     }
     lines = [
-        [run, *_percent_cells([several[run]], ("r1", "r5", "ap"))] for run in runs if run in several
+        [run, *_percent_cells([merged[run]], ("r1", "r5", "ap"))] for run in runs if run in merged
     ]
     for pixels, known in PUBLISHED_MULTI_QUERY.items() if published and lines else ():
         lines.append([f"PVDA, {pixels} px (published)", *(f"{value:.2f}" for value in known)])
@@ -216,52 +267,3 @@ def _escape_latex(text: str) -> str:
         out += special.get(token, token)
         i += len(token)
     return out
-
-
-@dataclass(frozen=True, kw_only=True)
-class PublishedResult:
-    """One line of the paper's tables; R@1 and AP in percent."""
-
-    method: str
-    pixels: int
-    drone_to_satellite: tuple[float, float]
-    satellite_to_drone: tuple[float, float]
-
-    def of(self, task: str) -> tuple[float, float] | None:
-        """R@1 and AP of a task by its name; None where the paper has none."""
-        known = {
-            "drone->satellite": self.drone_to_satellite,
-            "satellite->drone": self.satellite_to_drone,
-        }
-        return known.get(task)
-
-
-def _published(method: str, pixels: int, *figures: float) -> PublishedResult:
-    a, b, c, d = figures
-    return PublishedResult(
-        method=method, pixels=pixels, drone_to_satellite=(a, b), satellite_to_drone=(c, d)
-    )
-
-
-PUBLISHED_TABLE = (
-    _published("Instance loss", 256, 58.49, 63.31, 71.18, 58.74),
-    _published("LPN", 256, 75.93, 79.14, 86.45, 74.79),
-    _published("USAM", 256, 77.60, 80.55, 86.59, 75.96),
-    _published("PCL", 256, 79.47, 83.63, 87.69, 78.51),
-    _published("FSRA", 256, 82.25, 84.82, 87.87, 81.53),
-    _published("MSBA", 256, 82.33, 84.78, 90.58, 81.61),
-    _published("PVDA", 256, 82.73, 85.19, 92.30, 82.48),
-    _published("Instance loss", 384, 62.99, 67.69, 75.75, 62.09),
-    _published("LCM", 384, 66.65, 70.82, 79.89, 65.38),
-    _published("LPN", 384, 78.02, 80.99, 86.16, 76.56),
-    _published("PCL", 384, 81.63, 85.46, 89.73, 80.84),
-    _published("FSRA", 384, 84.82, 87.03, 87.59, 83.37),
-    _published("MSBA", 384, 86.61, 88.55, 92.15, 84.45),
-    _published("PVDA", 384, 87.34, 89.26, 93.72, 86.04),
-)
-PUBLISHED_ABLATION = (
-    _published("PVDA, constant alpha", 256, 82.00, 84.55, 91.73, 81.96),
-    _published("PVDA, no restart", 256, 81.54, 84.09, 92.30, 81.05),
-)
-PUBLISHED_MULTI_QUERY = {256: (92.01, 98.00, 93.30), 384: (95.29, 98.43, 95.99)}
-"Of PVDA, drone->satellite with a location's images as one query: R@1, R@5, AP by image size."

@@ -1,5 +1,4 @@
-"""What the field's other programs read: the challenge's answer file and the `.mat` file of
-features.
+"""Files for other programs: the challenge's answer file and the `.mat` file of features.
 
 In: per-query rows, feature tables. Out: `answer.txt`, one line per query with the ids of its ten
 best gallery images, best first, between tabs, as University-1652's test_160k.py writes it for the
@@ -20,11 +19,11 @@ from pipeline.core.records import Split, View
 from pipeline.features.table import FeatureTable
 from pipeline.shards.shard_set import ShardSet
 
-MAX_MAT_BYTES = 2**32 - 1  # bytes of one array in a MATLAB 5 file
+MAX_MAT_BYTES = 2**32 - 1  # of one array in a MATLAB 5 file
 
 
 def source_file_names(shards: ShardSet) -> dict[str, str]:
-    """The name of the file that each key was made from, without its folder."""
+    """The name of each key's source file, without its folder."""
     return {key: path.rsplit("/", 1)[-1] for key, path in shards.column("path").items()}
 
 
@@ -35,11 +34,12 @@ def answer_text(
 ) -> str:
     """The answer file of one task's per-query rows.
 
-    `names`: file name of each key; a gallery image's id is its file's name without ending, or, without `names`, its location,
-    which in University-1652's satellite gallery is the same. `order`: the queries' file names in the order that the challenge
-    asks for (its query_drone_name.txt); without it, the rows' order.
+    `names`: file name of each key; a gallery image's id is its file's name without ending, or,
+    without `names`, its location, which in University-1652's satellite gallery is the same.
+    `order`: the queries' file names in the order that the challenge requires (its
+    query_drone_name.txt); without it, the rows' order.
 
-    Raises InputError when a query that is asked for is not there, or two have one name.
+    Raises InputError if a query in the order is missing, or two have one name.
     """
     if order is not None:
         by_name: dict[str, dict[str, Any]] = {}
@@ -47,14 +47,15 @@ def answer_text(
             name = (names or {}).get(row["query"], row["query"])
             if by_name.setdefault(name, row) is not row:
                 raise InputError(
-                    f"two queries come from files named {name}; expected each name once, as in the challenge's masked test "
-                    "set; leave the order out"
+                    f"two queries come from files named {name}; expected each name once, as in "
+                    "the challenge's masked test set; leave the order out"
                 )
         missing = [name for name in order if name not in by_name]
         if missing:
             raise InputError(
-                f"{len(missing)} of {len(order)} names in the order were not queried, the first is {missing[0]}; expected "
-                "file names of the queries; give the --shards that were embedded, and the list that belongs to them"
+                f"{len(missing)} of {len(order)} names in the order were not queried, the first is "
+                f"{missing[0]}; expected file names of the queries; give the --shards that were "
+                "embedded, and the list that belongs to them"
             )
         rows = [by_name[name] for name in order]
     lines = []
@@ -71,49 +72,54 @@ def answer_text(
 def mat_bytes(
     queries: FeatureTable, gallery: FeatureTable, query_view: View, gallery_view: View
 ) -> bytes:
-    """The features of one task as a MATLAB 5 file. Labels are numbers there: a location's number
-    where all are numbers, else its place among the names. Paths hold the location as their folder,
-    whatever it is called.
+    """The features of one task as a MATLAB 5 file. Labels are integers there: the location names if
+    all are integers, else their indices among the sorted names. A path's folder is the location's
+    name in either case.
 
-    Raises InputError when the features do not fit such a file.
+    Raises InputError if the features do not fit such a file.
     """
-    sides = {
+    tables = {
         "query": queries.select(Split.QUERY, query_view),
         "gallery": gallery.select(Split.GALLERY, gallery_view),
     }
-    labels = {name: table.labels() for name, table in sides.items()}
-    places = np.unique(np.concatenate([known.locations for known in labels.values()]))
-    numbers = {place: int(place) if place.isdecimal() else -1 for place in places.tolist()}
-    if len(set(numbers.values())) < len(places) or -1 in numbers.values():
-        numbers = {place: index for index, place in enumerate(places.tolist())}
+    labels = {name: table.labels() for name, table in tables.items()}
+    locations = np.unique(np.concatenate([own.locations for own in labels.values()]))
+    numbers = {
+        location: int(location) if location.isdecimal() else -1 for location in locations.tolist()
+    }
+    if len(set(numbers.values())) < len(locations) or -1 in numbers.values():
+        numbers = {location: index for index, location in enumerate(locations.tolist())}
     content: dict[str, Any] = {}
-    for name, table in sides.items():
+    for name, table in tables.items():
         size = table.rows * table.dimension * 4
         if size > MAX_MAT_BYTES:
             raise InputError(
-                f"the {name} features take {size:,} bytes; expected at most {MAX_MAT_BYTES:,}, all that an array of a .mat file "
-                "can hold; leave the export out and read the Parquet table"
+                f"the {name} features take {size:,} bytes; expected at most {MAX_MAT_BYTES:,}, the "
+                "limit of an array in a .mat file; leave the export out and read the Parquet table"
             )
-        known, folder = labels[name], f"{name}_{'-'.join(table.views)}"
+        own, folder = labels[name], f"{name}_{'-'.join(table.views)}"
         content[f"{name}_f"] = table.embeddings()
         content[f"{name}_label"] = np.array(
-            [[numbers[place] for place in known.locations.tolist()]], np.int64
+            [[numbers[location] for location in own.locations.tolist()]], np.int64
         )
-        pairs = zip(known.locations.tolist(), known.keys.tolist(), strict=True)
-        content[f"{name}_path"] = np.array([f"{folder}/{place}/{key}" for place, key in pairs])
+        pairs = zip(own.locations.tolist(), own.keys.tolist(), strict=True)
+        content[f"{name}_path"] = np.array(
+            [f"{folder}/{location}/{key}" for location, key in pairs]
+        )
     stream = io.BytesIO()
     scipy.io.savemat(stream, content)
     return stream.getvalue()
 
 
 def read_answer_order(path: str) -> list[str]:
-    """The lines of a challenge's list of query names, without folders.
+    """The file names in a challenge's list of queries, without folders.
 
-    Raises InputError when there is no such file.
+    Raises InputError if there is no such file.
     """
     if not storage.exists(path):
         raise InputError(
-            f"no list of query names at {path}; expected a text file with one file name a line; check the path"
+            f"no list of query names at {path}; expected a text file with one file name per line; "
+            "check the path"
         )
     lines = storage.read_bytes(path).decode().splitlines()
     return [line.strip().rsplit("/", 1)[-1] for line in lines if line.strip()]

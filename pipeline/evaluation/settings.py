@@ -4,7 +4,7 @@ command line is parsed at once."""
 from dataclasses import dataclass
 from typing import Literal
 
-from pipeline.core.errors import InputError
+from pipeline.core.errors import InputError, require
 from pipeline.report.options import DEFAULT_PANELS, FigureFormat
 from pipeline.retrieval.metrics import Protocol
 
@@ -14,7 +14,8 @@ ExportFormat = Literal["answer", "mat"]
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationSettings:
-    """What to evaluate: --table for every task that it allows, or --queries and --gallery for one."""
+    """What to evaluate: --table for every task that it allows, or --queries and --gallery for
+    one."""
 
     out: str
     "Folder for the results; a path or a URI."
@@ -31,7 +32,7 @@ class EvaluationSettings:
     multi_query: bool = False
     "One query per location, the mean of its queries' features; with --queries and --gallery."
     query_view: ViewName | None = None
-    "View of the queries; needed where the tables allow more than one task."
+    "View of the queries; needed if the tables allow more than one task."
     gallery_view: ViewName | None = None
     "View of the gallery."
     shards: str | None = None
@@ -45,17 +46,17 @@ class EvaluationSettings:
     "Headline of the report."
     panels: int = DEFAULT_PANELS
     """Hits, and as many misses, that the report shows of each task; a few are open, the others
-    unfold."""
+    unfold on a click."""
     workers: int = 0
     """Ray tasks that rank, of one core each, each for some of the queries; 0: this process ranks,
     on all cores."""
     verify: bool = False
-    "Look at every byte of the tables first, and of the shards where they are given."
+    "Verify every byte of the tables first, and of the shards if they are given."
     views: bool = True
-    "Whether to measure drone->satellite by the number of views a query is the mean of."
+    "Measure drone->satellite by the number of views that a query is the mean of."
     parts: bool = True
-    """Whether to measure what each part of the embedding finds alone, and all but it: for four
-    parts, the time of four rankings."""
+    """Measure each part of the embedding alone, and all others without it: for four parts, the time
+    of four rankings."""
     by: tuple[str, ...] = ()
     """Columns of the shards' records to break the measures down by, such as altitude_m or
     heading_deg; with --shards."""
@@ -76,7 +77,8 @@ class EvaluationSettings:
                 if getattr(self, name) is not None
             ]
             raise InputError(
-                f"found {' and '.join(given) or 'no table'}; expected --table alone, or --queries and --gallery together"
+                f"found {' and '.join(given) or 'no table'}; "
+                "expected --table alone, or --queries and --gallery together"
             )
         if one and self.multi_query:
             raise InputError(
@@ -84,18 +86,14 @@ class EvaluationSettings:
             )
         if self.by and not self.shards:
             raise InputError(
-                f"found --by {' '.join(self.by)} without --shards, whose records know it; add --shards"
+                f"found --by {' '.join(self.by)} without --shards, whose records have the column; "
+                "add --shards"
             )
         if self.answer_order and ("answer" not in self.exports or not self.shards or self.table):
             raise InputError(
-                "found --answer-order, expected one task (--queries and --gallery), --exports answer and --shards with it; "
-                "add them"
+                "found --answer-order, expected one task (--queries and --gallery), "
+                "--exports answer and --shards with it; add them"
             )
-        if self.panels < 0:
-            raise InputError(
-                f"--panels is {self.panels}, expected 0 or more; leave it out for {DEFAULT_PANELS}"
-            )
-        if self.workers < 0:
-            raise InputError(
-                f"--workers is {self.workers}, expected 0 or more; leave it out to rank in this process"
-            )
+        panels, workers = self.panels, self.workers
+        require(panels >= 0, "panels", panels, f"0 or more; leave it out for {DEFAULT_PANELS}")
+        require(workers >= 0, "workers", workers, "0 or more; leave it out to rank in this process")
