@@ -1,10 +1,5 @@
-"""Evaluate features exactly: every task that a table allows (--table), or one of two tables
-(--queries and --gallery).
-
-Writes metrics.json, metrics.parquet, queries.parquet, views.json, parts.json, view_gap.json and
-report.html to --out, what --by, --exports and --figures ask for beside them, and prints the
-measures in percent.
-"""
+"""Evaluate, and print the tables of the result: metrics with intervals, distances, groups, view
+gaps, and the figures that papers published."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,18 +12,16 @@ from pipeline.evaluation.compare import PUBLISHED_ABLATION, PUBLISHED_TABLE
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.settings import EvaluationSettings
 from pipeline.report.inputs import read_extras
+from pipeline.report.tasks import METRIC_LABELS
 from pipeline.retrieval.parts import part_label
 
-MEASURES = {"r1": "R@1", "r5": "R@5", "r10": "R@10", "r1p": "R@1%", "ap": "AP"}
-SURE = ("r1", "r5", "ap")
+WITH_INTERVALS = ("r1", "r5", "ap")
 
 
 def evaluate_and_print(settings: EvaluationSettings, published: bool) -> None:
     """Rank queries against galleries and measure: Recall@K and AP, official protocol first.
 
-    Args:
-        settings: What to evaluate. published: Print the figures that papers published for
-        University-1652's official test beside ours.
+    `published`: print the figures that papers published for University-1652's official test too.
     """
     rows = evaluate(settings)
     print_table(rows)
@@ -45,26 +38,28 @@ def evaluate_and_print(settings: EvaluationSettings, published: bool) -> None:
 
 
 def print_table(rows: list[dict[str, Any]]) -> None:
-    """The measures of one evaluation on standard output, in percent, and how sure they are."""
+    """The metrics of one evaluation on standard output, in percent, with 95 % intervals."""
     table = _table(f"{rows[0]['protocol']} protocol, percent")
     table.add_column("task")
-    for heading in (*MEASURES.values(), "queries", "gallery"):
+    for heading in (*METRIC_LABELS.values(), "queries", "gallery"):
         table.add_column(heading, justify="right", no_wrap=True)
     for row in rows:
         counts = (f"{row['queries']:,}", f"{row['gallery']:,}")
-        table.add_row(_task(row), *(f"{100 * row[measure]:.2f}" for measure in MEASURES), *counts)
+        table.add_row(
+            _task(row), *(f"{100 * row[measure]:.2f}" for measure in METRIC_LABELS), *counts
+        )
     results.print(table)
     table = _table("95 % intervals: locations resampled")
     table.add_column("task")
-    for measure in SURE:
-        table.add_column(MEASURES[measure], justify="right", no_wrap=True)
+    for measure in WITH_INTERVALS:
+        table.add_column(METRIC_LABELS[measure], justify="right", no_wrap=True)
     for row in rows:
-        table.add_row(_task(row), *(_interval(row, measure) for measure in SURE))
+        table.add_row(_task(row), *(_interval(row, measure) for measure in WITH_INTERVALS))
     results.print(table)
 
 
 def print_published(tasks: list[str]) -> None:
-    """What papers published for the official test, by task."""
+    """The figures that papers published for the official test, by task."""
     for task in tasks:
         table = _table(f"{task}, published (arXiv 2401.01573), percent")
         table.add_column("method")
@@ -80,7 +75,7 @@ def print_published(tasks: list[str]) -> None:
 
 
 def print_positions(rows: list[dict[str, Any]]) -> None:
-    """How far off the best answers are, where positions are known."""
+    """Distance errors of the best answers, if positions are known."""
     known = [row for row in rows if row.get("geo_queries")]
     if not known:
         return
@@ -113,23 +108,23 @@ def print_positions(rows: list[dict[str, Any]]) -> None:
 
 
 def print_gaps(gaps: Sequence[dict[str, Any]]) -> None:
-    """How far apart the views lie in the embedding."""
+    """The gaps between the views in the embedding."""
     if not gaps:
         return
     table = _table("view gap: cosines with their 5 to 95 %, distance of means in spreads")
     for heading in ("task", "true pairs", "other pairs", "distance"):
         table.add_column(heading, justify="left" if heading == "task" else "right", no_wrap=True)
     for gap in gaps:
-        said = (
+        cosines = (
             f"{of['mean']:.3f} ({of['low']:.2f} to {of['high']:.2f})"
             for of in (gap["true"], gap["other"])
         )
-        table.add_row(gap["task"], *said, f"{gap['distance']:.3f}")
+        table.add_row(gap["task"], *cosines, f"{gap['distance']:.3f}")
     results.print(table)
 
 
 def print_groups(rows: Sequence[dict[str, Any]], first: str) -> None:
-    """Measures by number of views, by group or by part."""
+    """Metrics by number of views, by group or by part."""
     headings = dict.fromkeys((row["task"], row.get("by", "views a query")) for row in rows)
     for task, heading in headings:
         table = _table(task)

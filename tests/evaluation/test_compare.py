@@ -1,6 +1,4 @@
-"""Evaluations side by side: differences worked by hand, tables in Markdown and LaTeX, and what
-cannot be compared.
-"""
+"""Comparison of evaluations: differences worked by hand, Markdown and LaTeX tables, refusals."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -53,7 +51,7 @@ def run(
     )
 
 
-def test_the_difference_is_that_of_the_same_queries_whatever_their_order() -> None:
+def test_compare_matches_queries_in_any_order() -> None:
     base, other = run("base", [1, 2, 1, 2] * 10), run("other_1", [1, 1, 1, None] * 10)
     shuffled = replace(other, results=other.results.take(list(range(39, -1, -1))))
     for mine in (other, shuffled):
@@ -64,12 +62,12 @@ def test_the_difference_is_that_of_the_same_queries_whatever_their_order() -> No
         assert 0 < row["r1_difference_p"] < 0.05
 
 
-def test_a_run_against_its_own_copy_differs_by_nothing() -> None:
+def test_compare_of_equal_runs_is_zero() -> None:
     _, row = compare([run("a", [1, 2, 3, None]), run("b", [1, 2, 3, None])])
     assert [row[f"r1_difference_{name}"] for name in ("mean", "low", "high", "p")] == [0, 0, 0, 1]
 
 
-def test_tables_say_runs_differences_and_what_was_published() -> None:
+def test_tables_list_runs_differences_and_published_figures() -> None:
     rows = compare([run("base", [1, 2] * 4), run("my_run", [1, 1] * 4)])
     text = markdown(rows, published=True)
     assert "| base | 50.00 | 62.50 |" in text
@@ -83,7 +81,7 @@ def test_tables_say_runs_differences_and_what_was_published() -> None:
     assert r"95 \% interval" in tex
 
 
-def test_multi_query_has_its_own_table() -> None:
+def test_tables_list_multi_query_apart() -> None:
     base, other = (run(name, [1, 2], multi=True) for name in "ab")
     text = markdown(compare([base, other]), published=True)
     assert "| a | 50.00 | 100.00 | 62.50 |" in text
@@ -99,19 +97,21 @@ def test_multi_query_has_its_own_table() -> None:
         ([run("a", [1]), run("b", [1, 1])], r"b ranked 2 queries .* expected the same images"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(runs: list[EvaluationResults], sentence: str) -> None:
+def test_compare_refuses_runs_that_do_not_match(
+    runs: list[EvaluationResults], sentence: str
+) -> None:
     with pytest.raises(InputError, match=sentence):
         compare(runs)
 
 
-def test_other_queries_of_equal_number_are_refused() -> None:
+def test_compare_refuses_other_queries_of_equal_number() -> None:
     base, other = run("a", [1, 2]), run("b", [1, 2])
     named = other.results.set_column(0, "query", pa.array(["x", "y"]))
     with pytest.raises(InputError, match=r"b and a ranked different queries"):
         compare([base, replace(other, results=named)])
 
 
-def test_finished_folders_are_compared(tmp_path: Path) -> None:
+def test_compare_reads_finished_folders(tmp_path: Path) -> None:
     for seed, name in enumerate(("base", "again")):
         table = made_table(tmp_path / f"t{seed}", TEST_SET, seed=seed)
         evaluate(EvaluationSettings(table=table, out=str(tmp_path / name)))

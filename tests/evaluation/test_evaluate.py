@@ -1,4 +1,4 @@
-"""The evaluation from tables on disk to a finished folder, and what it refuses."""
+"""The evaluation stage from tables on disk to a finished folder, and its refusals."""
 
 import io
 from dataclasses import asdict
@@ -67,7 +67,7 @@ def made_table(
     return str(folder)
 
 
-def test_a_table_is_evaluated_on_every_task_that_it_allows(tmp_path: Path) -> None:
+def test_evaluate_table_on_every_possible_task(tmp_path: Path) -> None:
     out = tmp_path / "out"
     rows = evaluate(EvaluationSettings(table=made_table(tmp_path / "t", TEST_SET), out=str(out)))
     assert [(row["task"], row["multi_query"], row["queries"], row["gallery"]) for row in rows] == [
@@ -88,7 +88,7 @@ def test_a_table_is_evaluated_on_every_task_that_it_allows(tmp_path: Path) -> No
     assert not (out / "parts.json").exists()  # these embeddings have none
 
 
-def test_pictures_come_from_the_shards_by_key(tmp_path: Path) -> None:
+def test_evaluate_fetches_images_from_the_shards(tmp_path: Path) -> None:
     table, shards = made_table(tmp_path / "t", TEST_SET), tmp_path / "shards"
     picture, listed = io.BytesIO(), []
     Image.new("RGB", (8, 8)).save(picture, "PNG")
@@ -111,7 +111,7 @@ def test_pictures_come_from_the_shards_by_key(tmp_path: Path) -> None:
     assert "no picture" not in text
 
 
-def test_two_tables_are_evaluated_on_the_one_task_between_them(tmp_path: Path) -> None:
+def test_evaluate_two_tables_on_their_one_task(tmp_path: Path) -> None:
     queries, gallery = (
         made_table(tmp_path / "q", TEST_SET[1:2]),
         made_table(tmp_path / "g", TEST_SET[2:3]),
@@ -135,7 +135,7 @@ def test_two_tables_are_evaluated_on_the_one_task_between_them(tmp_path: Path) -
     assert (row["multi_query"], row["queries"], row["gallery"]) == (True, 5, 16)
 
 
-def test_a_finished_evaluation_run_again_does_nothing(
+def test_evaluate_rerun_of_a_finished_evaluation_is_a_no_op(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked = EvaluationSettings(
@@ -149,7 +149,7 @@ def test_a_finished_evaluation_run_again_does_nothing(
     assert "nothing to do" in capsys.readouterr().err
 
 
-def test_other_extras_rewrite_the_report_alone(tmp_path: Path) -> None:
+def test_evaluate_with_another_title_rewrites_the_report_only(tmp_path: Path) -> None:
     table, out = made_table(tmp_path / "t", TEST_SET), tmp_path / "out"
     evaluate(EvaluationSettings(table=table, out=str(out)))
     ranked = (out / "queries.parquet").stat().st_mtime_ns
@@ -158,19 +158,19 @@ def test_other_extras_rewrite_the_report_alone(tmp_path: Path) -> None:
     assert (out / "queries.parquet").stat().st_mtime_ns == ranked
 
 
-def test_an_unfinished_evaluation_is_made_again(tmp_path: Path) -> None:
+def test_evaluate_redoes_an_unfinished_evaluation(tmp_path: Path) -> None:
     asked = EvaluationSettings(
         table=made_table(tmp_path / "t", TEST_SET), out=str(tmp_path / "out")
     )
     evaluate(asked)
-    whole = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    complete = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
     (tmp_path / "out" / "metrics.json").unlink()
     (tmp_path / "out" / "report.html").write_text("half")
     evaluate(asked)
-    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == whole
+    assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == complete
 
 
-def test_a_folder_that_holds_another_evaluation_is_refused(tmp_path: Path) -> None:
+def test_evaluate_refuses_a_folder_of_another_evaluation(tmp_path: Path) -> None:
     table, out = made_table(tmp_path / "t", TEST_SET), str(tmp_path / "out")
     evaluate(EvaluationSettings(table=table, out=out))
     with pytest.raises(InputError, match=r"different protocol.*choose another --out"):
@@ -179,14 +179,14 @@ def test_a_folder_that_holds_another_evaluation_is_refused(tmp_path: Path) -> No
         evaluate(EvaluationSettings(table=made_table(tmp_path / "u", TEST_SET, seed=1), out=out))
 
 
-def test_tables_of_two_networks_are_refused(tmp_path: Path) -> None:
+def test_evaluate_refuses_tables_of_two_networks(tmp_path: Path) -> None:
     queries = made_table(tmp_path / "q", TEST_SET[:1])
     gallery = made_table(tmp_path / "g", TEST_SET[3:], fingerprint="e" * 64)
     with pytest.raises(InputError, match=r"embed both with the same checkpoint"):
         evaluate(EvaluationSettings(queries=queries, gallery=gallery, out=str(tmp_path / "out")))
 
 
-def test_tables_that_allow_several_tasks_need_the_views_named(tmp_path: Path) -> None:
+def test_evaluate_asks_for_views_if_several_tasks_fit(tmp_path: Path) -> None:
     table, out = made_table(tmp_path / "t", TEST_SET), str(tmp_path / "out")
     with pytest.raises(
         InputError, match=r"drone->satellite, satellite->drone; expected one task; .*--query-view"
@@ -198,7 +198,7 @@ def test_tables_that_allow_several_tasks_need_the_views_named(tmp_path: Path) ->
     assert row["task"] == "satellite->drone"
 
 
-def test_a_table_without_a_task_is_refused(tmp_path: Path) -> None:
+def test_evaluate_refuses_a_table_without_a_task(tmp_path: Path) -> None:
     with pytest.raises(
         InputError,
         match=r"query rows of drone in .* and gallery rows of drone in .*embed both splits",
@@ -214,12 +214,12 @@ def test_a_table_without_a_task_is_refused(tmp_path: Path) -> None:
     "named",
     [{}, {"queries": "q"}, {"table": "t", "gallery": "g"}, {"table": "t", "multi_query": True}],
 )
-def test_a_call_that_names_the_wrong_tables_is_refused(named: dict[str, str]) -> None:
+def test_settings_refuse_a_wrong_combination_of_tables(named: dict[str, str]) -> None:
     with pytest.raises(InputError, match=r"expected --table alone|leave it out"):
         EvaluationSettings(out="o", **named)  # type: ignore[arg-type]
 
 
-def test_an_evaluation_beside_must_be_of_the_same_images(tmp_path: Path) -> None:
+def test_evaluate_refuses_a_damaged_or_unlike_beside(tmp_path: Path) -> None:
     table, other = made_table(tmp_path / "t", TEST_SET), str(tmp_path / "reduced")
     evaluate(EvaluationSettings(table=table, out=other))
     beside = EvaluationSettings(table=table, out=str(tmp_path / "out"), beside=other)

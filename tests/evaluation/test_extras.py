@@ -1,6 +1,4 @@
-"""What an evaluation writes besides measures: numbers of views, groups, exports; and the same files
-from any workers.
-"""
+"""Extra outputs of an evaluation: views, groups, exports, and the same files from any workers."""
 
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,7 @@ from pipeline.shards.shard_set import open_shards
 from tests.evaluation.test_evaluate import TEST_SET, made_table
 
 
-def test_r1_by_views_starts_at_the_single_and_ends_at_the_multi_query(tmp_path: Path) -> None:
+def test_views_range_from_single_query_to_multi_query(tmp_path: Path) -> None:
     rows = evaluate(
         EvaluationSettings(table=made_table(tmp_path / "t", TEST_SET), out=str(tmp_path / "o"))
     )
@@ -36,7 +34,7 @@ def test_r1_by_views_starts_at_the_single_and_ends_at_the_multi_query(tmp_path: 
     )
 
 
-def test_any_number_of_workers_writes_the_same_bytes(tmp_path: Path, ray_cluster: None) -> None:
+def test_evaluate_writes_the_same_bytes_for_any_workers(tmp_path: Path, ray_cluster: None) -> None:
     table = made_table(tmp_path / "t", TEST_SET)
     for workers in (0, 1, 3):
         evaluate(
@@ -53,7 +51,7 @@ def test_any_number_of_workers_writes_the_same_bytes(tmp_path: Path, ray_cluster
         )
 
 
-def test_asking_for_more_writes_it_without_ranking_again(tmp_path: Path) -> None:
+def test_evaluate_adds_an_export_without_ranking_again(tmp_path: Path) -> None:
     table, out = made_table(tmp_path / "t", TEST_SET), tmp_path / "o"
     evaluate(EvaluationSettings(table=table, out=str(out)))
     ranked = (out / "queries.parquet").stat().st_mtime_ns
@@ -71,7 +69,9 @@ def test_asking_for_more_writes_it_without_ranking_again(tmp_path: Path) -> None
         ({"panels": -1}, r"--panels is -1"),
     ],
 )
-def test_what_cannot_go_together_is_refused(asked: dict[str, Any], sentence: str) -> None:
+def test_settings_refuse_flags_that_do_not_go_together(
+    asked: dict[str, Any], sentence: str
+) -> None:
     with pytest.raises(InputError, match=sentence):
         EvaluationSettings(table="t", out="o", **asked)
 
@@ -94,7 +94,7 @@ def results(*rows: tuple[str, str, int | None]) -> pa.Table:
     )
 
 
-def test_measures_by_group_are_those_of_the_group_s_queries() -> None:
+def test_break_down_measures_the_queries_of_each_group() -> None:
     known = {"a": 80.0, "b": 100.0, "c": 80.0, "d": None}
     rows = breakdowns.break_down(
         results(("a", "1", 1), ("b", "1", 3), ("c", "2", None), ("d", "2", 1)), "altitude_m", known
@@ -105,7 +105,7 @@ def test_measures_by_group_are_those_of_the_group_s_queries() -> None:
     assert (rows[0]["by"], rows[0]["locations"]) == ("altitude_m", 2)
 
 
-def test_directions_fall_into_sectors_and_many_numbers_into_round_bins() -> None:
+def test_group_names_are_sectors_and_round_bins() -> None:
     names, _ = breakdowns.group_names("heading_deg", [0, 22.4, 22.6, 359, -90, 180, None])
     assert names.tolist() == ["N", "N", "NE", "N", "W", "S", "unknown"]
     values = [float(v) for v in range(100, 251, 5)]
@@ -115,7 +115,7 @@ def test_directions_fall_into_sectors_and_many_numbers_into_round_bins() -> None
     assert breakdowns.group_names("variant", ["b", "a", None])[1] == ["a", "b", "unknown"]
 
 
-def test_groups_come_from_the_records_beside_the_shards(tiny_shards: str) -> None:
+def test_read_column_reads_the_records_beside_the_shards(tiny_shards: str) -> None:
     assert set(breakdowns.read_column(open_shards(tiny_shards), "view").values()) == {
         "drone",
         "satellite",
@@ -127,7 +127,7 @@ def test_groups_come_from_the_records_beside_the_shards(tiny_shards: str) -> Non
         breakdowns.read_column(open_shards(tiny_shards), "colour")
 
 
-def test_positions_of_the_table_become_distances(
+def test_evaluate_measures_distances_from_positions(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     places = ["0001", "0002"]
@@ -167,8 +167,8 @@ def test_positions_of_the_table_become_distances(
     assert asked[2]["distance_m"] is None
     assert (tmp_path / "o" / "figures" / "map-drone-satellite.pdf").exists()
     assert 'id="map"' in (tmp_path / "o" / "report.html").read_text()
-    said = capsys.readouterr().out
-    assert "55.6 m" in said
-    assert "published" in said
-    assert "82.73" in said
-    assert "…" not in said
+    output = capsys.readouterr().out
+    assert "55.6 m" in output
+    assert "published" in output
+    assert "82.73" in output
+    assert "…" not in output

@@ -1,6 +1,4 @@
-"""Bootstrap intervals: they cover what they should, depend on locations, and are the same in every
-run.
-"""
+"""Bootstrap intervals: their coverage, their dependence on locations, and their reproducibility."""
 
 import numpy as np
 import pytest
@@ -8,19 +6,19 @@ import pytest
 from pipeline.retrieval.bootstrap import confidence_intervals, paired_difference, resampled_means
 
 
-def test_without_spread_the_interval_is_the_mean() -> None:
+def test_confidence_intervals_of_a_constant_are_the_mean() -> None:
     found = confidence_intervals(np.full((6, 1), 0.25), np.array(list("aabbcc")))
     assert found.tolist() == [[0.25], [0.25]]
 
 
-def test_the_spread_is_that_of_independent_draws_when_each_query_is_a_location() -> None:
+def test_confidence_intervals_of_single_query_locations() -> None:
     values = (np.arange(400) % 4 == 0).astype(float)[:, None]
     low, high = confidence_intervals(values, np.arange(400).astype(str))[:, 0]
     assert (high - low) / 2 == pytest.approx(1.96 * np.sqrt(0.25 * 0.75 / 400), rel=0.1)
 
 
-def test_queries_of_one_location_count_as_one_observation() -> None:
-    """Ten equal images of each place tell no more than one."""
+def test_confidence_intervals_count_a_location_once() -> None:
+    """Ten equal images of each place carry no more information than one."""
     one = (np.arange(60) % 3 == 0).astype(float)[:, None]
     places = np.arange(60).astype(str)
     assert confidence_intervals(np.repeat(one, 10, axis=0), np.repeat(places, 10)) == pytest.approx(
@@ -28,15 +26,15 @@ def test_queries_of_one_location_count_as_one_observation() -> None:
     )
 
 
-def test_draws_weigh_locations_by_their_queries() -> None:
-    """Two places, of three hits and of one miss: whatever is drawn, the mean is 0, 1 or 3/4."""
+def test_resampled_means_weigh_locations_by_their_queries() -> None:
+    """Two places, of three hits and of one miss: in any draw the mean is 0, 1 or 3/4."""
     means = resampled_means(
         np.array([[1.0], [1], [1], [0]]), np.array(["a", "a", "a", "b"]), samples=200
     )
     assert set(np.unique(means).tolist()) == {0.0, 0.75, 1.0}
 
 
-def test_the_draws_are_the_same_in_every_run_however_many_are_made_at_once(
+def test_resampled_means_do_not_depend_on_the_block_size(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     values, places = (
@@ -48,11 +46,11 @@ def test_the_draws_are_the_same_in_every_run_however_many_are_made_at_once(
     assert np.array_equal(resampled_means(values, places, samples=100), first)
 
 
-def test_no_queries_have_no_interval() -> None:
+def test_confidence_intervals_without_queries_are_nan() -> None:
     assert np.isnan(confidence_intervals(np.empty((0, 3)), np.array([], np.str_))).all()
 
 
-def test_a_difference_is_sure_when_every_location_shows_it_and_not_when_half_do() -> None:
+def test_paired_difference_p_follows_how_many_locations_agree() -> None:
     places = np.arange(40).astype(str)
     always = paired_difference(np.ones(40), np.zeros(40), places)
     assert (always.mean, always.low, always.high) == (1, 1, 1)

@@ -11,7 +11,7 @@ from pipeline.retrieval.geo_metrics import distance_metrics, spatial_distance_me
 DEGREE_M = math.pi / 180 * EARTH_RADIUS_M
 
 
-def test_a_degree_of_a_meridian_and_of_a_parallel() -> None:
+def test_haversine_of_a_degree_of_meridian_and_parallel() -> None:
     assert haversine_m(np.array([10.0, 20]), np.array([11.0, 20])) == pytest.approx(DEGREE_M)
     assert haversine_m(np.array([60.0, 20]), np.array([60.0, 20.001])) == pytest.approx(
         DEGREE_M / 2000, rel=1e-6
@@ -22,7 +22,7 @@ def test_a_degree_of_a_meridian_and_of_a_parallel() -> None:
     )
 
 
-def test_sdm_weighs_the_first_answers_most_and_falls_with_distance() -> None:
+def test_sdm_weighs_first_answers_most_and_falls_with_distance() -> None:
     place = np.array([[30.0, 120.0]])
     near, far = [30.0002, 120.0], [31.0, 121.0]
     assert spatial_distance_metric(place, np.array([[[30.0, 120.0]]])) == pytest.approx(1)
@@ -31,7 +31,7 @@ def test_sdm_weighs_the_first_answers_most_and_falls_with_distance() -> None:
     assert found == pytest.approx((3 * math.exp(-1) + 2 * 0 + 1) / 6)
 
 
-def test_measures_are_over_the_queries_whose_place_is_known() -> None:
+def test_distance_metrics_use_queries_of_known_position() -> None:
     queries = np.array([[0.0, 0], [0.0, 0], [0.0, 0], [np.nan, np.nan]])
     metres = np.array([0, 30, 200, 0]) / DEGREE_M
     answers = np.stack([np.stack([metres, np.zeros(4)], axis=1)] * 3, axis=1)
@@ -43,7 +43,7 @@ def test_measures_are_over_the_queries_whose_place_is_known() -> None:
     assert found["sdm5"] is None
 
 
-def test_a_gallery_that_is_tagged_in_part_yields_no_distances() -> None:
+def test_distance_metrics_of_a_partly_tagged_gallery_are_none() -> None:
     found = distance_metrics(np.zeros((2, 2)), np.array([[[0.0, 0]], [[np.nan, np.nan]]]))
     assert found["geo_queries"] == 0
     assert {value for name, value in found.items() if name != "geo_queries"} == {None}

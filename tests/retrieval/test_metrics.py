@@ -1,6 +1,5 @@
-"""The measures against numbers worked by hand, and against the bound that holds for one match a
-query.
-"""
+"""Measures against numbers worked by hand, and against the bound that holds for one match per
+query."""
 
 import numpy as np
 import pytest
@@ -35,16 +34,16 @@ def test_average_precision_is_the_area_by_trapezoids(ranks: list[int], ap: float
     assert metrics.average_precisions(*ragged([ranks]))[0] == pytest.approx(ap, abs=1e-15)
 
 
-def test_each_query_has_its_own_average_precision() -> None:
+def test_average_precision_is_computed_per_query() -> None:
     found = metrics.average_precisions(*ragged([[2], [], [1, 3], [1]]))
     assert found.tolist() == pytest.approx([0.25, 0.0, (1 + (1 / 2 + 2 / 3) / 2) / 2, 1.0])
 
 
-def test_the_first_match_is_the_best_ranked_and_none_where_there_is_no_match() -> None:
+def test_first_match_rank_is_the_best_or_zero() -> None:
     assert metrics.first_match_ranks(*ragged([[4, 9], [], [1], []])).tolist() == [4, 0, 1, 0]
 
 
-def test_recall_counts_queries_without_a_match_in_the_denominator() -> None:
+def test_recall_counts_queries_without_a_match() -> None:
     first_Q = np.array([1, 2, 5, 0])
     assert [metrics.recall_at(k, first_Q) for k in (1, 2, 4, 5, 100)] == [
         0.25,
@@ -59,24 +58,24 @@ def test_recall_counts_queries_without_a_match_in_the_denominator() -> None:
     ("gallery", "k"),
     [(951, 11), (51_355, 515), (701, 8), (50, 1), (150, 3), (250, 3), (1, 1), (100, 2)],
 )
-def test_the_top_one_percent_reads_the_rank_that_the_field_reads(gallery: int, k: int) -> None:
+def test_one_percent_k_is_the_fields_rank(gallery: int, k: int) -> None:
     assert metrics.one_percent_k(gallery) == k
 
 
-def test_a_summary_holds_every_measure() -> None:
+def test_summarise_has_every_measure() -> None:
     first_Q, ap_Q = np.array([1, 6, 11, 12]), np.array([1.0, 0.5, 0.25, 0.25])
     found = metrics.summarise(first_Q, ap_Q, gallery=951)
     assert found == metrics.RetrievalMetrics(r1=0.25, r5=0.25, r10=0.5, r1p=0.75, ap=0.5)
 
 
-def test_no_queries_score_nothing() -> None:
+def test_summarise_without_queries_is_zero() -> None:
     none = np.array([], np.int64)
     assert metrics.summarise(none, none.astype(float), 5) == metrics.RetrievalMetrics(
         r1=0, r5=0, r10=0, r1p=0, ap=0
     )
 
 
-def test_chance_is_the_share_of_the_gallery_that_is_right() -> None:
+def test_chance_recall_is_the_matching_share_of_the_gallery() -> None:
     assert metrics.chance_recall(np.array([1, 3, 0]), gallery=8) == pytest.approx(
         (1 / 8 + 3 / 8) / 3
     )
@@ -84,7 +83,7 @@ def test_chance_is_the_share_of_the_gallery_that_is_right() -> None:
 
 
 @given(st.lists(st.integers(1, 400), min_size=1, max_size=30))
-def test_with_one_match_a_query_ap_stays_within_its_bound(ranks: list[int]) -> None:
+def test_average_precision_of_one_match_obeys_its_bound(ranks: list[int]) -> None:
     flat = ragged([[rank] for rank in ranks])
     r1 = metrics.recall_at(1, metrics.first_match_ranks(*flat))
     assert metrics.average_precisions(*flat).mean() <= r1 + 0.25 * (1 - r1) + 1e-12

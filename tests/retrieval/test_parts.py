@@ -1,4 +1,4 @@
-"""Parts of an embedding: how many there are is read off the vectors, and each is measured alone."""
+"""Parts of an embedding: counted from the vectors, and each measured alone."""
 
 from pathlib import Path
 
@@ -28,14 +28,12 @@ def made(rows: int, parts: int, part_dim: int, seed: int = 0) -> Floats:
 
 
 @given(parts=st.integers(1, 16), part_dim=st.integers(7, 40), half=st.booleans())
-def test_the_number_of_parts_is_found_from_the_vectors_float16_or_not(
-    parts: int, part_dim: int, half: bool
-) -> None:
+def test_count_parts_from_vectors_float16_or_not(parts: int, part_dim: int, half: bool) -> None:
     vectors = made(20, parts, part_dim)
     assert count_parts(vectors.astype(np.float16).astype(np.float32) if half else vectors) == parts
 
 
-def test_vectors_without_parts_have_one() -> None:
+def test_count_parts_of_vectors_without_parts_is_one() -> None:
     whole = made(5, 1, 64)
     assert count_parts(whole) == 1
     assert count_parts(made(5, 2, 32) + np.float32(0.01)) == 1
@@ -50,7 +48,7 @@ def test_vectors_without_parts_have_one() -> None:
     )
 
 
-def test_the_mean_of_the_parts_cosines_is_the_score() -> None:
+def test_cosines_by_part_average_to_the_score() -> None:
     one, other = made(6, 4, 9), made(6, 4, 9, seed=1)
     found = cosines_by_part(one, other, 4)
     assert found.shape == (6, 4)
@@ -63,7 +61,7 @@ def test_the_mean_of_the_parts_cosines_is_the_score() -> None:
     assert cosines_by_part(one, other, 2)[0] == pytest.approx([0.6, 0])
 
 
-def test_a_side_of_some_parts_has_unit_length_again() -> None:
+def test_select_parts_restores_unit_length() -> None:
     names = np.array(["a", "b"], np.str_)
     [block] = select_parts(embedding_set_from_array(names, names, made(2, 4, 3)), 4, (0, 2)).blocks(
         10
@@ -72,7 +70,7 @@ def test_a_side_of_some_parts_has_unit_length_again() -> None:
     assert block[:, :3] == pytest.approx(made(2, 4, 3)[:, :3] * np.sqrt(2))
 
 
-def test_each_part_is_measured_alone_and_left_out(tmp_path: Path) -> None:
+def test_measure_parts_alone_and_without_each(tmp_path: Path) -> None:
     """Part 2 shows the place, parts 1 and 3 are noise: it finds all alone, and without it little is
     found.
     """

@@ -1,4 +1,4 @@
-"""Several views as one query: which images make a group, and what their mean is."""
+"""Several views as one query: the images of each group, and their mean."""
 
 import numpy as np
 import pytest
@@ -25,13 +25,13 @@ def whole(of: EmbeddingSet) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]
     return np.concatenate(list(of.blocks(5)))
 
 
-def test_as_many_views_as_every_location_has() -> None:
+def test_possible_view_counts_fit_every_location() -> None:
     assert possible_view_counts(side([54, 55])) == [1, 2, 3, 6, 9, 18, 27, 54]
     assert possible_view_counts(side([54, 7])) == [1, 2, 3, 6]
     assert possible_view_counts(side([1, 1])) == [1]
 
 
-def test_a_group_takes_every_kth_image_in_the_order_of_the_keys() -> None:
+def test_mean_by_views_groups_every_kth_key() -> None:
     of = side([5, 4])
     grouped = mean_by_views(of, 2)
     assert grouped.keys.tolist() == ["0#0", "0#1", "1#0", "1#1"]
@@ -48,13 +48,13 @@ def test_a_group_takes_every_kth_image_in_the_order_of_the_keys() -> None:
         )
 
 
-def test_groups_of_all_images_are_the_locations() -> None:
+def test_mean_by_views_of_all_images_is_mean_by_location() -> None:
     of = side([6, 6, 6])
     assert np.array_equal(whole(mean_by_views(of, 6)), whole(mean_by_location(of)))
 
 
 @given(st.lists(st.integers(3, 9), min_size=1, max_size=5), st.integers(1, 3), st.integers(0, 99))
-def test_groups_do_not_depend_on_the_order_of_the_rows(
+def test_mean_by_views_does_not_depend_on_row_order(
     counts: list[int], views: int, seed: int
 ) -> None:
     of = side(counts, seed)

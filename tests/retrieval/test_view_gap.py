@@ -1,6 +1,4 @@
-"""The gap between two views: its figures by hand, its picture by invariants, and which rows are
-looked at.
-"""
+"""The gap between two views: statistics by hand, projection by invariants, and the sampled rows."""
 
 import numpy as np
 import pytest
@@ -27,14 +25,14 @@ def side(rows: int, dimension: int = 3) -> EmbeddingSet:
 
 
 @given(total=st.integers(0, 300), most=st.integers(2, 40))
-def test_evenly_spaced_numbers_are_distinct_and_reach_both_ends(total: int, most: int) -> None:
+def test_evenly_spaced_is_distinct_and_reaches_both_ends(total: int, most: int) -> None:
     found = evenly_spaced(total, most)
     assert len(found) == min(total, most)
     assert (np.diff(found) > 0).all()
     assert not total or (found[0], found[-1]) == (0, total - 1)
 
 
-def test_chosen_rows_come_in_the_order_asked_for_whatever_the_blocks(
+def test_take_rows_keeps_the_order_across_blocks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("pipeline.retrieval.subsets.BLOCK_ROWS", 4)
@@ -47,7 +45,7 @@ def test_chosen_rows_come_in_the_order_asked_for_whatever_the_blocks(
     assert vectors_by_key(side(11), ["absent"]) == {}
 
 
-def test_only_places_that_both_views_show_are_chosen_each_as_often_as_fits() -> None:
+def test_choose_common_rows_is_even_over_common_places() -> None:
     queries = np.repeat(["a", "b", "c"], 50).astype(np.str_)
     gallery = np.array(["distractor", "c", "b", "a", "only here"], np.str_)
     rows = view_gap.choose_common_rows(queries, gallery, most=12)
@@ -57,7 +55,7 @@ def test_only_places_that_both_views_show_are_chosen_each_as_often_as_fits() -> 
     assert [len(each) for each in view_gap.choose_common_rows(queries, gallery[:1])] == [0, 0]
 
 
-def test_the_distance_of_means_is_in_units_of_a_views_spread() -> None:
+def test_mean_distance_is_in_units_of_a_views_spread() -> None:
     # Two views, each two points at distance 1 from their mean; the means lie 3 apart.
     one = np.array([[0, 1], [0, -1]], np.float32)
     assert view_gap.mean_distance(one, one + np.array([3, 0], np.float32)) == pytest.approx(3)
@@ -67,11 +65,11 @@ def test_the_distance_of_means_is_in_units_of_a_views_spread() -> None:
     )
 
 
-def test_the_projection_shows_the_greatest_variance_both_views_weighing_alike() -> None:
+def test_project_pca_weighs_both_views_equally() -> None:
     query = np.array([[2, 0, 0], [-2, 0, 0]], np.float32)
     gallery = np.array(
         [[0, 1, 0], [0, -1, 0]] * 5, np.float32
-    )  # five times as many rows do not weigh more
+    )  # five times as many rows have the same weight
     found = view_gap.project_pca(query, gallery)
     assert found.shares == pytest.approx((0.8, 0.2))  # variances 4 and 1 of a half each
     assert np.abs(found.points_S2[:3]) == pytest.approx(
@@ -80,14 +78,14 @@ def test_the_projection_shows_the_greatest_variance_both_views_weighing_alike() 
     assert view_gap.project_pca(query, gallery).points_S2.tolist() == found.points_S2.tolist()
 
 
-def test_a_network_that_gives_all_images_one_vector_has_a_picture_too() -> None:
+def test_describe_gap_of_equal_vectors_is_zero() -> None:
     same = np.tile(np.array([1, 0], np.float32), (4, 1))
     found = view_gap.describe_gap(chosen("a a b b", same), chosen("a b c d", same))
     assert (found["shares"], found["distance"]) == ([0, 0], 0)
     assert {(point["x"], point["y"]) for point in found["points"]} == {(0, 0)}
 
 
-def test_cosines_of_true_pairs_stand_beside_those_of_other_places() -> None:
+def test_describe_gap_separates_true_and_other_pairs() -> None:
     eye = np.eye(4, dtype=np.float32)
     found = view_gap.describe_gap(chosen("a b b", eye[[0, 1, 1]]), chosen("b c a", eye[[1, 2, 3]]))
     assert found["true"] == {
@@ -106,7 +104,7 @@ def test_cosines_of_true_pairs_stand_beside_those_of_other_places() -> None:
     assert [point["side"] for point in found["points"]] == ["query"] * 3 + ["gallery"] * 3
 
 
-def test_one_place_has_no_gap_to_speak_of() -> None:
+def test_describe_gap_refuses_a_single_place() -> None:
     with pytest.raises(ValueError, match="show one place"):
         view_gap.describe_gap(
             chosen("a a", np.eye(2, dtype=np.float32)), chosen("a", np.eye(2, dtype=np.float32)[:1])
