@@ -40,7 +40,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "evaluation": BELOW_ALL | {"report", "retrieval", "features", "shards"},
 }
 ONLY_FROM = {
-    ("shards", "sources"): {"pack", "writer", "extend", "repair"},
+    ("shards", "sources"): {"pack", "pack_tars", "writer", "duplicates", "repair"},
     ("features", "shards"): {"embed", "embed_worker"},
     ("features", "batches"): {"embed", "embed_worker"},
 }

@@ -1,7 +1,7 @@
 """Shards -> shuffled pairs of batches for training, by a webdataset pipeline.
 
-In: a ShardSet. Out: batches of images as bytes (B, 3, H, W) with their labels. Which images come when
-is a pure function of the seed, the epoch and the rank, so a resumed run sees the same images.
+In: a ShardSet. Out: batches of images as bytes (B, 3, H, W) with their labels. Which images come
+when is a pure function of the seed, the epoch and the rank, so a resumed run sees the same images.
 """
 
 import random
@@ -36,7 +36,8 @@ class Batch:
     view: View
     keys: tuple[str, ...]
     damaged: tuple[str, ...] = ()
-    """Keys of images that could not be decoded; the batch's first image that could replaces them."""
+    """Keys of images that could not be decoded; the batch's first image that could replaces them.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,8 +2,8 @@
 view, of one location or at one position.
 
 In: records and record tables. Out: the new records when extending, and the images to leave out. A
-blank tile of the sea may come many times, each at its own position, and University-1652's queries are
-in its gallery too: these are not duplicates.
+blank tile of the sea may come many times, each at its own position, and University-1652's queries
+are in its gallery too: these are not duplicates.
 """
 
 import hashlib

@@ -15,7 +15,8 @@ from pipeline.core.records import Split, View, excerpt
 SCHEMA_VERSION = 2
 MANIFEST = "manifest.json"
 DAMAGED_FILE = "damaged.json"
-"""Names of the shards that verification found damaged: packing repairs them and removes the file."""
+"""Names of the shards that verification found damaged: packing repairs them and removes the file.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)

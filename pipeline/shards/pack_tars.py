@@ -1,7 +1,7 @@
 """Plans -> tars, several at once by Ray tasks; finished tars of an interrupted packing are kept.
 
-In: plans and what the source's scan gave. Out: the result of each tar, or TooManyRejected as soon as
-too many images are refused.
+In: plans and what the source's scan gave. Out: the result of each tar, or TooManyRejected as soon
+as too many images are refused.
 """
 
 import time
@@ -111,8 +111,8 @@ def write_shards(arguments: Iterable[tuple[Any, ...]], workers: int | None) -> I
 
 
 def check_rejections(settings: PackingSettings, refused: Sequence[Rejection], found: int) -> None:
-    """Raise TooManyRejected, with the list written, if too many images were refused. When extending,
-    an image that the set holds already does not count.
+    """Raise TooManyRejected, with the list written, if too many images were refused. When
+    extending, an image that the set holds already does not count.
     """
     bad = [one for one in refused if not (settings.extend and one.reason == "duplicate")]
     if len(bad) <= settings.max_bad_fraction * found:

@@ -1,5 +1,5 @@
-"""The record table of a set of shards: `records/<shard>.parquet`, one row per image with all that is
-known of it but its bytes.
+"""The record table of a set of shards: `records/<shard>.parquet`, one row per image with all that
+is known of it but its bytes.
 
 In: rows that packing made. Out: Parquet parts, by which packing resumes, extends and repairs; and
 one table for other programs, as Parquet or GeoJSON.

@@ -1,9 +1,9 @@
 """Repair of a finished set of shards: damaged tars and record parts are found, and packed again to
 the same bytes.
 
-In: a ShardSet and the imagery that a source found. Out: the damaged tars whose images the source has,
-packed again and compared with the manifest's hashes before they replace the damaged ones. Extended
-sets can be repaired too: rerun each packing command; it repairs the shards it wrote.
+In: a ShardSet and the imagery that a source found. Out: the damaged tars whose images the source
+has, packed again and compared with the manifest's hashes before they replace the damaged ones.
+Extended sets can be repaired too: rerun each packing command; it repairs the shards it wrote.
 """
 
 import hashlib

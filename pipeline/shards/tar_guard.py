@@ -1,9 +1,9 @@
-"""A check of a tar's bytes on their way to webdataset's reader: damaged, hostile and sparse tars are
-refused.
+"""A check of a tar's bytes on their way to webdataset's reader: damaged, hostile and sparse tars
+are refused.
 
-In: a stream. Out: the same bytes. webdataset reads tars with `tarfile`, which takes a broken header,
-a zeroed header, and the end of the file for the end of the tar, fills the holes of a sparse file with
-as many zeros as its header states, and reads a member name of any length.
+In: a stream. Out: the same bytes. webdataset reads tars with `tarfile`, which takes a broken
+header, a zeroed header, and the end of the file for the end of the tar, fills the holes of a sparse
+file with as many zeros as its header states, and reads a member name of any length.
 """
 
 import hashlib

@@ -1,10 +1,10 @@
 """A tar of webdataset's layout -> its samples as named bytes, in one pass, by webdataset's own
 iterators.
 
-In: a tar as a stream. Out: per sample its key and its members by suffix. Broken and hostile tars are
-refused by the guard in front of webdataset. Nothing is unpacked to disk, nothing unpickled. Never
-used: `WebDataset(...)`, whose reader silently drops the rest of a damaged tar; `gopen`, which runs a
-shell for `pipe:` URLs; `decode`, which unpickles.
+In: a tar as a stream. Out: per sample its key and its members by suffix. Broken and hostile tars
+are refused by the guard in front of webdataset. Nothing is unpacked to disk, nothing unpickled.
+Never used: `WebDataset(...)`, whose reader silently drops the rest of a damaged tar; `gopen`, which
+runs a shell for `pipe:` URLs; `decode`, which unpickles.
 """
 
 import re

@@ -1,5 +1,5 @@
-"""One planned shard -> one tar with the source's own bytes and a JSON per image, and its part of the
-record table.
+"""One planned shard -> one tar with the source's own bytes and a JSON per image, and its part of
+the record table.
 
 In: a plan and its source. Out: two files, each complete or absent; the same input gives the same
 bytes.
@@ -94,8 +94,8 @@ def write_shard(
 def read_member(record: ImageRecord, source: Source, check: Check) -> Member:
     """An image's bytes, never re-encoded, and the metadata beside them.
 
-    Raises DecodeError when they are no image or cannot be read, twice in a row: a storage that fails
-    for a moment costs no image.
+    Raises DecodeError when they are no image or cannot be read, twice in a row: a storage that
+    fails for a moment costs no image.
     """
     try:
         data, (width, height) = _read_checked(record, source, check)

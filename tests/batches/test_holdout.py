@@ -16,23 +16,23 @@ from pipeline.shards.shard_set import open_shards
 NAMES = [f"{number:04d}" for number in range(1000)]
 
 
-def test_about_the_share_that_was_asked_for_is_held_out() -> None:
+def test_holdout_is_about_the_share_asked_for() -> None:
     assert holdout_locations(NAMES, 0.0) == frozenset()
     assert 70 <= len(holdout_locations(NAMES, 0.1)) <= 130
 
 
 @given(st.sets(st.sampled_from(NAMES), min_size=200))
-def test_whether_a_place_is_held_out_depends_on_its_name_alone(some: set[str]) -> None:
+def test_holdout_depends_on_the_name_alone(some: set[str]) -> None:
     assert holdout_locations(sorted(some), 0.2) == holdout_locations(NAMES, 0.2) & some
 
 
 @pytest.mark.parametrize("share", [0.0001, 0.9999])
-def test_a_share_that_leaves_nothing_to_look_at_or_to_train_on_is_refused(share: float) -> None:
+def test_holdout_refuses_too_small_a_rest(share: float) -> None:
     with pytest.raises(InputError, match="expected at least two held out and two to train on"):
         holdout_locations(NAMES[:20], share)
 
 
-def test_places_held_out_are_neither_streamed_nor_classes_and_an_epoch_is_a_pass_over_the_others(
+def test_stream_without_holdout_locations(
     tiny_shards: str,
 ) -> None:
     share = next(
@@ -62,7 +62,7 @@ def chosen(shards: str, share: float) -> frozenset[str]:
         return frozenset()
 
 
-def test_shards_are_counted_without_the_places_left_out(tiny_shards: str) -> None:
+def test_exclude_locations_counts_the_others(tiny_shards: str) -> None:
     manifest = read_manifest(tiny_shards)
     drones = manifest.of(Split.TRAIN, View.DRONE)
     assert exclude_locations(open_shards(tiny_shards), drones, frozenset()) == drones

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from jobs.training.driver import train
 from jobs.training.recipes import smoke
@@ -23,10 +22,8 @@ from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.shards.manifest import DAMAGED_FILE, Shard, read_manifest
 from pipeline.shards.pack import pack
-from pipeline.shards.settings import PackingSettings
 from pipeline.shards.shard_set import open_shards
 from pipeline.shards.verify import check_shard, verify
-from pipeline.sources.university1652 import University1652
 from tests.damaging import (
     REMEDIES,
     count_detected,
@@ -34,39 +31,7 @@ from tests.damaging import (
     error_message,
     raising_if_missing,
 )
-
-SOURCE = University1652()
-
-
-def imagery(root: Path, places: range) -> Path:
-    """Of each place a satellite image and four of the UAV."""
-    for place in places:
-        for number, name in enumerate(["satellite", "drone", "drone", "drone", "drone"]):
-            path = root / f"train/{name}/{place:04d}/image-{number:02d}.jpg"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            pixels = np.random.default_rng([place, number]).integers(
-                0, 255, (16, 16, 3), dtype=np.uint8
-            )
-            Image.fromarray(pixels).save(path, "JPEG")
-    return root
-
-
-def said(root: Path, out: Path, **changes: Any) -> PackingSettings:
-    given: dict[str, Any] = {
-        "root": str(root),
-        "out": str(out),
-        "samples_per_shard": 5,
-        "workers": 0,
-    }
-    return PackingSettings(**(given | changes))
-
-
-def content(out: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(out)): path.read_bytes()
-        for path in sorted(out.rglob("*"))
-        if path.is_file()
-    }
+from tests.shards.imagery import SOURCE, content, imagery, said
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +52,7 @@ def a_shard(out: Path) -> tuple[Shard, Path]:
     return shard, out / f"{shard.name}.tar"
 
 
-def test_verification_and_embedding_find_each_damage_of_a_tar(out: Path) -> None:
+def test_reading_finds_each_damage_of_a_tar(out: Path) -> None:
     shard, tar = a_shard(out)
     look = raising_if_missing(tar, lambda: list(open_shards(str(out)).samples(shard, verify=True)))
     assert count_detected(tar, look, 200) == 201
@@ -96,8 +61,8 @@ def test_verification_and_embedding_find_each_damage_of_a_tar(out: Path) -> None
         assert any(str(tar) in sentence for sentence in check_shard(str(out), shard))
 
 
-def test_training_refuses_a_damaged_tar_or_leaves_the_damaged_image_out(out: Path) -> None:
-    """By default it looks at sizes before it starts, at each image's hash and name as it reads it."""
+def test_training_refuses_or_skips_damage(out: Path) -> None:
+    """By default sizes are checked first, and each image's hash and name as it is read."""
     _, tar = a_shard(out)
     good, refused, left_out = tar.read_bytes(), 0, 0
     reading = StreamConfig(batch_size=2, image_size=16, seed=1, threads=1, shuffle_buffer=4)
@@ -127,9 +92,7 @@ def test_training_refuses_a_damaged_tar_or_leaves_the_damaged_image_out(out: Pat
     assert left_out > 5
 
 
-def test_training_looks_at_sizes_first_and_at_every_byte_when_asked(
-    out: Path, tmp_path: Path
-) -> None:
+def test_training_checks_sizes_or_every_byte(out: Path, tmp_path: Path) -> None:
     recipe = smoke(1)
     settings = TrainSettings(
         recipe=replace(recipe, batch_size=2), shards=str(out), out=str(tmp_path / "run"), workers=0
@@ -175,9 +138,7 @@ SPOILT = [
 
 
 @pytest.mark.parametrize("what", SPOILT)
-def test_the_command_that_packed_makes_the_damaged_shard_anew(
-    what: str, packed: tuple[Path, Path], out: Path
-) -> None:
+def test_repair_by_the_packing_command(what: str, packed: tuple[Path, Path], out: Path) -> None:
     (root, whole), (shard, _) = packed, a_shard(out)
     spoil(what, out, shard)
     wrong = verify(open_shards(str(out)), workers=0)
@@ -196,9 +157,7 @@ def test_the_command_that_packed_makes_the_damaged_shard_anew(
 
 
 @pytest.mark.parametrize("what", SPOILT)
-def test_an_extended_set_is_mended_by_the_commands_that_packed_it(
-    what: str, tmp_path: Path
-) -> None:
+def test_repair_of_an_extended_set(what: str, tmp_path: Path) -> None:
     first, second, out = (
         imagery(tmp_path / "a", range(3)),
         imagery(tmp_path / "b", range(3, 6)),
@@ -224,7 +183,7 @@ def test_an_extended_set_is_mended_by_the_commands_that_packed_it(
     assert all(after[name] == data for name, data in before.items() if name.endswith(same))
 
 
-def test_imagery_that_has_changed_mends_nothing_and_spoils_nothing(tmp_path: Path) -> None:
+def test_repair_changed_imagery_leaves_the_set_alone(tmp_path: Path) -> None:
     first, second, out = (
         imagery(tmp_path / "a", range(3)),
         imagery(tmp_path / "b", range(3, 6)),
@@ -243,9 +202,7 @@ def test_imagery_that_has_changed_mends_nothing_and_spoils_nothing(tmp_path: Pat
     assert content(out) == before
 
 
-def test_a_part_of_a_table_with_damaged_pages_is_embedded_again_when_every_byte_is_asked_for(
-    out: Path, tmp_path: Path
-) -> None:
+def test_pending_shards_with_verify_finds_damaged_pages(out: Path, tmp_path: Path) -> None:
     manifest, table = read_manifest(str(out)), tmp_path / "table"
     for shard in manifest.shards:
         count = shard.samples

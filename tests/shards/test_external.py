@@ -68,7 +68,7 @@ def foreign(tmp_path: Path) -> str:
     return str(folder)
 
 
-def test_a_manifest_is_made_of_what_the_tars_hold(foreign: str) -> None:
+def test_scan_tars_describes_each_tar(foreign: str) -> None:
     manifest = open_or_scan(foreign, *TWO).manifest
     assert [(shard.name, shard.samples) for shard in manifest.shards] == [
         ("part-00", 5),
@@ -81,7 +81,7 @@ def test_a_manifest_is_made_of_what_the_tars_hold(foreign: str) -> None:
     assert open_or_scan(Path(foreign).as_uri(), *TWO).manifest.shards == manifest.shards
 
 
-def test_samples_come_with_legal_keys_their_labels_and_their_positions(foreign: str) -> None:
+def test_external_samples_have_keys_labels_and_positions(foreign: str) -> None:
     first, second = (
         list(read_samples(f"{foreign}/{name}.tar", TWO)) for name in ("part-00", "part-01")
     )
@@ -113,7 +113,7 @@ def test_samples_come_with_legal_keys_their_labels_and_their_positions(foreign: 
         ("0", {}, None, "0"),
     ],
 )
-def test_the_location_is_what_says_it_surest(
+def test_external_location_prefers_the_most_reliable_field(
     key: str, said: dict[str, object], label: bytes, location: str
 ) -> None:
     assert external_metadata(key, said, label, *TWO)["location"] == location
@@ -130,13 +130,13 @@ def test_the_location_is_what_says_it_surest(
         ({"lat": 3.0}, None),
     ],
 )
-def test_a_position_is_taken_where_it_is_plain(
+def test_external_position_of_plain_numbers(
     said: dict[str, object], geotag: dict[str, float] | None
 ) -> None:
     assert external_metadata("0", said, None, *TWO)["geotag"] == geotag
 
 
-def test_without_a_manifest_both_split_and_view_must_be_given(foreign: str, tmp_path: Path) -> None:
+def test_open_external_without_split_or_view_is_refused(foreign: str, tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"holds 2 tars and no manifest\.json: .* expected both --split and --view"
     ):
@@ -149,7 +149,7 @@ def test_without_a_manifest_both_split_and_view_must_be_given(foreign: str, tmp_
         TrainingStream(open_shards(foreign), StreamConfig())
 
 
-def test_shards_of_ours_read_as_they_did(tiny_shards: str) -> None:
+def test_open_or_scan_reads_packed_shards_as_they_are(tiny_shards: str) -> None:
     assert (
         open_or_scan(tiny_shards).manifest
         == open_or_scan(tiny_shards, *TWO).manifest
@@ -161,7 +161,7 @@ def test_shards_of_ours_read_as_they_did(tiny_shards: str) -> None:
     )
 
 
-def test_a_key_that_comes_twice_is_refused(foreign: str) -> None:
+def test_scan_tars_refuses_a_repeated_key(foreign: str) -> None:
     write(
         Path(foreign) / "part-02.tar",
         ({"__key__": f"{n:05d}", "jpg": picture(n)} for n in range(4, 6)),
@@ -172,14 +172,14 @@ def test_a_key_that_comes_twice_is_refused(foreign: str) -> None:
         open_or_scan(foreign, *TWO)
 
 
-def test_tars_whose_names_say_another_split_or_view_are_left_out(foreign: str) -> None:
+def test_scan_tars_skips_tars_of_another_view(foreign: str) -> None:
     (Path(foreign) / "part-01.tar").rename(Path(foreign) / "query-drone-000000.tar")
     assert [shard.name for shard in open_or_scan(foreign, *TWO).manifest.shards] == ["part-00"]
     found = open_or_scan(foreign, Split.QUERY, View.DRONE).manifest.shards
     assert [shard.name for shard in found] == ["part-00", "query-drone-000000"]
 
 
-def test_others_shards_are_embedded_and_done_parts_are_known_again(
+def test_external_shards_are_embedded_and_resumed(
     foreign: str, tmp_path: Path, ray_cluster: None
 ) -> None:
     def factory(threads: int) -> Encoder:

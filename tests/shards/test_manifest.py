@@ -49,7 +49,7 @@ def sample_set(root: Path) -> None:
 @pytest.mark.filterwarnings(
     "ignore::pytest.PytestUnraisableExceptionWarning"
 )  # webdataset leaves the tar open
-def test_a_shard_opens_with_webdataset_and_with_tarfile(tiny_shards: str) -> None:
+def test_shard_opens_with_webdataset_and_tarfile(tiny_shards: str) -> None:
     manifest = read_manifest(tiny_shards)
     shard = manifest.of(Split.GALLERY, View.DRONE)[0]
     path = Path(tiny_shards) / f"{shard.name}.tar"
@@ -74,7 +74,7 @@ def test_a_shard_opens_with_webdataset_and_with_tarfile(tiny_shards: str) -> Non
     assert hashlib.sha256(path.read_bytes()).hexdigest() == shard.sha256
 
 
-def test_bytes_are_copied_and_every_image_is_there_once(tiny_world: Path, tiny_shards: str) -> None:
+def test_pack_copies_every_image_once(tiny_world: Path, tiny_shards: str) -> None:
     packed = []
     for shard in read_manifest(tiny_shards).shards:
         with tarfile.open(Path(tiny_shards) / f"{shard.name}.tar") as tar:
@@ -85,13 +85,13 @@ def test_bytes_are_copied_and_every_image_is_there_once(tiny_world: Path, tiny_s
     assert sorted(packed) == sorted(source)
 
 
-def test_classes_are_the_training_locations_in_order(tiny_world: Path, tiny_shards: str) -> None:
+def test_manifest_classes_are_sorted_locations(tiny_world: Path, tiny_shards: str) -> None:
     assert list(read_manifest(tiny_shards).classes) == sorted(
         path.name for path in (tiny_world / "train/drone").iterdir()
     )
 
 
-def test_packing_again_gives_the_same_bytes_and_a_finished_set_is_left_alone(
+def test_pack_again_gives_the_same_bytes(
     tmp_path: Path, ray_cluster: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sample_set(tmp_path / "root")
@@ -109,9 +109,7 @@ def test_packing_again_gives_the_same_bytes_and_a_finished_set_is_left_alone(
         pack(University1652(), settings(tmp_path / "root", tmp_path / "a", samples_per_shard=4))
 
 
-def test_bad_files_are_refused_with_reasons_and_the_rest_is_packed(
-    tmp_path: Path, ray_cluster: None
-) -> None:
+def test_pack_rejects_bad_files_with_reasons(tmp_path: Path, ray_cluster: None) -> None:
     root = tmp_path / "root"
     sample_set(root)
     drone = root / "train/drone/0001"
@@ -136,9 +134,7 @@ def test_bad_files_are_refused_with_reasons_and_the_rest_is_packed(
     }
 
 
-def test_too_many_bad_files_stop_the_job_and_no_manifest_is_left(
-    tmp_path: Path, ray_cluster: None
-) -> None:
+def test_pack_too_many_bad_files_leaves_no_manifest(tmp_path: Path, ray_cluster: None) -> None:
     sample_set(tmp_path / "root")
     (tmp_path / "root/train/drone/0001/empty.jpeg").write_bytes(b"")
     with pytest.raises(TooManyRejected, match=r"1 of 9 images were refused.*empty file \(1\)"):
@@ -148,21 +144,21 @@ def test_too_many_bad_files_stop_the_job_and_no_manifest_is_left(
         read_manifest(str(tmp_path / "out"))
 
 
-def test_a_missing_and_an_empty_folder_are_told_apart(tmp_path: Path) -> None:
+def test_scan_missing_and_empty_folder_differ(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no folder"):
         list(University1652().scan(str(tmp_path / "nowhere")))
     with pytest.raises(InputError, match="no images below"):
         list(University1652().scan(str(tmp_path)))
 
 
-def test_street_images_come_when_asked_for(tmp_path: Path) -> None:
+def test_scan_street_images_on_request(tmp_path: Path) -> None:
     sample_set(tmp_path)
     jpeg(tmp_path / "train/street/0001/1.jpg")
     assert len([f for f in University1652().scan(str(tmp_path)) if isinstance(f, ImageRecord)]) == 8
     assert len(list(University1652(views=tuple(View)).scan(str(tmp_path)))) == 9
 
 
-def test_a_damaged_manifest_is_refused_with_the_remedy(tmp_path: Path, tiny_shards: str) -> None:
+def test_read_manifest_refuses_damage_with_the_remedy(tmp_path: Path, tiny_shards: str) -> None:
     said = json_files.read_checksummed(storage.join(tiny_shards, "manifest.json"))
     for damage in ({"schema_version": 9}, {"shards": [{"name": "x"}]}):
         json_files.write_checksummed(str(tmp_path / "manifest.json"), said | damage)
@@ -179,9 +175,7 @@ def test_a_damaged_manifest_is_refused_with_the_remedy(tmp_path: Path, tiny_shar
     ),
     st.integers(1, 9),
 )
-def test_a_plan_holds_every_image_once_in_shards_of_one_kind(
-    images: list[tuple[Split, View, int]], size: int
-) -> None:
+def test_plan_holds_every_image_once(images: list[tuple[Split, View, int]], size: int) -> None:
     records = [ImageRecord(path=f"/{n}.jpg", split=s, view=v, location="l") for s, v, n in images]
     plans, twice = plan_shards(records, ShardSize(samples_per_shard=size))
     assert not twice
@@ -194,7 +188,7 @@ def test_a_plan_holds_every_image_once_in_shards_of_one_kind(
     assert plan_shards(reversed(records), ShardSize(samples_per_shard=size))[0] == plans
 
 
-def test_a_packed_png_keeps_its_kind(tmp_path: Path, ray_cluster: None) -> None:
+def test_pack_keeps_png(tmp_path: Path, ray_cluster: None) -> None:
     path = tmp_path / "root/train/satellite/0001/0001.PNG"
     path.parent.mkdir(parents=True)
     Image.fromarray(np.zeros((8, 9, 3), np.uint8)).save(path)

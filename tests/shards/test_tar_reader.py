@@ -1,6 +1,8 @@
 """Tars as they come: whole, cut off anywhere, and hostile."""
 
 import io
+import subprocess
+import sys
 import tarfile
 from pathlib import Path
 
@@ -43,7 +45,7 @@ FOUND = [
 ]
 
 
-def test_members_are_grouped_by_their_names_and_those_of_other_endings_are_not_read(
+def test_read_tar_groups_members_and_skips_others(
     tmp_path: Path,
 ) -> None:
     (tmp_path / "x.tar").write_bytes(tar_of(MEMBERS))
@@ -51,7 +53,7 @@ def test_members_are_grouped_by_their_names_and_those_of_other_endings_are_not_r
     assert list(read_tar(str(tmp_path / "x.tar"), ("json",))) == [("a/0", {"json": b"{}"})]
 
 
-def test_long_names_and_folders_and_links_are_no_obstacle() -> None:
+def test_read_members_long_names_folders_and_links() -> None:
     long = "folder/" * 40 + "0.jpg"
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w", format=tarfile.PAX_FORMAT) as tar:
@@ -78,9 +80,7 @@ def test_long_names_and_folders_and_links_are_no_obstacle() -> None:
 @pytest.mark.parametrize(
     "name", ["/etc/0.jpg", "../0.jpg", "a/../../0.jpg", "a/..", "..\\0.jpg", "C:\\0.jpg"]
 )
-def test_a_name_that_leads_out_of_the_tar_is_refused_with_the_tars(
-    name: str, tmp_path: Path
-) -> None:
+def test_read_tar_refuses_names_that_lead_out(name: str, tmp_path: Path) -> None:
     path = tmp_path / "x.tar"
     path.write_bytes(tar_of({"0.jpg": b"x", name: b"y"}))
     with pytest.raises(
@@ -97,14 +97,14 @@ END = WHOLE.rindex(b"a caption") + 512 - WHOLE.rindex(b"a caption") % 512
 
 @settings(max_examples=200)
 @given(cut=st.integers(0, END + 511))
-def test_a_tar_that_is_cut_off_anywhere_is_seen_even_between_two_members(cut: int) -> None:
+def test_read_members_refuses_a_tar_cut_anywhere(cut: int) -> None:
     with pytest.raises(
         InputError, match=r"it\.tar is cut off or damaged after \d samples .*; copy it again"
     ):
         list(read_members(io.BytesIO(WHOLE[:cut]), "it.tar", ("jpg", "png", "webp")))
 
 
-def test_a_header_that_was_overwritten_is_not_taken_for_the_end() -> None:
+def test_read_members_refuses_an_overwritten_header() -> None:
     data = bytearray(WHOLE)
     second = WHOLE.index(b"b/0.PNG")
     data[second : second + 3] = b"???"
@@ -114,9 +114,88 @@ def test_a_header_that_was_overwritten_is_not_taken_for_the_end() -> None:
         list(read_members(io.BytesIO(data), "it.tar", ("jpg", "png", "webp")))
 
 
-def test_a_shard_of_ours_that_is_cut_off_or_hostile_is_named(
-    tiny_shards: str, tmp_path: Path
-) -> None:
+SUFFIXES = ("jpg", "png", "webp")
+
+
+def refused(data: bytes) -> str:
+    """The reason in the sentence with which a tar is refused."""
+    with pytest.raises(
+        InputError, match=r"it\.tar is cut off or damaged after \d samples"
+    ) as error:
+        list(read_members(io.BytesIO(data), "it.tar", SUFFIXES))
+    return str(error.value)
+
+
+def test_read_members_refuses_a_zeroed_header() -> None:
+    """tarfile, and so webdataset, ends at an empty header without an error."""
+    data = bytearray(WHOLE)
+    header = WHOLE.index(b"b/0.PNG")
+    data[header : header + 512] = bytes(512)
+    with tarfile.open(fileobj=io.BytesIO(data)) as tar:
+        assert len(tar.getnames()) == 4
+    assert "an empty header before its end" in refused(bytes(data))
+
+
+def test_read_members_refuses_a_tar_behind_a_tar() -> None:
+    assert "an empty header before its end" in refused(WHOLE + WHOLE)
+
+
+def test_read_members_accepts_any_padding() -> None:
+    for zeros in (512, 1024, 65_536):
+        found = read_members(io.BytesIO(WHOLE[:END] + bytes(zeros)), "it.tar", SUFFIXES)
+        assert [key for key, _ in found] == ["a/0", "b/0", "c"]
+
+
+def pax_tar(headers: dict[str, str]) -> bytes:
+    """A tar of one file behind a pax header."""
+    stream = io.BytesIO()
+    with tarfile.open(fileobj=stream, mode="w", format=tarfile.PAX_FORMAT) as tar:
+        member = tarfile.TarInfo("0.jpg")
+        member.size, member.pax_headers = 3, headers
+        tar.addfile(member, io.BytesIO(b"abc"))
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("padding", range(440, 520, 7))
+def test_read_members_refuses_sparse_across_blocks(padding: int) -> None:
+    """The keyword is found wherever the border between two blocks of the header falls."""
+    plain = pax_tar({"comment": "x" * padding})
+    [(key, members)] = read_members(io.BytesIO(plain), "it.tar", SUFFIXES)
+    assert (key, members) == ("0", {"jpg": b"abc"})
+    sparse = pax_tar({"comment": "x" * padding, "GNU.sparse.size": "200000000"})
+    assert "it holds a sparse file" in refused(sparse)
+
+
+def test_read_members_refuses_another_size_in_a_pax_header() -> None:
+    """tarfile follows this size, and the check would read other blocks as headers than it does."""
+    assert "a file larger than 8 GiB" in refused(pax_tar({"size": "1536"}))
+
+
+def test_read_members_refuses_a_name_like_gzip() -> None:
+    """tarfile would unpack it by itself, behind the check."""
+    data = bytearray(tar_of({"0.jpg": b"abc"}))
+    data[:3] = b"\x1f\x8b\x08"
+    checksum = sum(data[:148]) + sum(data[156:512]) + 8 * 32
+    data[148:156] = b"%06o\0 " % checksum
+    assert "compressed, or its first name looks like it" in refused(bytes(data))
+
+
+def test_read_members_errors_do_not_name_the_stream() -> None:
+    """webdataset appends the stream to the messages of errors."""
+    assert "GuardedTar" not in refused(WHOLE[: END - 600])
+    with pytest.raises(InputError) as error:
+        list(read_members(io.BytesIO(tar_of({"../0.jpg": b"x"})), "it.tar", SUFFIXES))
+    assert str(error.value).endswith("have it packed again with plain names")
+
+
+def test_packing_imports_neither_torch_nor_webdataset() -> None:
+    code = "import sys, pipeline.shards.pack; print({'torch', 'webdataset'} & {*sys.modules})"
+    command = [sys.executable, "-c", code]
+    found = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "set()"
+
+
+def test_read_samples_names_a_cut_shard(tiny_shards: str, tmp_path: Path) -> None:
     name = read_manifest(tiny_shards).of(Split.TRAIN, View.DRONE)[0].name
     data = (Path(tiny_shards) / f"{name}.tar").read_bytes()
     (tmp_path / f"{name}.tar").write_bytes(data[: len(data) // 2])
@@ -130,7 +209,7 @@ def test_a_shard_of_ours_that_is_cut_off_or_hostile_is_named(
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
-def test_hugging_faces_datasets_reads_a_shard_of_ours(tiny_shards: str, tmp_path: Path) -> None:
+def test_huggingface_datasets_reads_a_shard(tiny_shards: str, tmp_path: Path) -> None:
     # Optional: it brings a hundred megabytes along, for this one test.
     datasets = pytest.importorskip(
         "datasets", reason="Hugging Face datasets is not among the development dependencies"

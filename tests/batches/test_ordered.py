@@ -1,0 +1,74 @@
+"""Shards read in their order, for embedding, by key, and by other programs."""
+
+import json
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import webdataset
+
+from pipeline.batches.ordered import decode_samples
+from pipeline.images.decode import DecodeError
+from pipeline.shards.samples import read_samples
+from pipeline.shards.shard_set import open_shards
+
+# Reading for embedding and for pictures.
+
+
+def test_decode_samples_keeps_order_and_returns_errors(shards: str, tmp_path: Path) -> None:
+    with (
+        tarfile.open(Path(shards) / "train-drone-000002.tar") as old,
+        tarfile.open(tmp_path / "x.tar", "w") as new,
+    ):
+        for number, member in enumerate(old.getmembers()):
+            stream = old.extractfile(member)
+            if number == 2:  # the second sample's image, cut short
+                member.size -= 30
+            new.addfile(member, stream)
+    found = list(decode_samples(read_samples(str(tmp_path / "x.tar")), 8, threads=2, depth=4))
+    assert [held.key for held, _ in found] == [
+        held.key for held in read_samples(f"{shards}/train-drone-000002.tar")
+    ]
+    kinds = [type(image) for _, image in found]
+    assert kinds == [np.ndarray, DecodeError, *[np.ndarray] * 8]
+    assert all(image.shape == (8, 8, 3) for _, image in found if not isinstance(image, DecodeError))
+
+
+def test_fetch_returns_bytes_of_known_keys(
+    shards: str,
+) -> None:
+    wanted = [
+        "train-satellite-0003-satellite-004",
+        "train-drone-0839-drone-038",
+        "train-drone-0839-no",
+        "query-x",
+    ]
+    found = open_shards(shards).fetch(wanted)
+    assert set(found) == set(wanted[:2])
+    assert found[wanted[1]] == (Path(shards).parent / "drone-038.png").read_bytes()
+    assert open_shards(shards).fetch([]) == {}
+
+
+def test_tarfile_finds_two_members_a_sample(shards: str) -> None:
+    with tarfile.open(Path(shards) / "train-satellite-000000.tar") as tar:
+        names = tar.getnames()
+        assert {(m.mtime, m.uname, m.mode) for m in tar.getmembers()} == {(0, "root", 0o644)}
+    assert len(names) == 16
+    assert {name.rsplit(".", 1)[1] for name in names} == {"png", "json"}
+
+
+@pytest.mark.filterwarnings(
+    "ignore:unclosed file:ResourceWarning"
+)  # webdataset's own reader leaves it to the collector
+def test_plain_webdataset_opens_a_shard_of_images(shards: str) -> None:
+    dataset = webdataset.WebDataset(
+        str(Path(shards) / "train-satellite-000000.tar"), shardshuffle=False
+    )
+    found = list(dataset.decode("pil"))
+    assert len(found) == 8
+    for held in found:
+        assert held["png"].size == (9, 8)
+        assert held["json"]["key"] == held["__key__"]
+        assert json.dumps(held["json"])
+        assert held["json"]["view"] == "satellite"
