@@ -33,10 +33,13 @@ class Hit:
     """One row that a search found."""
 
     key: str
+    "Key of the gallery image."
     location: str
+    "The location that it shows."
     view: View
+    "Where it was taken from."
     lat: float | None
-    "Degrees north; None where the position is not known."
+    "Degrees north; null where the position is not known."
     lon: float | None
     "Degrees east."
     score: float

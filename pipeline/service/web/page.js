@@ -1,10 +1,10 @@
-// A photo in, the answer on the page. Nothing is loaded from elsewhere; the map is drawn from the answer's own numbers.
+// Sends a photo and shows the answer. Loads nothing from other hosts: the map is drawn from the answer's numbers.
 "use strict";
 const $ = (id) => document.getElementById(id);
-const value = (id) => $(id).value.trim().replace(",", "."); // 47,5 where people write it so
+const value = (id) => $(id).value.trim().replace(",", "."); // decimal commas: 47,5
 const FIELDS = ["lat", "lon", "radius_m", "top"];
 let photo = null;
-let asking = 0; // a newer question makes older answers stale
+let latest = 0; // number of the newest request: answers to older ones are dropped
 
 function say(text, kind) {
   $("say").textContent = text;
@@ -26,7 +26,7 @@ function take(file) {
 }
 
 async function ask() {
-  const number = ++asking;
+  const number = ++latest;
   const form = new FormData();
   form.append("photo", photo);
   for (const field of FIELDS) if (value(field)) form.append(field, value(field));
@@ -35,23 +35,23 @@ async function ask() {
   say("Looking ...", "busy");
   try {
     const response = await fetch("/locate", { method: "POST", body: form, headers: token ? { Authorization: `Bearer ${token}` } : {} });
-    const said = await response.json();
-    if (number !== asking) return;
-    if (response.ok) return show(said);
+    const body = await response.json();
+    if (number !== latest) return;
+    if (response.ok) return show(body);
     if (response.status === 401) {
       $("token-field").hidden = false;
       $("token").focus();
     }
-    say(said.error, "error");
+    say(body.error, "error");
   } catch {
-    if (number === asking) say("The service does not answer; is it still running? Try again.", "error");
+    if (number === latest) say("The service does not answer; is it still running? Try again.", "error");
   }
 }
 
 function show(answer) {
   const { position, probability, candidates } = answer;
   const place = position && `${position.lat.toFixed(6)}, ${position.lon.toFixed(6)}`;
-  say(answer.known ? `Found in ${answer.seconds.toFixed(2)} s.` : "Unknown: no place of the gallery fits well. The best guess:", answer.known ? "soft" : "unknown");
+  say(answer.known ? `Found in ${answer.seconds.toFixed(2)} s.` : "Unknown: no location of the gallery fits well. The best guess:", answer.known ? "soft" : "unknown");
   $("position").textContent = place || (candidates.length ? "No position known" : "No candidate");
   $("copy").hidden = !place;
   $("copy").textContent = "Copy position";
@@ -100,9 +100,9 @@ function distance(a, b) {
   return ((2 * 180) / Math.PI) * PER_DEGREE * Math.asin(Math.min(1, Math.sqrt(h)));
 }
 
-// The map: metres east and north of the answer, north up, as large as all candidates and the circle need.
+// The map: metres east and north of the answer, north up; its scale fits all candidates and the circle.
 const HIGH = 380, EDGE = 46;
-let drawn; // the answer on the map, to be drawn again where the window changes
+let drawn; // the answer on the map, drawn again when the window is resized
 
 function draw(answer) {
   drawn = answer;
@@ -167,14 +167,14 @@ addEventListener("resize", () => $("answer").hidden || draw(drawn));
 addEventListener("paste", (event) => take(event.clipboardData.files[0]));
 for (const kind of ["dragenter", "dragover", "dragleave", "drop"])
   addEventListener(kind, (event) => {
-    event.preventDefault(); // else the browser would leave the page for the photo
+    event.preventDefault(); // otherwise the browser opens the photo in place of the page
     $("drop").classList.toggle("over", kind === "dragenter" || kind === "dragover");
     if (kind === "drop") take(event.dataTransfer.files[0]);
   });
 fetch("/health")
   .then((response) => response.json())
   .then(({ ready, rows, fingerprint, why }) => {
-    const known = rows === undefined ? "Ready" : `${rows.toLocaleString("en")} images in the gallery, network ${fingerprint.slice(0, 12)}`;
+    const known = rows === undefined ? "Ready" : `${rows.toLocaleString("en")} images in the gallery, encoder ${fingerprint.slice(0, 12)}`;
     $("index").textContent = ready ? known : `Not ready yet${why ? `: ${why}` : ""}.`;
   })
   .catch(() => ($("index").textContent = "The service does not answer."));
