@@ -115,7 +115,8 @@ def distance_chart(title: str, rows: Sequence[Row]) -> Chart | None:
     top = math.ceil(math.log10(max(off_N[-1], 10.0)))
     within = 10.0 ** np.linspace(0, top, 121)
     shares = np.searchsorted(off_N, within, side="right") / len(off_N)
-    decades = [10.0**i for i in range(0, top + 1, 1 if top < 6 else 2)]
+    # Six labels would touch.
+    decades = [10.0**i for i in range(0, top + 1, 1 if top < 5 else 2)]
     ticks = tuple(Tick(at=each, label=format_metres(each)) for each in decades)
     points = tuple(zip(within.tolist(), shares.tolist(), strict=True))
     return Chart(
