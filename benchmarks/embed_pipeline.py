@@ -23,7 +23,8 @@ import numpy as np
 import ray
 from synthetic import jpegs
 
-from jobs.encoding.encoder import CALIBRATION_IMAGES, PROBE_IMAGES, make_encoder_spec
+from jobs.encoding.encoder import make_encoder_spec
+from jobs.encoding.probe_images import CALIBRATION_IMAGES, PROBE_IMAGES
 from jobs.encoding.settings import EncoderSettings
 from model.checkpoint import Checkpoint, dumps
 from model.config import PVDAConfig
@@ -50,7 +51,7 @@ class MeasuredEmbedder(ShardEmbedder):
         return self._device.submit(self._resident, images).result()
 
     def _resident(self, images: int) -> float:
-        size, batch = self._network.image_size, self._given.batch_size
+        size, batch = self._spec.image_size, self._job.batch_size
         bytes_BHW3 = np.random.default_rng(0).integers(0, 256, (batch, size, size, 3), np.uint8)
         begin = time.perf_counter()
         for start in range(0, images, batch):

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from model.checkpoint import build_encoder, loads
 from model.inference.embed import embed
-from pipeline.features.table import Floats, PartFooter, PartRows, write_part
+from pipeline.core.arrays import Floats
+from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.images.decode import decode
 from pipeline.index.recall import RECALL_QUERIES
 

@@ -15,8 +15,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.core.arrays import Ints
-from pipeline.features.table import Floats, PartFooter, PartRows, open_table, write_part
+from pipeline.core.arrays import Floats, Ints
+from pipeline.features.part import PartFooter, PartRows, write_part
+from pipeline.features.table import open_table
 from pipeline.retrieval.embedding_set import (
     EmbeddingSet,
     embedding_set_from_array,

@@ -21,8 +21,10 @@ from typing import Any
 import faiss
 import numpy as np
 
+from pipeline.core.arrays import Floats
 from pipeline.core.records import Split
-from pipeline.features.table import Floats, PartFooter, PartRows, open_table, write_part
+from pipeline.features.part import PartFooter, PartRows, write_part
+from pipeline.features.table import open_table
 from pipeline.index.build import build_index
 from pipeline.index.recall import RECALL_QUERIES, exact_search
 from pipeline.index.searcher import Index
@@ -195,19 +197,19 @@ def report(table: str, out: str, factory: str, args: argparse.Namespace, given: 
     start = time.perf_counter()
     metadata, anonymous, resident = in_a_process(build, settings)
     seconds = time.perf_counter() - start
-    scale = metadata["rows"] / len(given.flat_ND)
+    scale = metadata.rows / len(given.flat_ND)
     recall, rate, ratio, memory = in_a_process(search, out, given, scale)
-    label = metadata["factory"]
-    label += " + table" * (metadata["refine"] == "table") + " on disk" * metadata["on_disk"]
+    label = metadata.factory
+    label += " + table" * (metadata.refine == "table") + " on disk" * metadata.on_disk
     cells = [
         label + " (the planner)" * (name == PLANNED),
         f"{seconds:.0f} s",
         f"{anonymous / 1e9:.2f} GB",
         f"{resident / 1e9:.2f} GB",
-        f"{metadata['bytes_per_vector']:,.0f}",
+        f"{metadata.bytes_per_vector:,.0f}",
         f"{memory / 1e9:.2f} GB",
         f"{recall:.4f}",
-        f"{metadata['effort']['breadth']}, {metadata['effort']['candidates']}",
+        f"{metadata.search_params.nprobe_or_ef}, {metadata.search_params.rerank_factor}",
         f"{rate:,.0f}",
         f"{ratio:.1f} x",
     ]

@@ -1,111 +1,95 @@
-"""Photos as bytes -> embeddings that an index can be asked with: the network and the settings that
-the index was made by.
+"""Encodes photos as an index's gallery was encoded: the same network, the same encoding.
 
-In: a checkpoint's bytes, and what an index says of itself. Out: a PhotoEncoder. No one has to
-repeat with which resizer or in which precision the gallery was embedded: the index's fingerprint
-says which of all possible settings it was.
+In: a checkpoint's bytes, and fingerprint and encoding from the index's metadata. Out: a
+PhotoEncoder, whose embeddings the index can be searched with; no setting has to be repeated.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import product
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 
-from jobs.encoding.encoder import CALIBRATION_IMAGES, PROBE_IMAGES, Bytes, first_images
-from model.checkpoint import Checkpoint, build_encoder, fingerprint, loads
-from model.inference.int8 import calibration_digest, require_int8
+from jobs.encoding.encoder import digest_of, encoder_fingerprint
+from jobs.encoding.probe_images import (
+    CALIBRATION_IMAGES,
+    PROBE_IMAGES,
+    ImageBytes,
+    first_images,
+    synthetic_images,
+)
+from model.checkpoint import build_encoder, loads
+from model.inference.int8 import PrecisionError, require_int8
 from model.inference.optimise import optimise_encoder
-from model.inference.precision import EffectivePrecision, describe_preprocessing
 from pipeline.batches.ordered import stack
-from pipeline.core.arrays import Pixels
+from pipeline.core.arrays import Floats, Pixels
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import Rejection
-from pipeline.features.table import Floats
+from pipeline.features.encoding import EncodingConfig
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.inspect import inspect
-from pipeline.images.transforms import Resizer, preprocessing_name, resize
+from pipeline.images.transforms import resize
 from pipeline.shards.shard_set import open_or_scan
 
 FORWARD_BATCH = 32
-"Photos of a forward pass."
+"Photos per forward pass."
 DECODE_THREADS = 2
-"That decode; the network computes on all cores."
-
-
-@dataclass(frozen=True, kw_only=True)
-class EncodingConfig:
-    """One way to embed with a network."""
-
-    mirror: bool
-    resizer: Resizer
-    precision: EffectivePrecision
-    probe_B3HW: Bytes
-    "Images to check the encoder by."
-    calibration_B3HW: Bytes | None = None
-
-    def fingerprint(self, checkpoint: Checkpoint) -> str:
-        calibration = self.calibration_B3HW
-        digest = None if calibration is None else calibration_digest(torch.from_numpy(calibration))
-        said = f"{preprocessing_name(self.resizer)}, mirror {self.mirror}"
-        return fingerprint(checkpoint, describe_preprocessing(said, self.precision, digest))
+"The network computes on all cores beside them."
 
 
 class PhotoEncoder:
-    """The encoder that made an index's embeddings, for photos that come one by one or by the
-    hundred.
+    """The encoder that made an index's embeddings, for single photos or hundreds of them.
 
-    Not for several threads at once: torch spreads a batch over the cores itself.
+    Not thread-safe: torch spreads a batch over the cores itself.
     """
 
     def __init__(
-        self, checkpoint: bytes, name: str, index_facts: dict[str, Any], shards: str | None = None
+        self,
+        checkpoint: bytes,
+        name: str,
+        fingerprint: str,
+        encoding: EncodingConfig | None,
+        shards: str | None = None,
     ) -> None:
-        """`checkpoint` are the bytes of the file `name`, `index_facts` those of Index.facts.
+        """`checkpoint`: the bytes of the file `name`. `fingerprint`, `encoding`: of the index.
 
-        `shards` are those that the index was made of: needed only where its embeddings are int8,
-        which they calibrated. Raises CheckpointError when the bytes are no checkpoint, InputError
-        when they did not make the index.
+        `shards` are those that the index was made of: needed only where it was encoded in int8,
+        which their images calibrated. Raises CheckpointError when the bytes are no checkpoint,
+        InputError when they did not make the index.
         """
         opened = loads(checkpoint, name)
-        self.image_size = opened.network.image_size
-        self.fingerprint: str = index_facts["fingerprint"]
-        ways = candidate_configs(shards, self.image_size)
-        way = next((way for way in ways if way.fingerprint(opened) == self.fingerprint), None)
-        if way is None:
-            int8 = (
-                ""
-                if shards
-                else ", or, where it was embedded in int8, give the --shards that it was made of"
-            )
+        if encoding is None:
             raise InputError(
-                f"{name} did not make this index: none of its fingerprints is "
-                f"{self.fingerprint[:12]}..., expected the "
-                f"checkpoint that the gallery was embedded with; name that one{int8}"
+                f"the index was built of features that another program made, which {name} cannot "
+                "encode photos for; expected an index of a table of jobs/embed_gallery.py"
             )
-        self.precision: EffectivePrecision = way.precision
+        found = encoder_fingerprint(opened, encoding)
+        if found != fingerprint:
+            raise InputError(
+                f"{name} did not make this index: its fingerprint is {found[:12]} and the index's "
+                f"{fingerprint[:12]}, expected the checkpoint that the gallery was embedded with; "
+                "name that one"
+            )
+        self.fingerprint, self.encoding = fingerprint, encoding
+        self.image_size = opened.network.image_size
+        self.dimension = opened.network.embedding_dim
         self.remarks: list[str] = []
-        "What the encoder's check had to say."
-        self._resizer: Resizer = way.resizer
+        "What the check of the encoder found."
         device = "cuda" if torch.cuda.is_available() else "cpu"
-        if way.precision == "int8":
-            require_int8(device)
+        probe_B3HW, calibration_B3HW = _check_images(encoding, self.image_size, shards, device)
         encoder = build_encoder(opened).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        calibration = way.calibration_B3HW
         self._encode = optimise_encoder(
             encoder,
-            probe_B3HW=torch.from_numpy(way.probe_B3HW),
+            probe_B3HW=torch.from_numpy(probe_B3HW),
             batch_size=FORWARD_BATCH,
-            precision=way.precision,
-            mirror=way.mirror,
+            precision=encoding.precision,
+            mirror=encoding.mirror,
             compiled=False,  # compiling takes longer than some hundred photos
-            calibration_B3HW=None if calibration is None else torch.from_numpy(calibration),
+            calibration_B3HW=None
+            if calibration_B3HW is None
+            else torch.from_numpy(calibration_B3HW),
             log=self.remarks.append,
         )
-        self.dimension = opened.network.embedding_dim
 
     def encode(
         self, photos: Sequence[bytes], names: Sequence[str] | None = None
@@ -113,63 +97,57 @@ class PhotoEncoder:
         """Unit embeddings (Q, D) of the photos that can be decoded, in order, and for each photo
         None or why it has no row.
 
-        `names` are what a rejection's path says; by default the photos' numbers, from 1.
+        `names` become the rejections' paths; by default the photos' numbers, from 1.
         """
-        named = names or [f"photo {number}" for number in range(1, len(photos) + 1)]
-        opened = (
-            list(prefetch_map(self._open, photos, DECODE_THREADS, 4 * DECODE_THREADS))
-            if len(photos) > 1
-            else [*map(self._open, photos)]
-        )
+        names = names or [f"photo {number}" for number in range(1, len(photos) + 1)]
+        images: list[Pixels | DecodeError]
+        if len(photos) > 1:
+            images = list(prefetch_map(self._decode, photos, DECODE_THREADS, 4 * DECODE_THREADS))
+        else:
+            images = [*map(self._decode, photos)]
         rejected = [
             Rejection(path=name, reason=image.reason, found=image.found)
             if isinstance(image, DecodeError)
             else None
-            for name, image in zip(named, opened, strict=True)
+            for name, image in zip(names, images, strict=True)
         ]
-        whole = [image for image in opened if not isinstance(image, DecodeError)]
-        if not whole:
+        decoded = [image for image in images if not isinstance(image, DecodeError)]
+        if not decoded:
             return np.empty((0, self.dimension), np.float32), rejected
-        return self._encode(torch.from_numpy(stack(whole))).cpu().numpy(), rejected
+        return self._encode(torch.from_numpy(stack(decoded))).cpu().numpy(), rejected
 
-    def _open(self, data: bytes) -> Pixels | DecodeError:
-        """Judged by its structure first, so that no bomb and no strip is decoded."""
+    def _decode(self, data: bytes) -> Pixels | DecodeError:
+        """A photo's pixels. Its structure is inspected first, so that no decompression bomb is
+        decoded.
+        """
         try:
             inspect(data)
-            return resize(decode(data), self.image_size, self._resizer)
+            return resize(decode(data), self.image_size, self.encoding.resizer)
         except DecodeError as error:
             return error
 
 
-def candidate_configs(shards: str | None, size: int) -> Iterator[EncodingConfig]:
-    """All ways to embed, the likely ones first."""
-    precisions: tuple[EffectivePrecision, ...] = ("float32", "bfloat16")
-    resizers: tuple[Resizer, ...] = ("torch", "pillow")
-    made_B3HW = synthetic_images(size)
-    for precision, mirror, resizer in product(precisions, (True, False), resizers):
-        yield EncodingConfig(
-            mirror=mirror, resizer=resizer, precision=precision, probe_B3HW=made_B3HW
-        )
+def _check_images(
+    encoding: EncodingConfig, size: int, shards: str | None, device: str
+) -> tuple[ImageBytes, ImageBytes | None]:
+    """Images to check the encoder by, and those that calibrate int8. Raises InputError."""
+    if encoding.precision != "int8":
+        return synthetic_images(size), None
     if shards is None:
-        return
-    opened = open_or_scan(shards)
-    for resizer, mirror in product(resizers, (True, False)):
-        some_B3HW = first_images(opened, size, resizer, PROBE_IMAGES + CALIBRATION_IMAGES)
-        yield EncodingConfig(
-            mirror=mirror,
-            resizer=resizer,
-            precision="int8",
-            probe_B3HW=some_B3HW[:PROBE_IMAGES],
-            calibration_B3HW=some_B3HW[PROBE_IMAGES:],
+        raise InputError(
+            "the index was encoded in int8, which images of its shards calibrated; expected "
+            "--shards; give those that it was made of"
         )
-
-
-def synthetic_images(size: int) -> Bytes:
-    """Images (PROBES, 3, size, size) to check the encoder by before any photo is there: clouds of
-    colour, always the same.
-    """
-    rng = np.random.default_rng(0)
-    sides = [4 << number % 4 for number in range(PROBE_IMAGES)]
-    return stack(
-        [resize(rng.integers(0, 256, size=(side, side, 3), dtype=np.uint8), size) for side in sides]
-    )
+    try:
+        require_int8(device)
+    except PrecisionError as error:
+        raise InputError(str(error)) from None
+    count = PROBE_IMAGES + CALIBRATION_IMAGES
+    images_B3HW = first_images(open_or_scan(shards), size, encoding.resizer, count)
+    calibration_B3HW = images_B3HW[PROBE_IMAGES:]
+    if digest_of(calibration_B3HW) != encoding.calibration:
+        raise InputError(
+            f"the images of {shards} are not those that calibrated the index, expected the shards "
+            "that it was made of; give these as --shards"
+        )
+    return images_B3HW[:PROBE_IMAGES], calibration_B3HW

@@ -8,10 +8,10 @@ import numpy as np
 
 from jobs.encoding.photo_encoder import PhotoEncoder
 from pipeline.core import storage
+from pipeline.core.arrays import Floats
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.progress import progress
 from pipeline.core.records import Rejection
-from pipeline.features.table import Floats
 from pipeline.locate.photo_files import parent_folder, read_taken_at
 
 READ_BATCH = 128

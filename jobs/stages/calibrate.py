@@ -50,7 +50,13 @@ def calibrate_index(settings: CalibrateSettings) -> Calibration:
         console.print(f"{out} is complete; nothing to do")
         return done
     data = read_checkpoint_bytes(settings.checkpoint)
-    encoder = PhotoEncoder(data, settings.checkpoint, index.facts, settings.shards)
+    encoder = PhotoEncoder(
+        data,
+        settings.checkpoint,
+        index.metadata.fingerprint,
+        index.metadata.encoding,
+        settings.shards,
+    )
     trained_on = frozenset(loads(data, settings.checkpoint).locations)
     photos = embed_view(settings, encoder, settings.view, trained_on, settings.photos)
     overhead = embed_view(settings, encoder, settings.gallery_view, trained_on, None)
@@ -78,7 +84,7 @@ def load_if_done(
     """The calibration at `out` if it is of this index, selection of photos and criteria; else None,
     also where it is damaged or of another encoder, as it is then replaced."""
     try:
-        found = read_calibration(out, index.facts) if storage.exists(out) else None
+        found = read_calibration(out, index.metadata.fingerprint) if storage.exists(out) else None
     except InputError:
         return None
     if found is None:

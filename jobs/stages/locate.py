@@ -17,11 +17,11 @@ from jobs.encoding.queries import Query, encode_photos, merge_by_folder
 from jobs.stages.settings import LocateSettings
 from pipeline.core import storage
 from pipeline.core.errors import Incomplete, InputError
+from pipeline.core.filters import Filter
 from pipeline.core.progress import console, results
 from pipeline.core.rejections import most_common_reasons
 from pipeline.features.part import verify_part
 from pipeline.images.thumbnails import no_images
-from pipeline.index.filters import Filter
 from pipeline.index.searcher import Index
 from pipeline.locate.answer_table import answer_table
 from pipeline.locate.calibration import Calibration, find_calibration, read_calibration
@@ -46,12 +46,18 @@ def locate_photos(
     """
     photos = find_photos(settings.photos)
     checkpoint = read_checkpoint_bytes(settings.checkpoint)
-    index = Index(settings.index, whole=settings.verify or None)
-    if settings.verify and index.told.refine == "table":
-        for name in index.told.table_parts:
-            verify_part(storage.join(index.told.table, name))
+    index = Index(settings.index, verify=settings.verify or None)
+    if settings.verify and index.metadata.refine == "table":
+        for name in index.metadata.table_parts:
+            verify_part(storage.join(index.metadata.table, name))
     calibration = load_calibration(settings, index)
-    encoder = PhotoEncoder(checkpoint, settings.checkpoint, index.facts, settings.shards)
+    encoder = PhotoEncoder(
+        checkpoint,
+        settings.checkpoint,
+        index.metadata.fingerprint,
+        index.metadata.encoding,
+        settings.shards,
+    )
     gallery = read_gallery_map(index)
     queries = encode_photos(photos, encoder)
     if settings.together:
@@ -110,8 +116,8 @@ def load_calibration(settings: LocateSettings, index: Index) -> Calibration | No
     Raises InputError where it belongs to another encoder, or is missing and a track needs one.
     """
     if settings.calibration:
-        return read_calibration(settings.calibration, index.facts)
-    calibration = find_calibration(settings.index, index.facts)
+        return read_calibration(settings.calibration, index.metadata.fingerprint)
+    calibration = find_calibration(settings.index, index.metadata.fingerprint)
     if calibration is None and settings.track:
         raise InputError(
             f"no calibration beside {settings.index}, and --track weighs candidates by one; "

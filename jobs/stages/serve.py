@@ -6,7 +6,6 @@ import asyncio
 import os
 import signal
 from functools import partial
-from typing import Any
 
 import torch
 from aiohttp import web
@@ -18,7 +17,7 @@ from pipeline.core import cluster, storage
 from pipeline.core.cluster import plan_placement
 from pipeline.core.errors import InputError
 from pipeline.core.progress import console
-from pipeline.index.metadata import METADATA_FILE
+from pipeline.index.metadata import METADATA_FILE, IndexMetadata
 from pipeline.service.app import Service
 from pipeline.service.batcher import ReplicaLost
 from pipeline.service.engine import NotReady
@@ -31,10 +30,10 @@ def load_predictor(checkpoint: str, index: str, shards: str | None, threads: int
     """Load the encoder and the index; called on each replica. Raises InputError."""
     torch.set_num_threads(threads)  # FAISS takes OMP_NUM_THREADS, which Ray sets to the cores
 
-    def encoder_for(index_metadata: dict[str, Any]) -> PhotoEncoder:
+    def encoder_for(metadata: IndexMetadata) -> PhotoEncoder:
         try:
             data = storage.read_bytes(checkpoint)
-            return PhotoEncoder(data, checkpoint, index_metadata, shards)
+            return PhotoEncoder(data, checkpoint, metadata.fingerprint, metadata.encoding, shards)
         except CheckpointError as error:
             raise InputError(str(error)) from None
 

@@ -17,9 +17,9 @@ from model.inference.embed import unit_embedding
 from model.pvda import FeatureEncoder
 from pipeline.batches.ordered import Decoded, decode_samples, split_failed, stack
 from pipeline.batches.training import TrainingStream
+from pipeline.core.arrays import Floats
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.features.table import Floats
 from pipeline.retrieval.embedding_set import EmbeddingSet, embedding_set_from_array
 from pipeline.retrieval.metrics import summarise
 from pipeline.retrieval.ranking import rank

@@ -1,193 +1,189 @@
-"""Shards + encoder -> feature table: the stage. Ray actors make one Parquet part per shard; done
-parts are left as they are.
+"""Shards + encoder -> feature table: the stage, in three steps: plan, run, report.
 
 In: a set of shards, and the encoder as a factory that is called on each worker. Out: the table, the
-list of what of the shards has no row, and a summary. However often workers or the stage itself are
-killed, the table ends up with the same bytes: a part is a function of its shard, and appears whole.
+list of the images and shards that have no row, and a summary. Ray actors write one part per shard;
+a rerun skips finished parts. However often workers or the stage itself are killed, the table ends
+up with the same bytes: a part is a function of its shard and appears atomically.
 """
 
 import time
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import ray
 
 from pipeline.core import cluster, storage
-from pipeline.core import rejections as rejects
 from pipeline.core.actor_pool import ActorPool, NoWorkerStarted, PoolConfig, PoolFailed, Skipped
 from pipeline.core.cluster import Node, Placement, plan_placement
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.lock import locks_output
 from pipeline.core.progress import console, progress
-from pipeline.features import expected_parts
+from pipeline.core.rejections import most_common_reasons
 from pipeline.features.embed_worker import (
     IN_FLIGHT,
     EmbedJob,
-    Encoder,
     EncoderSpec,
     ShardEmbedder,
     ShardResult,
     TableWriteFailed,
 )
-from pipeline.features.part import (
-    REJECTED,
-    PartHeader,
-    part_names,
-    read_header,
-    read_headers,
-    verify_part,
-    write_rejected,
-)
+from pipeline.features.rejected import REJECTED
 from pipeline.features.settings import EmbeddingSettings
+from pipeline.features.table_writer import ExpectedPart, FeatureTableWriter, WrittenTable
 from pipeline.shards.manifest import Shard
 from pipeline.shards.shard_set import ShardSet, open_or_scan
 from pipeline.shards.verify import require_intact
 
-__all__ = ["EmbeddingSettings", "Encoder", "EncoderSpec", "IncompleteEmbedding", "embed_gallery"]
+
+@dataclass(frozen=True, kw_only=True)
+class EmbeddingPlan:
+    """What there is to do."""
+
+    shard_set: ShardSet
+    shards: tuple[Shard, ...]
+    "All that were requested."
+    pending: tuple[Shard, ...]
+    "Those of them without a finished part."
+    skipped: dict[str, Skipped]
+    "Names of pending shards whose tars are missing."
 
 
-class IncompleteEmbedding(Incomplete):
-    """Embedding has done what it could, and some shards could not be done. One sentence, with their
-    names.
-    """
+@dataclass(kw_only=True)
+class EmbeddingRun:
+    """What a run of the workers did."""
+
+    images: int = 0
+    skipped: dict[str, Skipped] = field(default_factory=dict)
+    "Names of shards that could not be embedded."
+    seconds: Counter[str] = field(default_factory=Counter)
+    "Of threads, by what they did: read, decode, infer, write."
 
 
-@locks_output(lambda settings, network: settings.out)
-def embed_gallery(settings: EmbeddingSettings, network: EncoderSpec) -> int:
+@locks_output(lambda settings, encoder: settings.out)
+def embed_gallery(settings: EmbeddingSettings, encoder: EncoderSpec) -> int:
     """Embed every shard that has no finished part yet; returns how many images were embedded.
 
-    `settings` must name paths that a worker can open (absolute, or URIs). Raises InputError on unusable input, Incomplete
-    where shards are unreadable or kill their workers, the others being done.
+    `settings` must name paths that a worker can open (absolute, or URIs). Raises InputError on
+    unusable input, Incomplete where shards are unreadable or kill their workers; the others are
+    done then.
     """
-    shards = open_or_scan(settings.shards, settings.split, settings.view)
-    if settings.verify and not shards.external:
-        require_intact(shards)
-    wanted = requested_shards(settings, shards)
-    missing = pending_shards(settings, network, wanted)
-    expected_parts.add_expected(settings.out, [f"{shard.name}.parquet" for shard in wanted])
-    absent = shards.missing_tars(missing)  # said now, and not when their turn comes
-    lost = {
-        name: Skipped(reason="unusable", found=f"{said}; {shards.repair_hint}")
-        for name, said in absent.items()
+    writer = FeatureTableWriter(settings.out, encoder.fingerprint, settings.dtype)
+    plan = plan_embedding(settings, writer)
+    run = run_workers(settings, encoder, plan)
+    for name, skipped in run.skipped.items():
+        writer.skip(part_name(name), skipped.reason, skipped.found)
+    report(settings, plan, run, writer.finish())
+    return run.images
+
+
+def part_name(shard: str) -> str:
+    """The file name of the part that is made of a shard."""
+    return f"{shard}.parquet"
+
+
+def plan_embedding(settings: EmbeddingSettings, writer: FeatureTableWriter) -> EmbeddingPlan:
+    """Find the shards that have no finished part.
+
+    Raises InputError when none was requested, or the table is another encoder's.
+    """
+    shard_set = open_or_scan(settings.shards, settings.split, settings.view)
+    if settings.verify and not shard_set.external:
+        require_intact(shard_set)
+    shards = requested_shards(settings, shard_set)
+    pending_parts = set(
+        writer.expect(
+            [
+                ExpectedPart(
+                    name=part_name(shard.name), shard_sha256=shard.sha256, images=shard.samples
+                )
+                for shard in shards
+            ],
+            settings.verify,
+        )
+    )
+    pending = tuple(shard for shard in shards if part_name(shard.name) in pending_parts)
+    # Reported now, and not hours later when their turn comes.
+    skipped = {
+        name: Skipped(reason="unusable", found=f"{found}; {shard_set.repair_hint}")
+        for name, found in shard_set.missing_tars(pending).items()
     }
-    embedded = 0
-    for name, aside in lost.items():
-        console.print(f"{name} is set aside ({aside.reason}): {aside.found}", style="yellow")
-    if todo := [shard for shard in missing if shard.name not in lost]:
-        cluster.connect()
-        nodes = cluster.nodes()
-        given = (settings.workers, settings.cpus_per_worker, settings.gpus_per_worker)
-        placement = plan_placement(nodes, len(todo), *given)
-        crew = ActorPool(pool_config(settings, shards, network, placement, nodes))
-        embedded, given_up = run_pool(settings, crew, todo, placement)
-        lost |= given_up
-    expected_parts.remove_expected(settings.out, [f"{name}.parquet" for name in lost])
-    storage.remove_temporaries(
-        settings.out,
-        [expected_parts.EXPECTED_PARTS, *(f"{shard.name}.parquet" for shard in wanted)],
+    for name, one in skipped.items():
+        console.print(f"{name} is skipped ({one.reason}): {one.found}", style="yellow")
+    return EmbeddingPlan(
+        shard_set=shard_set, shards=tuple(shards), pending=pending, skipped=skipped
     )
-    rejections = [
-        (header.name.removesuffix(".parquet"), one)
-        for header in read_headers(settings.out)
-        for one in header.footer.rejected
-    ]
-    listed = write_rejected(
-        settings.out,
-        [
-            *((name, one.path, one.reason, one.found) for name, one in rejections),
-            *((name, None, aside.reason, aside.found) for name, aside in lost.items()),
-        ],
-    )
-    if listed and rejections:
-        reasons = rejects.most_common_reasons(one for _, one in rejections)
-        told = f"{len(rejections)} images could not be decoded: {reasons}; see {storage.join(settings.out, REJECTED)}"
-        console.print(told, style="yellow")
-    if lost:
-        reasons = "; ".join(
-            f"{name} ({aside.reason}: {aside.found})" for name, aside in sorted(lost.items())
-        )
-        raise IncompleteEmbedding(
-            f"{len(lost)} of {len(wanted)} shards could not be embedded, expected all; the others are done; mend these and run "
-            f"the same command again: {reasons}"
-        )
-    if not missing:
-        console.print(f"{settings.out} is complete: {len(wanted)} parts; nothing to do")
-    return embedded
 
 
-def requested_shards(settings: EmbeddingSettings, shards: ShardSet) -> list[Shard]:
-    """The shards that were asked for.
+def requested_shards(settings: EmbeddingSettings, shard_set: ShardSet) -> list[Shard]:
+    """The shards of the requested split and view that have images.
 
     Raises InputError when there are none.
     """
-    manifest = shards.manifest
-    wanted = [shard for shard in manifest.of(settings.split, settings.view) if shard.samples]
-    if not wanted:
-        held = (
-            ", ".join(sorted({f"{shard.split} {shard.view}" for shard in manifest.shards}))
-            or "nothing"
-        )
+    manifest = shard_set.manifest
+    shards = [shard for shard in manifest.of(settings.split, settings.view) if shard.samples]
+    if not shards:
+        kinds = sorted({f"{shard.split} {shard.view}" for shard in manifest.shards})
         raise InputError(
-            f"{settings.shards} holds {held}, and none of it was asked for; check --split and --view"
+            f"{settings.shards} holds {', '.join(kinds) or 'nothing'}, and none of it was asked "
+            "for; check --split and --view"
         )
-    return wanted
+    return shards
 
 
-def pending_shards(
-    settings: EmbeddingSettings, network: EncoderSpec, wanted: Sequence[Shard]
-) -> list[Shard]:
-    """Those that have no finished part: one that is there, complete, and made of this very shard.
-
-    Raises InputError when the table holds another network's parts, or another kind of numbers.
-    """
-    own = {f"{shard.name}.parquet": shard for shard in wanted}
-    done = set()
-    for name in part_names(settings.out):
-        try:
-            header = read_header(storage.join(settings.out, name))
-            if settings.verify:
-                verify_part(storage.join(settings.out, name))
-        except InputError as error:
-            if name not in own:
-                raise
-            console.print(f"{error}; it is embedded again", style="yellow")
-            continue
-        check_same_encoder(settings, network, header)
-        footer, shard = header.footer, own.get(name)
-        counted = footer.rows + len(footer.rejected)
-        if shard and (footer.shard_sha256, counted) == (shard.sha256, shard.samples):
-            done.add(shard.name)
-    return [shard for shard in wanted if shard.name not in done]
-
-
-def check_same_encoder(
-    settings: EmbeddingSettings, network: EncoderSpec, header: PartHeader
-) -> None:
-    """Raise InputError where a part of the table cannot stand beside those that would be made."""
-    path, made_by = storage.join(settings.out, header.name), header.footer.fingerprint
-    if made_by != network.fingerprint:
+def run_workers(
+    settings: EmbeddingSettings, encoder: EncoderSpec, plan: EmbeddingPlan
+) -> EmbeddingRun:
+    """Embed the pending shards on an actor pool. Raises InputError, Incomplete."""
+    run = EmbeddingRun(skipped=dict(plan.skipped))
+    shards = [shard for shard in plan.pending if shard.name not in plan.skipped]
+    if not shards:
+        return run
+    cluster.connect()
+    nodes = cluster.nodes()
+    placement = plan_placement(
+        nodes, len(shards), settings.workers, settings.cpus_per_worker, settings.gpus_per_worker
+    )
+    pool = ActorPool(pool_config(settings, plan.shard_set, encoder, placement, nodes))
+    start = time.monotonic()
+    try:
+        with progress(sum(shard.samples for shard in shards), "embedding") as meter:
+            for shard, result in pool.work(shards):
+                if isinstance(result, Skipped):
+                    run.skipped[shard.name] = result
+                    meter.note(f"{shard.name} is skipped ({result.reason}): {result.found}")
+                    continue
+                assert isinstance(result, ShardResult)
+                run.seconds.update(result.seconds)
+                run.images += shard.samples
+                meter.advance(shard.samples, workers=pool.ready_workers)
+    except NoWorkerStarted as error:
         raise InputError(
-            f"{path} was made by network {made_by[:12]}, this checkpoint is {network.fingerprint[:12]}; choose another "
-            "--out, the --precision, --resizer and --mirror that it was made with, or delete the old table"
-        )
-    if header.dtype != settings.dtype:
-        raise InputError(
-            f"{path} holds {header.dtype}, --dtype is {settings.dtype}, expected one kind of numbers in a table; choose "
-            f"another --out, or --dtype {header.dtype}"
-        )
+            f"{error}; start nodes that have them, or give --cpus-per-worker, --gpus-per-worker"
+        ) from None
+    except (PoolFailed, TableWriteFailed) as error:
+        raise Incomplete(str(error)) from error
+    elapsed, spent = time.monotonic() - start, run.seconds
+    idle = max(0.0, pool.seconds - spent["infer"])
+    threads = ", ".join(f"{name} {spent[name]:.1f} s" for name in ("read", "decode", "write"))
+    console.print(
+        f"{settings.out}: {run.images} images in {elapsed:.1f} s; over {placement.workers} workers "
+        f"of {placement}: infer {spent['infer']:.1f} s, idle {idle:.1f} s, beside it {threads}"
+    )
+    return run
 
 
 def pool_config(
     settings: EmbeddingSettings,
     shards: ShardSet,
-    network: EncoderSpec,
+    encoder: EncoderSpec,
     placement: Placement,
     nodes: Sequence[Node],
 ) -> PoolConfig:
-    """How the crew works: what an actor is, and which failures are whose."""
+    """The actor pool: what an actor is, and which errors skip a shard or end the stage."""
     cpus, gpus = placement.cpus, placement.gpus
-    assignment = EmbedJob(
+    job = EmbedJob(
         shards=shards.for_workers(),
         out=settings.out,
         batch_size=settings.batch_size,
@@ -195,14 +191,14 @@ def pool_config(
         threads=cpus,
         decode_threads=settings.decode_threads or max(1, cpus - 1 if gpus else cpus // 4),
     )
-    actor: Any = ray.remote(num_cpus=cpus, num_gpus=gpus)(ShardEmbedder).options(
-        max_concurrency=IN_FLIGHT
-    )
-    shared = ray.put(network)  # the weights travel to each node once
+    remote: Any = ray.remote(num_cpus=cpus, num_gpus=gpus)(ShardEmbedder)
+    actor = remote.options(max_concurrency=IN_FLIGHT)
+    shared = ray.put(encoder)  # the weights travel to each node once
+    largest = max((node.cpus for node in nodes), default=0)
     return PoolConfig(
-        create_actor=lambda: actor.remote(assignment, shared),
+        create_actor=lambda: actor.remote(job, shared),
         size=placement.workers,
-        resources=f"{placement}, and the largest of {len(nodes)} nodes has {max((n.cpus for n in nodes), default=0):g} CPUs",
+        resources=f"{placement}, and the largest of {len(nodes)} nodes has {largest:g} CPUs",
         in_flight=IN_FLIGHT,
         skip_on=(InputError,),
         fatal=(TableWriteFailed,),
@@ -211,35 +207,23 @@ def pool_config(
     )
 
 
-def run_pool(
-    settings: EmbeddingSettings, crew: ActorPool, missing: Sequence[Shard], placement: Placement
-) -> tuple[int, dict[str, Skipped]]:
-    """Embed the missing shards; returns how many images that made, and which shards had to be set
-    aside.
-    """
-    spent, embedded, lost, start = Counter[str](), 0, dict[str, Skipped](), time.monotonic()
-    try:
-        with progress(sum(shard.samples for shard in missing), "embedding") as meter:
-            for shard, result in crew.work(missing):
-                if isinstance(result, Skipped):
-                    lost[shard.name] = result
-                    meter.note(f"{shard.name} is set aside ({result.reason}): {result.found}")
-                    continue
-                assert isinstance(result, ShardResult)
-                spent.update(result.seconds)
-                embedded += shard.samples
-                meter.advance(shard.samples, workers=crew.ready_workers)
-    except NoWorkerStarted as error:
-        raise InputError(
-            f"{error}; start nodes that have them, or give --cpus-per-worker, --gpus-per-worker"
-        ) from None
-    except (PoolFailed, TableWriteFailed) as error:
-        raise IncompleteEmbedding(str(error)) from error
-    elapsed = time.monotonic() - start
-    idle = max(0.0, crew.seconds - spent["infer"])
-    threads = ", ".join(f"{name} {spent[name]:.1f} s" for name in ("read", "decode", "write"))
-    console.print(
-        f"{settings.out}: {embedded} images in {elapsed:.1f} s; over {placement.workers} workers of {placement}: infer "
-        f"{spent['infer']:.1f} s, idle {idle:.1f} s, beside it {threads}"
-    )
-    return embedded, lost
+def report(
+    settings: EmbeddingSettings, plan: EmbeddingPlan, run: EmbeddingRun, table: WrittenTable
+) -> None:
+    """Tell what has no row. Raises Incomplete where shards were skipped."""
+    if table.list_changed and table.rejected:
+        console.print(
+            f"{len(table.rejected)} images could not be decoded: "
+            f"{most_common_reasons(table.rejected)}; see {storage.join(settings.out, REJECTED)}",
+            style="yellow",
+        )
+    if run.skipped:
+        reasons = "; ".join(
+            f"{name} ({one.reason}: {one.found})" for name, one in sorted(run.skipped.items())
+        )
+        raise Incomplete(
+            f"{len(run.skipped)} of {len(plan.shards)} shards could not be embedded, expected all; "
+            f"the others are done; repair these and run the same command again: {reasons}"
+        )
+    if not plan.pending:
+        console.print(f"{settings.out} is complete: {len(plan.shards)} parts; nothing to do")

@@ -1,9 +1,8 @@
-"""Which parts a feature table has: said before the first one is made, so that whoever opens the
-table misses none.
+"""The list of parts that a feature table is to have, recorded before the first one is written.
 
-In: names of parts. Out: `_parts.json` in the table's folder, whose underscore keeps it from readers
-that look into folders. A table without it, of others or from before there were such lists, is what
-is there.
+In: names of parts. Out: `_parts.json` in the table's folder, by which opening a table notices a
+missing part; readers that take folders skip its underscore. A table without the list, such as an
+imported one, has the parts that are there.
 """
 
 from collections.abc import Iterable
@@ -15,41 +14,42 @@ EXPECTED_PARTS = "_parts.json"
 
 
 def add_expected(table: str, names: Iterable[str]) -> None:
-    """These parts, besides those that were promised before, are the table's."""
-    known = set(_read(table, mending=True))
-    if not known.issuperset(promised := set(names)):
-        _write(table, known | promised)
+    """Add parts to the list; those that were added before stay. A damaged list is replaced."""
+    known = set(_read(table, replace_damaged=True))
+    if not known.issuperset(added := set(names)):
+        _write(table, known | added)
 
 
 def remove_expected(table: str, names: Iterable[str]) -> None:
-    """These parts are not to come: their shards could not be embedded, and that was said."""
-    if lost := set(names):
-        _write(table, set(_read(table)) - lost)
+    """Take parts off the list: their shards could not be embedded, and that was reported."""
+    if removed := set(names):
+        _write(table, set(_read(table)) - removed)
 
 
-def check_expected(table: str, there: Iterable[str]) -> None:
-    """Raise InputError where a promised part is not there."""
-    promised = set(_read(table))
-    missing = sorted(promised.difference(there))
+def check_expected(table: str, present: Iterable[str]) -> None:
+    """Raise InputError where an expected part is not present."""
+    expected = set(_read(table))
+    missing = sorted(expected.difference(present))
     if missing:
         raise InputError(
-            f"{table} lacks {len(missing)} of the {len(promised)} parts that it is to have, {missing[0]} first; run the "
-            f"embed_gallery command that fills it again, or delete {storage.join(table, EXPECTED_PARTS)} where it is meant to do without"
+            f"{table} lacks {len(missing)} of the {len(expected)} parts that it is to have, "
+            f"{missing[0]} first; run the embed_gallery command that fills it again, or delete "
+            f"{storage.join(table, EXPECTED_PARTS)} where it is meant to do without"
         )
 
 
-def _read(table: str, mending: bool = False) -> list[str]:
+def _read(table: str, replace_damaged: bool = False) -> list[str]:
     path = storage.join(table, EXPECTED_PARTS)
     if not storage.exists(path):
         return []
     try:
         return [str(name) for name in json_files.read_checksummed(path)["parts"]]
     except (KeyError, TypeError, ValueError) as error:
-        if mending:
+        if replace_damaged:
             return []
         raise InputError(
-            f"{path} is damaged ({error}), expected the list of the table's parts; run the embed_gallery command that "
-            "fills the table again, which writes it"
+            f"{path} is damaged ({error}), expected the list of the table's parts; run the "
+            "embed_gallery command that fills the table again, which writes it"
         ) from None
 
 

@@ -1,8 +1,8 @@
-"""A .mat file of features -> plain arrays, read by a process of its own: scipy's reader crashes on
-some damaged files, and a crash ends whoever reads.
+"""Reads the arrays of a .mat file in a process of its own: scipy's reader crashes on some damaged
+files, and a crash would end the calling process.
 
 In: the file's bytes. Out: the arrays that features consist of, numbers as numbers and paths as
-text; or why there are none.
+text, or an error that says why there are none.
 """
 
 import io
@@ -16,13 +16,14 @@ import numpy.typing as npt
 NUMBERS = ("gallery_f", "gallery_label", "query_f", "query_label")
 PATHS = ("gallery_path", "query_path")
 NAMES = "names"
-"Under this name the reader lists all that the file holds."
+"Under this name the reader returns the names of all arrays in the file."
 EXIT_UNREADABLE, EXIT_HDF5 = 3, 4
-"Exit codes of the reader: it says why on its error stream; the file is a MATLAB 7.3 one."
+"""Exit codes of the reader: the file cannot be read, with the reason on the error stream; it is a
+MATLAB 7.3 file."""
 
 
 class Unreadable(ValueError):
-    """A file that is no .mat file of MATLAB 5, or holds no plain arrays. The message says why."""
+    """Not a .mat file of MATLAB 5, or one without plain arrays. The message says why."""
 
 
 class IsHdf5(ValueError):
@@ -30,52 +31,50 @@ class IsHdf5(ValueError):
 
 
 def read_mat(data: bytes) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
-    """The arrays of NUMBERS and PATHS that are there, and the names of all that is.
+    """The arrays of NUMBERS and PATHS that the file has, and the names of all its arrays.
 
     Raises Unreadable, IsHdf5.
     """
     done = subprocess.run([sys.executable, __file__], input=data, capture_output=True, check=False)
     if done.returncode == EXIT_HDF5:
         raise IsHdf5
+    if done.returncode == EXIT_UNREADABLE:
+        reasons = done.stderr.decode(errors="replace").strip().splitlines()
+        raise Unreadable(reasons[-1][:300] if reasons else "the reader gave no reason")
     if done.returncode:
-        said = (
-            done.stderr.decode(errors="replace").strip().splitlines()
-            if done.returncode == EXIT_UNREADABLE
-            else []
-        )
-        raise Unreadable(said[-1][:300] if said else "the reader crashed over it")
+        raise Unreadable("the reader crashed over it")
     with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
-        found = {name: arrays[name] for name in arrays.files}
-    return found, [str(name) for name in found.pop(NAMES)]
+        read = {name: arrays[name] for name in arrays.files}
+    return read, [str(name) for name in read.pop(NAMES)]
 
 
 def main() -> int:
     """The reader: a file on standard input, the arrays in NumPy's own format on standard output."""
-    import scipy.io  # here: whoever starts this has no use for it
+    import scipy.io  # only the reader needs it
 
     try:
-        said = scipy.io.loadmat(io.BytesIO(sys.stdin.buffer.read()))
-        plain = {name: _numbers(name, said[name]) for name in NUMBERS if name in said}
-        plain |= {name: _texts(said[name]) for name in PATHS if name in said}
-        names = np.array([name for name in said if not name.startswith("__")], np.str_)
+        file = scipy.io.loadmat(io.BytesIO(sys.stdin.buffer.read()))
+        plain = {name: _numbers(name, file[name]) for name in NUMBERS if name in file}
+        plain |= {name: _texts(file[name]) for name in PATHS if name in file}
+        names = np.array([name for name in file if not name.startswith("__")], np.str_)
         np.savez(sys.stdout.buffer, **{NAMES: names}, **plain)  # type: ignore[arg-type]
-    except NotImplementedError:  # scipy's word for MATLAB 7.3
+    except NotImplementedError:  # what scipy raises for MATLAB 7.3
         return EXIT_HDF5
-    except Exception as error:  # the reader raises whatever the damage leads it to
+    except Exception as error:  # scipy raises any type over damage
         print(" ".join(str(error).split()) or type(error).__name__, file=sys.stderr)
         return EXIT_UNREADABLE
     return 0
 
 
 def _numbers(name: str, value: Any) -> npt.NDArray[Any]:
-    found = np.asarray(value)
-    if found.dtype.kind not in "fiub":
-        raise ValueError(f"{name} holds {found.dtype}, not numbers")
-    return found
+    numbers = np.asarray(value)
+    if numbers.dtype.kind not in "fiub":
+        raise ValueError(f"{name} holds {numbers.dtype}, not numbers")
+    return numbers
 
 
 def _texts(value: Any) -> npt.NDArray[np.str_]:
-    """MATLAB has no lists of text: a matrix of padded characters, or cells with one array each."""
+    """Texts of a matrix of padded characters, or of cells: MATLAB has no lists of text."""
     cells = (
         cell.item() if isinstance(cell, np.ndarray) and cell.size == 1 else cell
         for cell in np.ravel(value)

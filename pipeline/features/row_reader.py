@@ -1,10 +1,10 @@
-"""Single embeddings out of a feature table on a local disk: where in which part they stand in,
-their vectors out.
+"""Reads single embeddings from a feature table on a local disk, by part and row number.
 
-Parts are mapped into memory, so only what is asked for is read and the operating system keeps what
-is asked for often. The first time that a page is read from, all of it is, and held against its
-checksum: 65 us, once a page and reader. An index that refines its answers, or searches a few
-candidates exactly, needs no copy of the vectors. Shapes: R rows asked for, D dimensions.
+Parts are mapped into memory, so only the requested rows are read and the operating system caches
+what is requested often. The first read from a page reads all of it and compares its checksum: 65
+us, once a page and reader. An index that reranks its results, or searches a few candidates exactly,
+needs no copy of the vectors.
+Shapes: R requested rows, D dimensions, P pages, W bytes of an embedding.
 """
 
 import mmap
@@ -17,10 +17,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.core import storage
-from pipeline.core.arrays import Floats, Halves, Ints
+from pipeline.core.arrays import Floats, Halves, Ints, Mask
 from pipeline.core.errors import InputError
 from pipeline.features.parquet_pages import ColumnPages, DamagedPage, NotPlain, find_pages
-from pipeline.features.part import open_part, part_header
+from pipeline.features.part import REPAIR_HINT, open_part, part_header
 
 MAX_OPEN_PARTS = 512
 "Mapped at once: each takes a file descriptor."
@@ -32,24 +32,22 @@ class _MappedPart:
     "The whole file."
     pages: ColumnPages
     dtype: "np.dtype[np.float16] | np.dtype[np.float32]"
-    sound_P: npt.NDArray[np.bool_]
-    "Pages whose checksum was found right."
+    verified_P: Mask
+    "Pages whose checksum was compared."
 
 
 class RowReader:
-    """The embeddings of a table's parts by row number within a part. Not for several threads at
-    once.
-    """
+    """The embeddings of a table's parts by row number within a part. Not thread-safe."""
 
     def __init__(self, table: str, dimension: int) -> None:
         self._table, self._dimension = table, dimension
         self._open: OrderedDict[str, _MappedPart] = OrderedDict()
 
     def read(self, part: str, shard_sha256: str, row_R: Ints) -> Floats | Halves:
-        """Embeddings (R, D) of rows of a part, as stored, in the order asked for.
+        """Embeddings (R, D) of rows of a part, as stored, in the order of `row_R`.
 
-        `shard_sha256` is the shard that the part is of. Raises InputError where the part is gone, another's, or not stored
-        as embed_gallery stores it.
+        `shard_sha256` is the shard that the part was made of. Raises InputError where the part is
+        missing, made of another shard, or not stored as embed_gallery stores it.
         """
         mapped = self._part(part, shard_sha256)
         pages, width = mapped.pages, self._dimension * mapped.dtype.itemsize
@@ -58,36 +56,34 @@ class RowReader:
         value_R = row_R * self._dimension
         page_R = np.searchsorted(pages.first_P, value_R, side="right") - 1
         begin_R = pages.begin_P[page_R] + (value_R - pages.first_P[page_R]) * mapped.dtype.itemsize
-        whole_R = value_R + self._dimension <= end_P[page_R]
+        in_one_R = value_R + self._dimension <= end_P[page_R]
         last_R = np.searchsorted(pages.first_P, value_R + self._dimension - 1, side="right") - 1
-        self._refuse_damaged(part, mapped, page_R, last_R)
-        for row, begin in zip(
-            np.flatnonzero(whole_R).tolist(), begin_R[whole_R].tolist(), strict=True
-        ):
+        self._check_pages(part, mapped, page_R, last_R)
+        in_one = np.flatnonzero(in_one_R).tolist()
+        for row, begin in zip(in_one, begin_R[in_one_R].tolist(), strict=True):
             rows_RW[row] = mapped.bytes_N[begin : begin + width]
-        for row in np.flatnonzero(~whole_R).tolist():
+        for row in np.flatnonzero(~in_one_R).tolist():
             rows_RW[row] = self._across_pages(mapped, int(value_R[row]), int(page_R[row]))
         return rows_RW.view(mapped.dtype)
 
-    def _refuse_damaged(self, part: str, mapped: _MappedPart, first_R: Ints, last_R: Ints) -> None:
-        """Raise InputError where a page of rows that reach from a first to a last one is not what
-        was written.
+    def _check_pages(self, part: str, mapped: _MappedPart, first_R: Ints, last_R: Ints) -> None:
+        """Compare the checksums of the pages that rows reach, each from a first to a last page.
+
+        Raises InputError where one differs.
         """
-        if mapped.sound_P.all():
+        if mapped.verified_P.all():
             return
-        wanted_P = np.zeros(
-            len(mapped.sound_P) + 1, np.int32
-        )  # +1 where a row begins, -1 behind its end
-        np.add.at(wanted_P, first_R, 1)
-        np.add.at(wanted_P, last_R + 1, -1)
-        for page in np.flatnonzero((np.cumsum(wanted_P)[:-1] > 0) & ~mapped.sound_P).tolist():
+        change_P = np.zeros(len(mapped.verified_P) + 1, np.int32)
+        np.add.at(change_P, first_R, 1)  # where a row begins
+        np.add.at(change_P, last_R + 1, -1)  # behind its end
+        reached_P = np.cumsum(change_P)[:-1] > 0
+        for page in np.flatnonzero(reached_P & ~mapped.verified_P).tolist():
             try:
-                mapped.pages.refuse_damaged(mapped.bytes_N.data, page)
+                mapped.pages.verify(mapped.bytes_N.data, page)
             except DamagedPage as error:
-                raise InputError(
-                    f"{storage.join(self._table, part)} is damaged ({error}); delete it and embed its shard again"
-                ) from None
-            mapped.sound_P[page] = True
+                path = storage.join(self._table, part)
+                raise InputError(f"{path} is damaged ({error}); {REPAIR_HINT}") from None
+            mapped.verified_P[page] = True
 
     def _across_pages(self, mapped: _MappedPart, value: int, page: int) -> npt.NDArray[np.uint8]:
         """The bytes of a row that begins in one page and ends in another."""
@@ -107,15 +103,16 @@ class RowReader:
         path = storage.join(self._table, name)
         if not storage.exists(path):
             raise InputError(
-                f"the index answers by vectors of {path}, which is not there; expected the feature table where it was when "
-                "the index was built; put it back, or build the index again with jobs/build_index.py"
+                f"the index needs the vectors of {path}, which is not there; expected the feature "
+                "table where it was when the index was built; put it back, or build the index "
+                "again with jobs/build_index.py"
             )
         with open_part(path) as parquet:
             header = part_header(parquet, path)
             if header.footer.shard_sha256 != shard_sha256 or header.dimension != self._dimension:
                 raise InputError(
-                    f"{path} is no longer of the shard that the index was built from; expected an unchanged part; build the "
-                    "index again with jobs/build_index.py"
+                    f"{path} is no longer of the shard that the index was built from; expected an "
+                    "unchanged part; build the index again with jobs/build_index.py"
                 )
             mapped = _map(parquet, path, header.dtype)
         self._open[name] = mapped
@@ -125,26 +122,27 @@ class RowReader:
 
 
 def supports_row_reads(table: str) -> bool:
-    """Whether single rows can be read: of a table on this machine's disks."""
+    """Whether single rows can be read: the table must lie on this machine's disks."""
     return storage.is_local(table)
 
 
 def _map(parquet: pq.ParquetFile, path: str, dtype: str) -> _MappedPart:
-    embedding = pa.schema(parquet.schema_arrow).get_field_index(
-        "embedding"
-    )  # those before it have one column each
+    # The columns before the embedding are one Parquet column each.
+    embedding = pa.schema(parquet.schema_arrow).get_field_index("embedding")
     with open(storage.resolve(path)[1], "rb") as stream:
         data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     try:
-        kept = np.dtype(np.float16) if dtype == "float16" else np.dtype(np.float32)
-        pages = find_pages(parquet, data, embedding, kept.itemsize)
+        stored = np.dtype(np.float16) if dtype == "float16" else np.dtype(np.float32)
+        pages = find_pages(parquet, data, embedding, stored.itemsize)
     except NotPlain:
         data.close()
         raise InputError(
-            f"the embeddings of {path} are compressed, encoded or damaged, expected plain ones, as jobs/embed_gallery.py "
-            "writes them; delete it and embed its shard again"
+            f"the embeddings of {path} are compressed, encoded or damaged, expected plain ones, "
+            f"as jobs/embed_gallery.py writes them; {REPAIR_HINT}"
         ) from None
-    sound_P = np.zeros(len(pages.first_P), np.bool_)
     return _MappedPart(
-        bytes_N=np.frombuffer(data, np.uint8), pages=pages, dtype=kept, sound_P=sound_P
+        bytes_N=np.frombuffer(data, np.uint8),
+        pages=pages,
+        dtype=stored,
+        verified_P=np.zeros(len(pages.first_P), np.bool_),
     )

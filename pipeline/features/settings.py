@@ -1,11 +1,12 @@
-"""The settings of embedding and of importing features: flags of jobs/embed_gallery.py and
-jobs/import_features.py. Imports nothing heavy, so that
-the command line is parsed at once."""
+"""The settings of embedding and importing: flags of jobs/embed_gallery.py and import_features.py.
+
+Imports nothing heavy, so that the command line is parsed at once.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
 
-from pipeline.core.errors import InputError
+from pipeline.core.errors import require
 from pipeline.core.records import Split, View
 
 ViewName = Literal["drone", "satellite", "street", "google"]
@@ -20,7 +21,7 @@ class EmbeddingSettings:
     out: str
     "Folder or URI of the feature table."
     split: Split | None = None
-    "Only this split; of shards that others made, which have no manifest, what they are."
+    "Only this split; of shards without a manifest, which other programs made, the split they are."
     view: View | None = None
     "Only this view; likewise."
     batch_size: int = 32
@@ -34,24 +35,22 @@ class EmbeddingSettings:
     gpus_per_worker: float | None = None
     "GPUs of an actor; by default 1 where the cluster has any, else 0."
     decode_threads: int | None = None
-    """Threads of an actor that decode; by default its cores but one beside a GPU, else one per four
+    """Decoding threads of an actor; by default its cores but one beside a GPU, else one per four
     cores."""
     patience: float = 600.0
     "Seconds to wait for the first actor to start, before giving up."
     verify: bool = False
-    """Look at every byte of the shards first, and of the parts that are done: damaged parts are
-    embedded again."""
+    """Compare every byte of the shards, and of the parts that are done, with the checksums first:
+    damaged parts are embedded again."""
 
     def __post_init__(self) -> None:
-        if self.batch_size < 1:
-            raise InputError(f"--batch-size is {self.batch_size}, expected at least 1")
-        if self.dtype not in ("float32", "float16"):
-            raise InputError(f"--dtype is {self.dtype!r}, expected float32 or float16")
+        require(self.batch_size >= 1, "batch_size", self.batch_size, "at least 1")
+        require(self.dtype in ("float32", "float16"), "dtype", self.dtype, "float32 or float16")
         for name in ("workers", "cpus_per_worker", "decode_threads"):
-            if (value := getattr(self, name)) is not None and value < 1:
-                raise InputError(f"--{name.replace('_', '-')} is {value}, expected at least 1")
-        if self.gpus_per_worker is not None and self.gpus_per_worker < 0:
-            raise InputError(f"--gpus-per-worker is {self.gpus_per_worker}, expected 0 or more")
+            value = getattr(self, name)
+            require(value is None or value >= 1, name, value, "at least 1")
+        gpus = self.gpus_per_worker
+        require(gpus is None or gpus >= 0, "gpus_per_worker", gpus, "0 or more")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +62,6 @@ class ImportSettings:
     out: str
     "Folder for the tables: queries and gallery appear in it."
     query_view: ViewName = "drone"
-    "View of the queries, where the file holds no paths that say it."
+    "View of the queries, where the file has no paths that name it."
     gallery_view: ViewName = "satellite"
-    "View of the gallery, where the file holds no paths that say it."
+    "View of the gallery, where the file has no paths that name it."

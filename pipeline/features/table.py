@@ -1,9 +1,9 @@
-"""The feature table: a folder of Parquet parts, one per shard, that any Parquet reader opens as it
-is.
+"""The feature table: a folder of Parquet parts, one per shard, that any Parquet reader opens.
 
-In: a folder that embedding has filled. Out: its rows in blocks, all of them or a selection, for
-whoever ranks, indexes or evaluates. What is not a whole table of one network is refused. Shapes: B
-rows of a block, D dimensions of an embedding.
+In: a folder that embedding has filled. Out: its rows in blocks, all of them or those that filters
+select, for ranking, indexing and evaluation. A table that is incomplete, damaged or of more than
+one encoder is refused.
+Shapes: B rows of a block, D dimensions of an embedding.
 """
 
 import hashlib
@@ -15,89 +15,72 @@ from functools import cached_property
 from typing import Any, Literal, overload
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from pipeline.core import storage
-from pipeline.core.arrays import Floats, Halves, Strings
+from pipeline.core.arrays import Doubles, Floats, Halves, Strings
 from pipeline.core.errors import InputError
+from pipeline.core.filters import Filter
 from pipeline.core.geo import Box
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import Split, View
-from pipeline.features import expected_parts
+from pipeline.features.encoding import EncodingConfig
+from pipeline.features.expected_parts import check_expected
 from pipeline.features.part import (
     READERS,
     PartFooter,
     PartHeader,
-    PartRows,
     check_consistent_parts,
     open_part,
     parse_split_and_view,
     part_header,
     part_names,
-    part_schema,
-    read_footer,
     validate_rows,
+    vector_lengths,
     verify_part,
-    write_part,
 )
-from pipeline.features.selection import Selection
-
-__all__ = [
-    "Box",
-    "FeatureTable",
-    "Floats",
-    "Labels",
-    "PartFooter",
-    "PartRows",
-    "Strings",
-    "open_table",
-    "part_names",
-    "part_schema",
-    "read_footer",
-    "verify_table",
-    "write_part",
-]
+from pipeline.features.row_groups import matching_row_groups
+from pipeline.features.unique_keys import check_unique_keys
 
 BLOCK_BYTES = 64 * 2**20
-"Of a block as float32, where its rows are not said."
-TOLERANCE = 0.01
-"Of an embedding's length: what float16 and rounding take."
+"Of a block as float32, where its number of rows is not given."
 UNIQUE_CHECK_ROWS = 1_000_000
-"""Rows up to which opening looks whether a key repeats, a third of a second; `verify_table` does for any
-number."""
+"""Rows up to which opening checks that keys are unique, a third of a second; `verify_table` checks
+any number."""
 Counts = Counter[tuple[Split, View]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Labels:
-    """What is known of each row besides its embedding; equal lengths, in the table's order."""
+    """A row's columns besides its embedding; equal lengths, in the table's order."""
 
     keys: Strings
     locations: Strings
-    lats: npt.NDArray[np.float64]
+    lats: Doubles
     "NaN where unknown."
-    lons: npt.NDArray[np.float64]
+    lons: Doubles
 
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureTable:
-    """A feature table, or the rows of it that were selected. Opened by `open_table`; embeddings are
-    read in blocks.
+    """A feature table, or a selection of its rows. Opened by `open_table`; embeddings are read in
+    blocks.
     """
 
     path: str
     fingerprint: str
-    "Of the network that made every row."
+    "Of the encoder that made every row."
+    encoding: EncodingConfig | None
+    "How it encoded the images; None for features that another program made."
     dimension: int
     dtype: str
     "Of the stored embeddings: float32 or float16."
     parts: tuple[str, ...]
     footers: tuple[PartFooter, ...]
     counts: dict[tuple[Split, View], int]
-    "Rows of each split and view that the whole table holds, whatever is selected."
-    selections: tuple[Selection, ...] = ()
-    "A row is meant when all of them mean it."
+    "Rows of each split and view in the whole table, whatever is selected."
+    filters: tuple[Filter, ...] = ()
+    "A row is selected when all of them match it."
 
     def select(
         self,
@@ -106,89 +89,88 @@ class FeatureTable:
         locations: str | Iterable[str] | None = None,
         box: Box | None = None,
     ) -> "FeatureTable":
-        """Of these rows, those of a split, a view, one or several locations, a rectangle of
-        positions (None: any).
+        """Those of these rows that have the split, the view, one of the locations and a position in
+        the rectangle (None: any).
         """
-        named = frozenset([locations]) if isinstance(locations, str) else locations
-        meant = Selection(
-            split=split, view=view, locations=None if named is None else frozenset(named), box=box
-        )
-        return replace(self, selections=(*self.selections, meant)) if meant != Selection() else self
+        if locations is not None:
+            locations = frozenset([locations] if isinstance(locations, str) else locations)
+        added = Filter(split=split, view=view, locations=locations, box=box)
+        return replace(self, filters=(*self.filters, added)) if added != Filter() else self
 
     @cached_property
     def rows(self) -> int:
-        """How many are selected."""
-        if any(meant.columns - {"split", "view"} for meant in self.selections):
+        """Number of selected rows."""
+        if self._filter_columns - {"split", "view"}:
             return sum(len(rows) for _, rows in self._read(["split"]))
-        return sum(count for _, count in self._kinds())
+        return sum(count for _, count in self._selected_counts())
 
     @property
     def digest(self) -> str:
-        """Hash of what the whole table holds, from its parts' footers: the same for a copy
-        elsewhere.
-        """
-        said = [[footer.fingerprint, footer.shard_sha256, footer.rows] for footer in self.footers]
-        return hashlib.sha256(
-            json.dumps([self.dimension, list(self.parts), said]).encode()
-        ).hexdigest()
+        """Hash of the whole table's content, from its footers: the same for a copy elsewhere."""
+        footers = [[one.fingerprint, one.shard_sha256, one.rows] for one in self.footers]
+        content = json.dumps([self.dimension, list(self.parts), footers])
+        return hashlib.sha256(content.encode()).hexdigest()
 
     @property
     def shards(self) -> dict[str, str]:
-        """Of each part the hash of the shard that was embedded, in the table's order."""
-        return {
-            name: footer.shard_sha256 for name, footer in zip(self.parts, self.footers, strict=True)
-        }
+        """For each part the hash of the shard that was embedded, in the table's order."""
+        return {name: footer.shard_sha256 for name, footer in self._footer_of.items()}
 
     @property
     def views(self) -> list[View]:
-        """The views that rows of the selected splits and views have."""
-        return sorted({view for view, _ in self._kinds()})
+        """The views that occur in the selected splits and views."""
+        return sorted({view for view, _ in self._selected_counts()})
 
-    def _kinds(self) -> Iterator[tuple[View, int]]:
-        """View and count of the splits and views that are selected."""
+    def _selected_counts(self) -> Iterator[tuple[View, int]]:
+        """View and count of the splits and views that the filters select."""
         for (split, view), count in self.counts.items():
-            if all(
-                one.split in (None, split) and one.view in (None, view) for one in self.selections
-            ):
+            if all(one.split in (None, split) and one.view in (None, view) for one in self.filters):
                 yield view, count
+
+    @property
+    def _filter_columns(self) -> set[str]:
+        return {column for one in self.filters for column in one.columns}
 
     def labels(self) -> Labels:
         """Keys, locations and positions of all selected rows."""
         columns = ["key", "location", "lat", "lon"]
         tables = [rows for _, rows in self._read(columns)]
-        whole = pa.concat_tables(tables) if tables else pa.table({name: [] for name in columns})
+        rows = pa.concat_tables(tables) if tables else pa.table({name: [] for name in columns})
         return Labels(
-            keys=np.asarray(whole["key"].to_pylist(), dtype=np.str_),
-            locations=np.asarray(whole["location"].to_pylist(), dtype=np.str_),
-            lats=np.asarray(whole["lat"].to_numpy(), dtype=np.float64),
-            lons=np.asarray(whole["lon"].to_numpy(), dtype=np.float64),
+            keys=np.asarray(rows["key"].to_pylist(), dtype=np.str_),
+            locations=np.asarray(rows["location"].to_pylist(), dtype=np.str_),
+            lats=np.asarray(rows["lat"].to_numpy(), dtype=np.float64),
+            lons=np.asarray(rows["lon"].to_numpy(), dtype=np.float64),
         )
 
-    def only(self, parts: Sequence[str]) -> "FeatureTable":
+    def keys(self) -> Iterator[tuple[str, list[str]]]:
+        """The selected rows' keys in pieces, each with the part that it is from."""
+        for part, rows in self._read(["key"]):
+            yield part, rows["key"].to_pylist()
+
+    def with_parts(self, parts: Sequence[str]) -> "FeatureTable":
         """The same selection of some parts alone, in this order. `counts`, and with it `rows`,
         remain the whole table's.
         """
-        return replace(
-            self, parts=tuple(parts), footers=tuple(self._footer_of[name] for name in parts)
-        )
+        footers = tuple(self._footer_of[name] for name in parts)
+        return replace(self, parts=tuple(parts), footers=footers)
 
     @cached_property
     def _footer_of(self) -> dict[str, PartFooter]:
         return dict(zip(self.parts, self.footers, strict=True))
 
-    def numbered(self, columns: Sequence[str]) -> Iterator[tuple[str, pa.Table]]:
-        """Per part that holds selected rows: its name and their columns, first `part_row`, a row's
+    def numbered_rows(self, columns: Sequence[str]) -> Iterator[tuple[str, pa.Table]]:
+        """Per part that has selected rows: its name and their columns, first `part_row`, a row's
         number within the part.
         """
-        tests = set().union(*(meant.columns for meant in self.selections))
+        wanted = sorted({*columns, *self._filter_columns})
         for part in self.parts:
             with open_part(storage.join(self.path, part)) as parquet:
-                found = validate_rows(parquet.read(columns=sorted({*columns, *tests})))
-            found = found.append_column("part_row", pa.array(np.arange(len(found), dtype=np.int32)))
-            for meant in self.selections:
-                found = found.filter(meant.mask(found))
-            if len(found):
-                yield part, found.select(["part_row", *columns])
+                rows = validate_rows(parquet.read(columns=wanted))
+            rows = rows.append_column("part_row", pa.array(np.arange(len(rows), dtype=np.int32)))
+            rows = self._apply_filters(rows)
+            if len(rows):
+                yield part, rows.select(["part_row", *columns])
 
     @overload
     def blocks(
@@ -208,72 +190,71 @@ class FeatureTable:
     ) -> Iterator[Any]:
         """Embeddings of the selected rows as arrays (B, D), B <= rows, in the order of `labels`.
 
-        No more than a block is in memory; without `rows` it has 64 MiB at most. `dtype` may be
-        `stored`: as the parts have them. Raises InputError where an embedding is NaN or not of unit
+        One block at a time is in memory; without `rows` it has 64 MiB at most. With the dtype
+        "stored" it is that of the parts. Raises InputError where an embedding is NaN or not of unit
         length.
         """
         wanted = self.dtype if dtype == "stored" else dtype
-        for part, found in self._read(["embedding"], rows):
-            flat = found["embedding"].combine_chunks().flatten().to_numpy(zero_copy_only=False)
+        for part, piece in self._read(["embedding"], rows):
+            flat = piece["embedding"].combine_chunks().flatten().to_numpy(zero_copy_only=False)
             block_BD = flat.reshape(-1, self.dimension)
             single_BD = block_BD.astype(np.float32, copy=False)
-            self._refuse_lengths(part, np.sqrt(np.einsum("bd,bd->b", single_BD, single_BD)))
+            self._check_unit_length(part, single_BD)
             yield single_BD if wanted == "float32" else block_BD.astype(wanted, copy=False)
 
     def embeddings(self) -> Floats:
         """All selected embeddings at once, float32 (rows, D)."""
         return np.concatenate([np.empty((0, self.dimension), np.float32), *self.blocks()])
 
-    def _refuse_lengths(self, part: str, length_B: Floats) -> None:
-        unit_B = np.abs(length_B - 1) <= TOLERANCE  # false of a NaN
+    def _check_unit_length(self, part: str, vectors_BD: Floats) -> None:
+        length_B, unit_B = vector_lengths(vectors_BD)
         if not unit_B.all():
             raise InputError(
-                f"{storage.join(self.path, part)} holds {np.count_nonzero(~unit_B)} embeddings like one of length "
-                f"{length_B[np.argmin(unit_B)]:.4g}, expected unit length; delete this part and embed its shard again"
+                f"{storage.join(self.path, part)} holds {np.count_nonzero(~unit_B)} embeddings "
+                f"like one of length {length_B[np.argmin(unit_B)]:.4g}, expected unit length; "
+                "delete this part and embed its shard again"
             )
 
     def _read(self, columns: list[str], rows: int | None = None) -> Iterator[tuple[str, pa.Table]]:
         """The selected rows' columns in pieces, each with the part that it is from."""
         rows = rows or max(1, BLOCK_BYTES // (4 * self.dimension))
-        tests = set().union(*(meant.columns for meant in self.selections))
+        wanted = sorted({*columns, *self._filter_columns})
         for part in self.parts:
             with open_part(storage.join(self.path, part)) as parquet:
-                groups = [
-                    group
-                    for group in range(parquet.num_row_groups)
-                    if all(meant.may_hold(parquet, group) for meant in self.selections)
-                ]
-                for batch in parquet.iter_batches(rows, groups, columns=sorted({*columns, *tests})):
-                    found = validate_rows(pa.Table.from_batches([batch]))
-                    for meant in self.selections:
-                        found = found.filter(meant.mask(found))
-                    if len(found):
-                        yield part, found.select(columns)
+                groups = matching_row_groups(parquet, self.filters)
+                for batch in parquet.iter_batches(rows, groups, columns=wanted):
+                    piece = self._apply_filters(validate_rows(pa.Table.from_batches([batch])))
+                    if len(piece):
+                        yield part, piece.select(columns)
+
+    def _apply_filters(self, rows: pa.Table) -> pa.Table:
+        for one in self.filters:
+            rows = rows.filter(pa.array(one.mask(rows)))
+        return rows
 
 
 def open_table(path: str) -> FeatureTable:
     """Open a feature table.
 
-    Raises InputError when there is none, when a part is missing, torn or another's, when the parts
-    come from different networks or hold different numbers, and when a key is there twice (looked
-    for in tables of up to KEYS_AT_OPENING rows).
+    Raises InputError when there is none, when a part is missing, damaged or no part, when the parts
+    come from different encoders or have different vectors, and when a key is not unique (checked in
+    tables of up to UNIQUE_CHECK_ROWS rows).
     """
     table = _open(path)
     if table.rows <= UNIQUE_CHECK_ROWS:
-        _check_unique_keys(table)
+        check_unique_keys(path, table.keys)
     return table
 
 
 def verify_table(path: str) -> FeatureTable:
-    """`open_table`, and every byte and row is looked at: keys there once, embeddings of unit
-    length. Takes 8 bytes a row.
+    """`open_table` with a check of every byte and row: keys unique, embeddings of unit length.
 
-    Raises InputError, naming the part, where they are not.
+    Takes 8 bytes of memory a row. Raises InputError, naming the part, where a check fails.
     """
     for name in part_names(path):
         verify_part(storage.join(path, name))
     table = _open(path)
-    _check_unique_keys(table)
+    check_unique_keys(path, table.keys)
     for _ in table.blocks(dtype="stored"):
         pass
     return table
@@ -283,22 +264,24 @@ def _open(path: str) -> FeatureTable:
     names = part_names(path)
     if not names:
         raise InputError(
-            f"no feature table at {path}: found no Parquet part; make one with jobs/embed_gallery.py"
+            f"no feature table at {path}: found no Parquet part; make one with "
+            "jobs/embed_gallery.py"
         )
-    expected_parts.check_expected(path, names)
-    found = list(
-        prefetch_map(lambda name: _open_one(storage.join(path, name)), names, READERS, 4 * READERS)
-    )
-    headers = [header for header, _ in found]
+    check_expected(path, names)
+    paths = [storage.join(path, name) for name in names]
+    opened = list(prefetch_map(_open_one, paths, READERS, 4 * READERS))
+    headers = [header for header, _ in opened]
     check_consistent_parts(path, headers)
+    first = headers[0]
     return FeatureTable(
         path=path,
-        fingerprint=headers[0].footer.fingerprint,
-        dimension=headers[0].dimension,
-        dtype=headers[0].dtype,
+        fingerprint=first.footer.fingerprint,
+        encoding=first.footer.encoding,
+        dimension=first.dimension,
+        dtype=first.dtype,
         parts=tuple(names),
         footers=tuple(header.footer for header in headers),
-        counts=dict(sum((counts for _, counts in found), Counts())),
+        counts=dict(sum((counts for _, counts in opened), Counts())),
     )
 
 
@@ -306,29 +289,7 @@ def _open_one(path: str) -> tuple[PartHeader, Counts]:
     counts: Counts = Counter()
     with open_part(path) as parquet:
         header = part_header(parquet, path)
-        table = validate_rows(parquet.read(columns=["split", "view"])).unify_dictionaries()
-    for row in table.group_by(["split", "view"]).aggregate([([], "count_all")]).to_pylist():
+        rows = validate_rows(parquet.read(columns=["split", "view"])).unify_dictionaries()
+    for row in rows.group_by(["split", "view"]).aggregate([([], "count_all")]).to_pylist():
         counts[parse_split_and_view(path, row["split"], row["view"])] += row["count_all"]
     return header, counts
-
-
-def _check_unique_keys(table: FeatureTable) -> None:
-    """Raise InputError where a key is there twice. Keys are compared by 64-bit hashes, and those
-    that agree by themselves.
-    """
-    hashes = [np.empty(0, np.int64)]
-    for _, rows in table._read(["key"]):
-        hashes.append(np.fromiter(map(hash, rows["key"].to_pylist()), np.int64, len(rows)))
-    hash_N = np.sort(np.concatenate(hashes))
-    twice = set(hash_N[1:][hash_N[1:] == hash_N[:-1]].tolist())
-    seen: dict[str, str] = {}
-    for part, rows in table._read(["key"]) if twice else ():
-        for key in rows["key"].to_pylist():
-            if hash(key) not in twice:
-                continue
-            if key in seen:
-                raise InputError(
-                    f"{storage.join(table.path, part)} holds key {key}, which {seen[key]} holds too, expected keys that are "
-                    "there once; keep the parts of one data set only, and embed others into a folder of their own"
-                )
-            seen[key] = part

@@ -1,8 +1,8 @@
-"""An index spread over a cluster: Ray actors hold some of its parts each and answer a query
-together.
+"""An index spread over a cluster: each Ray actor opens some of its parts, and all answer a query.
 
-The same questions and answers as pipeline/index/searcher.py's Index, which it is made of.
-Shapes: Q queries, K rows wanted, D dimensions.
+Searches return the same hits as those of pipeline/index/searcher.py's Index, which each actor has
+one of.
+Shapes: Q queries, K wanted rows, D dimensions.
 """
 
 from typing import Any
@@ -12,34 +12,34 @@ import pyarrow as pa
 import ray
 
 from pipeline.core import cluster, storage
-from pipeline.core.arrays import Ints
+from pipeline.core.arrays import Floats, Ints
 from pipeline.core.errors import InputError
-from pipeline.features.table import Floats
-from pipeline.index.filters import Filter
-from pipeline.index.metadata import SearchParams, metadata_dict, read_metadata
+from pipeline.core.filters import Filter
+from pipeline.index.metadata import SearchParams, read_metadata
 from pipeline.index.part import NO_ROW
 from pipeline.index.searcher import Hit, Index, make_hits, merge_results
 
 PartResult = tuple[Floats, Ints, pa.Table]
+"Scores and row numbers (Q, K), and the ids of these rows."
 
 
 class DistributedIndex:
-    """An index whose parts are held by actors. Closing it, or leaving its `with`, ends them."""
+    """An index whose parts are opened by actors. Closing it, or leaving its `with`, ends them."""
 
     def __init__(self, path: str, actors: int, cores: int = 1) -> None:
-        """`cores`: of each actor. More actors than parts are not made: a part is the smallest piece
-        that an actor can hold.
+        """`cores`: of each actor. There are at most as many actors as parts, for an actor opens
+        whole parts.
 
         Raises InputError when there is no index at `path`, or it is damaged.
         """
-        told = read_metadata(path)
-        self.facts = metadata_dict(told)
-        self.dimension = told.dimension
+        self.metadata = read_metadata(path)
+        self.dimension = self.metadata.dimension
         cluster.connect()
-        kind: Any = ray.remote(num_cpus=cores)(_PartServer)
-        shares = np.array_split(np.arange(len(told.parts)), min(actors, len(told.parts)))
+        remote: Any = ray.remote(num_cpus=cores)(_PartServer)
+        parts = len(self.metadata.parts)
+        shares = np.array_split(np.arange(parts), min(actors, parts))
         self._actors = [
-            kind.remote(storage.absolute(path), share.tolist(), cores) for share in shares
+            remote.remote(storage.absolute(path), share.tolist(), cores) for share in shares
         ]
         self._counts = [actor.rows.remote() for actor in self._actors]
         try:
@@ -55,7 +55,7 @@ class DistributedIndex:
         self.close()
 
     def __len__(self) -> int:
-        """Rows that may answer."""
+        """Rows that a search can return."""
         return self._rows
 
     def close(self) -> None:
@@ -68,23 +68,19 @@ class DistributedIndex:
         queries_QD: Floats,
         k: int = 10,
         where: Filter | None = None,
-        effort: SearchParams | None = None,
+        params: SearchParams | None = None,
     ) -> list[list[Hit]]:
-        """As `Index.search`. Every actor searches its parts at the same time."""
+        """As `Index.search`. All actors search their parts at the same time."""
         queries = ray.put(np.ascontiguousarray(queries_QD, np.float32))
-        found: list[PartResult] = _get(
-            [actor.search.remote(queries, k, where, effort) for actor in self._actors]
+        results: list[PartResult] = _get(
+            [actor.search.remote(queries, k, where, params) for actor in self._actors]
         )
-        scores_QK, rows_QK = merge_results([(scores, rows) for scores, rows, _ in found], k)
-        names = pa.concat_tables([names for _, _, names in found])
-        at = {
-            row: place
-            for place, row in enumerate(
-                row for _, rows, _ in found for row in rows[rows != NO_ROW].tolist()
-            )
-        }
-        wanted = [at[row] for row in rows_QK[rows_QK != NO_ROW].tolist()]
-        return make_hits(scores_QK, rows_QK, names.take(pa.array(wanted, pa.int64())))
+        scores_QK, rows_QK = merge_results([(scores, rows) for scores, rows, _ in results], k)
+        ids = pa.concat_tables([ids for _, _, ids in results])
+        all_rows = (row for _, rows, _ in results for row in rows[rows != NO_ROW].tolist())
+        position = {row: number for number, row in enumerate(all_rows)}
+        wanted = [position[row] for row in rows_QK[rows_QK != NO_ROW].tolist()]
+        return make_hits(scores_QK, rows_QK, ids.take(pa.array(wanted, pa.int64())))
 
 
 class _PartServer:
@@ -92,30 +88,31 @@ class _PartServer:
 
     def __init__(self, path: str, parts: list[int], threads: int) -> None:
         self._index: Index | None = None
-        self._refusal: InputError | None = None
+        self._error: InputError | None = None
         try:
             self._index = Index(path, parts, threads)
-        except InputError as error:  # raised here it would reach the caller as a death of the actor
-            self._refusal = error
+        except InputError as error:  # raised here, the caller would see a dead actor
+            self._error = error
 
     def rows(self) -> int:
         return len(self._opened())
 
     def search(
-        self, queries_QD: Floats, k: int, where: Filter | None, effort: SearchParams | None
+        self, queries_QD: Floats, k: int, where: Filter | None, params: SearchParams | None
     ) -> PartResult:
-        scores_QK, rows_QK = self._opened().search_rows(queries_QD, k, where, effort)
-        return scores_QK, rows_QK, self._opened().names(rows_QK)
+        index = self._opened()
+        scores_QK, rows_QK = index.search_rows(queries_QD, k, where, params)
+        return scores_QK, rows_QK, index.ids_of(rows_QK)
 
     def _opened(self) -> Index:
         if self._index is None:
-            raise self._refusal or AssertionError("an index or a refusal")
+            raise self._error or AssertionError("an index or an error")
         return self._index
 
 
-def _get(answers: list[Any]) -> Any:
-    """What actors answer; an InputError of theirs as the sentence that it is."""
+def _get(results: list[Any]) -> Any:
+    """The actors' results. An InputError of an actor is raised as itself."""
     try:
-        return ray.get(answers)
+        return ray.get(results)
     except ray.exceptions.RayTaskError as error:
         raise error.cause from None

@@ -1,8 +1,8 @@
-"""Which FAISS index suits a gallery: rows, dimension, memory and wanted recall in, a factory string
-and its reasons out. Pure.
+"""Chooses the FAISS index of a gallery: rows, dimension, memory and wanted recall in, a factory
+string with its reason out. A pure function.
 
-The families stand from the fastest to the slowest, as `benchmarks/index.py` measures them
-(docs/results.md). The first that fits the memory and is known to reach the recall is taken; where
+FAMILIES are ordered from the fastest to the slowest, as `benchmarks/index.py` measures them
+(docs/results.md). The first that fits the memory and is known to reach the recall is chosen; where
 none reaches it, the one that comes nearest.
 """
 
@@ -23,22 +23,24 @@ PROCESS_BYTES = 300e6
 BLOCK_BYTES = 4 * 64e6
 "Blocks of the table on their way into the index, and FAISS's own copies of them."
 MASK_BYTES = 1.125
-"""Of a row while a filter is looked at: a truth value and a bit. Names and positions are mapped
-from the disk."""
+"""Of a row while a filter is applied: a boolean and a bit. Ids and positions are mapped from the
+disk."""
 TRAINING_SHARE = 0.25
 "Of the memory, for the rows that an index is trained on."
 TRAINING_COPIES = 1.75
 "FAISS's residuals and reduced copies of them, the rows themselves included."
 MERGE_FACTOR = 1.3
-"Of the codes, what merging them and reading them back took, as measured with lists of 8-bit codes."
+"Multiple of the codes that merging them and reading them back took, with lists of 8-bit codes."
 MAX_TRAINING_ROWS = 2_000_000
-ROWS_PER_LIST = 50  # that train a centroid: FAISS warns below 39 and uses no more than 256
+ROWS_PER_LIST = 50
+"That train a centroid: FAISS warns below 39 and uses no more than 256."
 UNIT_SHARE = 1 / 16
-"Of the memory, for the codes of one unit of work; while lists grow they take twice that."
+"Of the memory, for the codes of one work unit; while lists grow they take twice that."
 MIN_UNIT_ROWS = 20_000
 PART_SHARE = 1 / 3
 "Of the memory, for merging a part of an index whose lists then stay on the disk."
-SUBQUANTISER_DIM = 8  # dimensions of a 4-bit subquantiser: 256 of them at 2,048 dimensions
+SUBQUANTISER_DIM = 8
+"Dimensions of a 4-bit subquantiser: 256 subquantisers at 2,048 dimensions."
 RERANK_FACTOR = 10
 "Candidates per wanted row whose vectors are read from the table."
 Refine = Literal["none", "table"]
@@ -46,7 +48,7 @@ Refine = Literal["none", "table"]
 
 @dataclass(frozen=True, kw_only=True)
 class GallerySpec:
-    """What is to be indexed, and within what."""
+    """What is to be indexed, and within which limits."""
 
     rows: int
     dimension: int
@@ -64,7 +66,7 @@ class GallerySpec:
 
 @dataclass(frozen=True, kw_only=True)
 class IndexPlan:
-    """How to build, what it will take, and why."""
+    """How to build an index, what it will take, and why this one."""
 
     factory: str
     "As `faiss.index_factory` reads it."
@@ -75,14 +77,14 @@ class IndexPlan:
     training_rows: int
     "0: nothing is trained."
     unit_rows: int
-    "Rows of a unit of work: built alone, then merged with the others."
+    "Rows of a work unit: built alone, then merged with the others."
     part_rows: int
     "Rows of a part of the index: more than one part where the lists stay on the disk."
     search_bytes: float
     build_bytes: float
     expected_recall: float
-    "Recall@10 that is reached once the breadth is tuned."
-    why: str
+    "Recall@10 that is reached once the search parameters are tuned."
+    reason: str
 
     @property
     def bytes(self) -> float:
@@ -98,18 +100,18 @@ class _IndexFamily:
     form: str
     "Factory string with {lists} and {pieces}, the subquantisers."
     ceiling: float
-    "Recall@10 that is reached with enough breadth: what quantisation leaves."
+    "Recall@10 that the most thorough search reaches: what quantisation leaves."
     refine: Refine = "none"
     on_disk: bool = False
     graph: bool = False
     "Built in one piece, for FAISS cannot merge graphs."
     merging: float = MERGE_FACTOR
-    "Its codes' room, while units become one, as a multiple of the codes: appended ones double."
+    "Memory of its codes while units are merged, as a multiple of the codes: appended ones double."
     reduces: bool = False
     "Whether it is used behind a projection onto the leading directions, or without one."
 
     def code_bytes(self, dimension: int) -> float:
-        """Of one row's code with its id or its links."""
+        """Size of one row's code with its id or its links."""
         return {
             "Flat": 4.0 * dimension,
             "HNSW32,SQ8": dimension + 4.0 * 2 * 32 + 24,
@@ -141,15 +143,16 @@ EXACT = _IndexFamily(name="Flat", form="Flat", ceiling=1.0, merging=2)
 def plan_index(gallery: GallerySpec) -> IndexPlan:
     """The plan for a gallery.
 
-    Raises InputError where no family fits the memory, with what would.
+    Raises InputError, with the memory that would do, where no family fits the budget.
     """
-    found = list(_plans(gallery))
-    fitting = [plan for plan in found if plan.bytes <= gallery.budget]
+    plans = list(_plans(gallery))
+    fitting = [plan for plan in plans if plan.bytes <= gallery.budget]
     if not fitting:
-        least = min(found, key=lambda plan: plan.bytes)
+        least = min(plans, key=lambda plan: plan.bytes)
         raise InputError(
-            f"{gallery.rows:,} rows of {gallery.dimension} dimensions take {least.bytes / 1e9:.2f} GB at least, by "
-            f"{least.factory}, and the budget is {gallery.budget / 1e9:.2f} GB; raise --memory-budget, or index the gallery in "
+            f"{gallery.rows:,} rows of {gallery.dimension} dimensions take "
+            f"{least.bytes / 1e9:.2f} GB at least, by {least.factory}, and the budget is "
+            f"{gallery.budget / 1e9:.2f} GB; raise --memory-budget, or index the gallery in "
             "several indexes, by --split, --view or tables of their own"
         )
     for plan in fitting:
@@ -159,7 +162,7 @@ def plan_index(gallery: GallerySpec) -> IndexPlan:
 
 
 def plan_factory(gallery: GallerySpec, factory: str, refine: Refine = "none") -> IndexPlan:
-    """The plan for a factory string of the user's. What it takes and reaches is not foreseen: 0."""
+    """The plan for a factory string of the user's. Its memory and recall are not estimated: 0."""
     lists = re.search(r"IVF(\d+)", factory)
     return IndexPlan(
         factory=factory,
@@ -171,12 +174,12 @@ def plan_factory(gallery: GallerySpec, factory: str, refine: Refine = "none") ->
         search_bytes=0,
         build_bytes=0,
         expected_recall=0,
-        why="as asked by --factory",
+        reason="as given by --factory",
     )
 
 
 def _plans(gallery: GallerySpec) -> Iterator[IndexPlan]:
-    """Every family that suits the gallery, the fastest first, whatever it takes."""
+    """The plans of all families that suit the gallery, the fastest first, whatever they take."""
     if gallery.rows <= EXACT_ROWS:
         yield _plan(EXACT, gallery)
     pays = (
@@ -191,11 +194,9 @@ def _plans(gallery: GallerySpec) -> Iterator[IndexPlan]:
 
 
 def _plan(family: _IndexFamily, gallery: GallerySpec) -> IndexPlan:
-    reduced = (
-        gallery.effective_dimension
-        if family.reduces and gallery.effective_dimension
-        else gallery.dimension
-    )
+    reduced = gallery.dimension
+    if family.reduces and gallery.effective_dimension:
+        reduced = gallery.effective_dimension
     lists = 0 if family is EXACT or family.graph else _lists(gallery)
     trained = 0 if family is EXACT else _training_rows(gallery, lists)
     code = family.code_bytes(reduced)
@@ -213,36 +214,35 @@ def _plan(family: _IndexFamily, gallery: GallerySpec) -> IndexPlan:
         unit = gallery.rows
     part = max(unit, int(gallery.budget * PART_SHARE / code)) if family.on_disk else gallery.rows
     merging = part * code if family.on_disk else family.merging * codes
-    growing = max(1, gallery.workers) * (fixed + BLOCK_BYTES + 2 * unit * code) + (
-        PROCESS_BYTES if gallery.workers else 0
-    )
+    growing = max(1, gallery.workers) * (fixed + BLOCK_BYTES + 2 * unit * code)
+    growing += PROCESS_BYTES if gallery.workers else 0
+    projection = f"PCA{reduced}," if family.reduces else ""
+    training = TRAINING_COPIES * 4.0 * trained * gallery.dimension
     return IndexPlan(
-        factory=(f"PCA{reduced}," if family.reduces else "")
-        + factory_string(family, lists, reduced),
+        factory=projection + factory_string(family, lists, reduced),
         refine=family.refine,
         on_disk=family.on_disk,
         training_rows=trained,
         unit_rows=unit,
         part_rows=part,
         search_bytes=fixed + masks + (0 if family.on_disk else codes),
-        build_bytes=max(
-            growing,
-            fixed + BLOCK_BYTES + max(merging, TRAINING_COPIES * 4.0 * trained * gallery.dimension),
-        ),
+        build_bytes=max(growing, fixed + BLOCK_BYTES + max(merging, training)),
         expected_recall=family.ceiling,
-        why=_reason(family, gallery, reduced, code),
+        reason=_reason(family, gallery, reduced, code),
     )
 
 
 def factory_string(family: _IndexFamily, lists: int, dimension: int) -> str:
-    """A family's factory string. FAISS wants as many subquantisers as divide the dimension."""
+    """A family's factory string. The number of subquantisers must divide the dimension."""
     most = max(1, dimension // SUBQUANTISER_DIM)
     pieces = next(count for count in range(most, 0, -1) if dimension % count == 0)
     return family.form.format(lists=lists, pieces=pieces)
 
 
 def _lists(gallery: GallerySpec) -> int:
-    """About twice the root of the rows, as a power of two; no more than the memory allows to train."""
+    """About twice the root of the rows, as a power of two; at most as many as the memory can
+    train.
+    """
     most = max(1, _max_training_rows(gallery) // ROWS_PER_LIST)
     return int(2 ** min(round(math.log2(2 * math.sqrt(gallery.rows))), math.floor(math.log2(most))))
 
@@ -253,13 +253,13 @@ def _max_training_rows(gallery: GallerySpec) -> int:
 
 
 def _training_rows(gallery: GallerySpec, lists: int) -> int:
-    """At least 16,384, which codes and projections are trained on as well."""
+    """At least 16,384: codes and projections are trained on them as well."""
     return min(_max_training_rows(gallery), max(16_384, ROWS_PER_LIST * lists))
 
 
 def _reason(family: _IndexFamily, gallery: GallerySpec, reduced: int, code: float) -> str:
-    what = {
-        "Flat": f"exact search: {gallery.rows:,} rows are few enough to look at each",
+    kind = {
+        "Flat": f"exact search: {gallery.rows:,} rows are few enough to compare each",
         "HNSW32,SQ8": "a graph over 8-bit codes",
         "SQfp16": "lists of 16-bit numbers",
         "SQ8": "lists of 8-bit codes",
@@ -268,16 +268,11 @@ def _reason(family: _IndexFamily, gallery: GallerySpec, reduced: int, code: floa
         "RaBitQ4": "lists of four-bit codes",
     }[family.name]
     if family is EXACT:
-        return what
-    less = (
-        f" of vectors reduced from {gallery.dimension} to {reduced} directions"
-        if family.reduces
-        else ""
-    )
-    where = ", on the disk" if family.on_disk else ""
-    again = (
-        ", the best candidates scored again by the table's vectors"
-        if family.refine == "table"
-        else ""
-    )
-    return f"{what}{less}{where}{again}: {code:,.0f} bytes a row"
+        return kind
+    if family.reduces:
+        kind += f" of vectors reduced from {gallery.dimension} to {reduced} directions"
+    if family.on_disk:
+        kind += ", on the disk"
+    if family.refine == "table":
+        kind += ", the best candidates scored again by the table's vectors"
+    return f"{kind}: {code:,.0f} bytes a row"

@@ -1,5 +1,4 @@
-"""How well and how fast an index finds what exact search finds, and how hard it has to try for a
-wanted recall.
+"""Recall and speed of an index against exact search, and the search parameters that a recall needs.
 
 Shapes: Q queries, K neighbours, D dimensions.
 """
@@ -12,21 +11,24 @@ from typing import Any
 import faiss
 import numpy as np
 
-from pipeline.core.arrays import Ints
-from pipeline.features.table import FeatureTable, Floats
+from pipeline.core.arrays import Floats, Ints
+from pipeline.features.table import FeatureTable
+from pipeline.index.faiss_io import FAISS
 from pipeline.index.metadata import SearchParams
 from pipeline.index.part import NO_ROW
 from pipeline.index.plan import RERANK_FACTOR, Refine
 from pipeline.index.searcher import Index
 from pipeline.index.train import sample_rows
 
-FAISS: Any = faiss  # whose types know nothing of its keyword arguments
 RECALL_QUERIES = 256
 NEIGHBOURS = 10
-MAX_EF_SEARCH = 1_024  # of a graph: beyond, it hardly gains
+MAX_EF_SEARCH = 1_024
+"Of a graph: beyond, its recall hardly grows."
 MAX_RERANK_FACTOR = 8 * RERANK_FACTOR
 TIMED_SECONDS = 0.1
 SINGLE_QUERIES = 32
+Tuned = tuple[SearchParams, float, float]
+"Search parameters with their recall@1 and recall@10."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +38,7 @@ class RecallQueries:
     queries_QD: Floats
     exact_QK: Ints
     own_row_Q: Ints
-    """The row that is the query itself, which nobody is credited for; NOBODY where it is not in the
-    index."""
+    "The query's own row, excluded from recall; NO_ROW if the query is not indexed."
     source: str
     "Where the queries are from."
 
@@ -45,16 +46,14 @@ class RecallQueries:
 def sample_queries(
     indexed: FeatureTable, rows_of_part: dict[str, int], others: FeatureTable | None
 ) -> RecallQueries:
-    """Queries for an index of a table: rows of `others`, else its own rows, and then none counts as
-    found by itself.
+    """Queries for an index of a table: rows of `others`, else the table's own rows, which are then
+    excluded from their own recall.
     """
     if others is not None and others.rows:
-        counts = {part: len(rows) for part, rows in others.numbered(["view"])}
-        numbers_Q, queries_QD = sample_rows(others, counts, RECALL_QUERIES)
-        own_row_Q, source = (
-            np.full_like(numbers_Q, NO_ROW),
-            "rows of the table that are not indexed",
-        )
+        counts = {part: len(rows) for part, rows in others.numbered_rows(["view"])}
+        row_Q, queries_QD = sample_rows(others, counts, RECALL_QUERIES)
+        own_row_Q = np.full_like(row_Q, NO_ROW)
+        source = "rows of the table that are not indexed"
     else:
         own_row_Q, queries_QD = sample_rows(indexed, rows_of_part, RECALL_QUERIES)
         source = "rows of the index, each looking for others"
@@ -76,92 +75,94 @@ def exact_search(queries_QD: Floats, table: FeatureTable, k: int) -> Ints:
         heap.add_result(scores, rows + start)
         start += len(block_BD)
     heap.finalize()
-    found: Ints = heap.I
-    return found
+    rows_QK: Ints = heap.I
+    return rows_QK
 
 
-def without_own_row(found_QK: Ints, own_row_Q: Ints) -> Ints:
+def without_own_row(rows_QK: Ints, own_row_Q: Ints) -> Ints:
     """Each query's rows but its own: one column fewer, the last one where its own is not there."""
-    drop_QK = found_QK == own_row_Q[:, None]
+    drop_QK = rows_QK == own_row_Q[:, None]
     drop_QK[~drop_QK.any(axis=1), -1] = True
-    return np.asarray(found_QK[~drop_QK]).reshape(len(found_QK), found_QK.shape[1] - 1)
+    return np.asarray(rows_QK[~drop_QK]).reshape(len(rows_QK), rows_QK.shape[1] - 1)
 
 
-def measure_recall(index: Index, held: RecallQueries, effort: SearchParams) -> tuple[float, float]:
-    """Shares of exact search's first row and first ten rows that the index finds at this effort."""
-    k = held.exact_QK.shape[1]
+def measure_recall(
+    index: Index, queries: RecallQueries, params: SearchParams
+) -> tuple[float, float]:
+    """Shares of exact search's first row and of its first ten rows that the index finds."""
+    exact_QK = queries.exact_QK
+    k = exact_QK.shape[1]
     if not k:
         return 1.0, 1.0
-    found_QK = without_own_row(
-        index.search_rows(held.queries_QD, k + 1, effort=effort)[1], held.own_row_Q
-    )
+    _, rows_QK = index.search_rows(queries.queries_QD, k + 1, params=params)
+    found_QK = without_own_row(rows_QK, queries.own_row_Q)
     k = min(k, NEIGHBOURS)
-    pairs = zip(held.exact_QK[:, :k].tolist(), found_QK[:, :k].tolist(), strict=True)
-    return (
-        float((held.exact_QK[:, 0] == found_QK[:, 0]).mean()),
-        float(np.mean([len({*exact} & {*found}) / k for exact, found in pairs])),
-    )
+    pairs = zip(exact_QK[:, :k].tolist(), found_QK[:, :k].tolist(), strict=True)
+    at_10 = np.mean([len({*exact} & {*found}) / k for exact, found in pairs])
+    return float((exact_QK[:, 0] == found_QK[:, 0]).mean()), float(at_10)
 
 
 def search_param_grid(index: Any, refine: Refine) -> Iterator[SearchParams]:
-    """From the least effort to the most for a kind of index: the breadth is doubled, then the
-    candidates scored again.
+    """The parameters of a kind of index, from the fastest search to the most thorough: nprobe or
+    efSearch is doubled, then the number of reranked candidates.
     """
     ivf = FAISS.try_extract_index_ivf(index)
     breadth, most = (16, MAX_EF_SEARCH) if ivf is None else (1, ivf.nlist)
-    candidates = RERANK_FACTOR if refine == "table" else 1
+    factor = RERANK_FACTOR if refine == "table" else 1
     if ivf is None and not isinstance(FAISS.downcast_index(index), FAISS.IndexHNSW):
-        breadth = most  # looks at every row anyway
+        breadth = most  # exact search has no such parameter
     while breadth < most:
-        yield SearchParams(breadth=breadth, candidates=candidates)
+        yield SearchParams(nprobe_or_ef=breadth, rerank_factor=factor)
         breadth *= 2
-    yield SearchParams(breadth=most, candidates=candidates)
-    while refine == "table" and candidates < MAX_RERANK_FACTOR:
-        candidates *= 2
-        yield SearchParams(breadth=most, candidates=candidates)
+    yield SearchParams(nprobe_or_ef=most, rerank_factor=factor)
+    while refine == "table" and factor < MAX_RERANK_FACTOR:
+        factor *= 2
+        yield SearchParams(nprobe_or_ef=most, rerank_factor=factor)
 
 
 def tune(
-    index: Index, held: RecallQueries, ladder: Iterator[SearchParams], target: float
-) -> tuple[SearchParams, float, float]:
-    """The least effort that reaches the target, with its recall@1 and @10; the best one where none
-    does.
+    index: Index, queries: RecallQueries, grid: Iterator[SearchParams], target: float
+) -> Tuned:
+    """The first parameters of the grid that reach the target, with their recall@1 and @10; the best
+    ones where none does.
     """
-    best = SearchParams(breadth=1), -1.0, -1.0
-    for effort in ladder:
-        found = effort, *measure_recall(index, held, effort)
-        if found[2] > best[2]:
-            best = found
-        if found[2] >= target:
-            return _lower_rerank_factor(index, held, found, target)
+    best = SearchParams(nprobe_or_ef=1), -1.0, -1.0
+    for params in grid:
+        tuned = params, *measure_recall(index, queries, params)
+        if tuned[2] > best[2]:
+            best = tuned
+        if tuned[2] >= target:
+            return _lower_rerank_factor(index, queries, tuned, target)
     return best
 
 
 def _lower_rerank_factor(
-    index: Index, held: RecallQueries, found: tuple[SearchParams, float, float], target: float
-) -> tuple[SearchParams, float, float]:
-    """Reading the candidates' vectors may be most of a search: half as many, as long as they do."""
-    while found[0].candidates >= 4:
-        effort = replace(found[0], candidates=found[0].candidates // 2)
-        fewer = effort, *measure_recall(index, held, effort)
-        if fewer[2] < target:
+    index: Index, queries: RecallQueries, tuned: Tuned, target: float
+) -> Tuned:
+    """Halve the number of reranked candidates while the recall stays at the target: reading their
+    vectors may be most of a search.
+    """
+    while tuned[0].rerank_factor >= 4:
+        params = replace(tuned[0], rerank_factor=tuned[0].rerank_factor // 2)
+        lower = params, *measure_recall(index, queries, params)
+        if lower[2] < target:
             break
-        found = fewer
-    return found
+        tuned = lower
+    return tuned
 
 
-def measure_speed(index: Index, held: RecallQueries, effort: SearchParams) -> dict[str, float]:
-    """Queries a second in one batch, and the median milliseconds of one alone, names included."""
+def measure_speed(index: Index, queries: RecallQueries, params: SearchParams) -> dict[str, float]:
+    """Queries a second in one batch, and the median milliseconds of a single one, ids included."""
     start, rounds = time.perf_counter(), 0
     while (spent := time.perf_counter() - start) < TIMED_SECONDS or not rounds:
-        index.search(held.queries_QD, NEIGHBOURS, effort=effort)
+        index.search(queries.queries_QD, NEIGHBOURS, params=params)
         rounds += 1
     single = []
-    for query_D in held.queries_QD[:SINGLE_QUERIES]:
+    for query_D in queries.queries_QD[:SINGLE_QUERIES]:
         start = time.perf_counter()
-        index.search(query_D[None], NEIGHBOURS, effort=effort)
+        index.search(query_D[None], NEIGHBOURS, params=params)
         single.append(time.perf_counter() - start)
     return {
-        "queries_per_second": round(rounds * len(held.queries_QD) / spent, 1),
+        "queries_per_second": round(rounds * len(queries.queries_QD) / spent, 1),
         "milliseconds_per_query": round(1e3 * float(np.median(single)), 3),
     }

@@ -1,10 +1,12 @@
-"""The settings of building an index: flags of jobs/build_index.py. Imports nothing heavy, so that
-the command line is parsed at once."""
+"""The settings of building an index: flags of jobs/build_index.py.
+
+Imports nothing heavy, so that the command line is parsed at once.
+"""
 
 import re
 from dataclasses import dataclass
 
-from pipeline.core.errors import InputError
+from pipeline.core.errors import InputError, require
 from pipeline.core.records import Split, View
 
 BYTE_UNITS = {"": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
@@ -23,8 +25,8 @@ class IndexSettings:
     view: View | None = None
     "Only rows of this view."
     memory_budget: str = "4GB"
-    """What building and searching may take in memory, the process included: a number with KB, MB,
-    GB or TB."""
+    """Memory that building and searching may take, the process included: a number with KB, MB, GB
+    or TB."""
     target_recall: float = 0.95
     "Recall@10 against exact search that the index is to reach."
     factory: str | None = None
@@ -37,39 +39,30 @@ class IndexSettings:
     """Ray tasks that build units of the index, of one core each; 0: this process builds, on all
     cores."""
     verify: bool = False
-    "Look at every byte of the table first, and of an index that is finished."
+    """Compare every byte of the table with its checksums first, and every byte of an index that is
+    finished."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.target_recall <= 1:
-            raise InputError(
-                f"--target-recall is {self.target_recall}, expected a fraction above 0 and at most 1"
-            )
-        if self.parts < 1 or self.workers < 0:
-            raise InputError(
-                f"found --parts {self.parts} and --workers {self.workers}; expected at least one part, and 0 workers or more"
-            )
+        recall = self.target_recall
+        require(0 < recall <= 1, "target_recall", recall, "a fraction above 0 and at most 1")
+        require(self.parts >= 1, "parts", self.parts, "at least 1")
+        require(self.workers >= 0, "workers", self.workers, "0 or more")
         if self.refine and not self.factory:
             raise InputError(
-                "found --refine without --factory, whose planner decides it; leave it out or name a --factory"
+                "found --refine without --factory, whose planner decides it; leave it out or name a "
+                "--factory"
             )
         parse_bytes(self.memory_budget)
 
 
 def parse_bytes(text: str) -> int:
-    """Bytes that a text such as `4GB` means.
+    """The number of bytes that a text such as `4GB` stands for.
 
     Raises InputError.
     """
-    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?B?)\s*", text.upper())
-    unit = (
-        ""
-        if match is None
-        else match[2]
-        if match[2].endswith("B") or not match[2]
-        else match[2] + "B"
-    )
-    if match is None or unit not in BYTE_UNITS:
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)B?\s*", text.upper())
+    if match is None:
         raise InputError(
             f"--memory-budget is {text!r}, expected a number with KB, MB, GB or TB, such as 4GB"
         )
-    return int(float(match[1]) * BYTE_UNITS[unit])
+    return int(float(match[1]) * BYTE_UNITS[match[2] and f"{match[2]}B"])

@@ -1,9 +1,10 @@
-"""The units of work of an index: some parts of the table, added to a copy of the trained index; and
-many units made into one.
+"""Work units of an index build: parts of the table, added to a copy of the trained index, and the
+merging of units into one index.
 
-A unit's file is whole or not there, and a file beside it vouches for its bytes; so a killed build
-goes on with the units that are missing or damaged. Units are added by one order of rows, and merged
-by their number: the index is the same whoever did which and when. Shapes: D dimensions.
+A unit's file appears atomically, with its checksum beside it, so a killed build resumes with the
+units that are missing or damaged. Rows are added in one order and units merged by their number: the
+index is the same whichever worker built a unit, and when.
+Shapes: D dimensions, L rows of an inverted list.
 """
 
 import tempfile
@@ -11,16 +12,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import faiss
 import numpy as np
 
-from pipeline.core import json_files, storage
+from pipeline.core import storage
+from pipeline.core.integrity import write_checksum
 from pipeline.features.table import FeatureTable
-from pipeline.index.ids import local_copy
-from pipeline.index.metadata import file_checksum
-from pipeline.index.part import read_faiss
-
-FAISS: Any = faiss  # whose types know nothing of its keyword arguments
+from pipeline.index.faiss_io import FAISS, local_copy, read_faiss
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +42,9 @@ def plan_units(rows_of_part: dict[str, int], rows: int) -> list[WorkUnit]:
 
 
 def even_groups(sizes: Sequence[int], wanted: int) -> list[list[int]]:
-    """Numbers of consecutive items in groups of about `wanted` in all: each where its middle lies."""
+    """Numbers of consecutive items in groups of about `wanted` in all: each goes where its middle
+    lies.
+    """
     groups: dict[int, list[int]] = {}
     begin = 0
     for number, size in enumerate(sizes):
@@ -59,7 +58,7 @@ def build_unit(trained: str, table: FeatureTable, unit: WorkUnit, out: str, thre
     FAISS.omp_set_num_threads(threads)
     with tempfile.TemporaryDirectory() as scratch:
         index = read_faiss(local_copy(trained, scratch), on_disk=False)
-    for block_BD in table.only(unit.table_parts).blocks():
+    for block_BD in table.with_parts(unit.table_parts).blocks():
         index.add(block_BD)
     with storage.atomic_file(out) as local:
         FAISS.write_index(index, local)
@@ -67,63 +66,44 @@ def build_unit(trained: str, table: FeatureTable, unit: WorkUnit, out: str, thre
     return int(index.ntotal)
 
 
-def write_checksum(file: str) -> None:
-    """Write beside a finished file how many bytes it has, and their hash: without that it is not
-    believed later.
-    """
-    folder, name = file.rsplit("/", 1)
-    json_files.write_checksummed(f"{file}.json", file_checksum(folder, name))
-
-
-def checksum_ok(file: str) -> bool:
-    """Whether a file is there and every byte is what was vouched for."""
-    folder, name = file.rsplit("/", 1)
-    try:
-        return storage.exists(f"{file}.json") and json_files.read_checksummed(
-            f"{file}.json"
-        ) == file_checksum(folder, name)
-    except (OSError, ValueError):
-        return False
-
-
 def can_merge(index: Any) -> bool:
-    """Whether units of such an index can become one: lists and plain codes can, graphs and refined
+    """Whether units of such an index can be merged: lists and plain codes can, graphs and refined
     indexes cannot.
     """
-    kind = FAISS.downcast_index(
-        index
-    )  # under another name: it lives only as long as what it is a view of
+    # A name of its own: `index` must outlive the view that downcasting returns.
+    kind = FAISS.downcast_index(index)
     if isinstance(kind, FAISS.IndexPreTransform):
         return can_merge(kind.index)
     return isinstance(kind, FAISS.IndexIVF | FAISS.IndexFlatCodes)
 
 
 def merge_units(trained: str, files: Sequence[str]) -> Any:
-    """One index of all units, their rows one after the other. Files are mapped, so no more than the
-    result is in memory.
+    """One index of all units, their rows one after the other. Files are mapped, so only the result
+    is in memory.
     """
-    whole = read_faiss(trained, on_disk=False)
-    lists = _lists_of(whole)
+    merged = read_faiss(trained, on_disk=False)
+    lists = _plain_lists(merged)
     if lists is None:
         shift = 0
         for file in files:
-            part = read_faiss(file, on_disk=False)
-            rows = part.ntotal
-            # Lists keep each row's number, plain codes are numbered by their place.
-            whole.merge_from(part, shift if FAISS.try_extract_index_ivf(whole) is not None else 0)
+            unit = read_faiss(file, on_disk=False)
+            rows = unit.ntotal
+            # Lists hold each row's number, plain codes are numbered by their position.
+            has_lists = FAISS.try_extract_index_ivf(merged) is not None
+            merged.merge_from(unit, shift if has_lists else 0)
             shift += rows
-        return whole
-    parts = [read_faiss(file, on_disk=True) for file in files]
-    sources = [FAISS.extract_index_ivf(part).invlists for part in parts]
+        return merged
+    units = [read_faiss(file, on_disk=True) for file in files]
+    sources = [FAISS.extract_index_ivf(unit).invlists for unit in units]
     for number in range(lists.nlist):
-        _fill_list(lists, number, list(_pieces(sources, parts, number)))
-    ivf = FAISS.extract_index_ivf(whole)
-    ivf.ntotal = whole.ntotal = sum(part.ntotal for part in parts)
-    return whole
+        _fill_list(lists, number, list(_pieces(sources, units, number)))
+    ivf = FAISS.extract_index_ivf(merged)
+    ivf.ntotal = merged.ntotal = sum(unit.ntotal for unit in units)
+    return merged
 
 
-def _lists_of(index: Any) -> Any:
-    """The inverted lists, where codes stand in them one by one; None of packed ones and of other
+def _plain_lists(index: Any) -> Any:
+    """The inverted lists, where they hold codes one by one; None of packed ones and of other
     indexes.
     """
     ivf = FAISS.try_extract_index_ivf(index)
@@ -132,24 +112,25 @@ def _lists_of(index: Any) -> Any:
 
 
 def _pieces(
-    sources: Sequence[Any], parts: Sequence[Any], number: int
+    sources: Sequence[Any], units: Sequence[Any], number: int
 ) -> Iterator[tuple[Any, Any, int]]:
-    """A list's row numbers in the whole index, codes and length, unit by unit."""
+    """A list's row numbers in the merged index, its codes and its length, unit by unit."""
     shift = 0
-    for source, part in zip(sources, parts, strict=True):
+    for source, unit in zip(sources, units, strict=True):
         size = source.list_size(number)
         if size:
-            ids = FAISS.rev_swig_ptr(source.get_ids(number), size) + shift
-            yield ids, source.get_codes(number), size
-        shift += part.ntotal
+            row_L = FAISS.rev_swig_ptr(source.get_ids(number), size) + shift
+            yield row_L, source.get_codes(number), size
+        shift += unit.ntotal
 
 
 def _fill_list(lists: Any, number: int, pieces: Sequence[tuple[Any, Any, int]]) -> None:
-    """Make room for exactly what comes, and copy it: lists that grow take up to twice the memory."""
+    """Reserve exactly the space of the pieces, and copy them: lists that grow take up to twice the
+    memory.
+    """
     lists.resize(number, sum(size for _, _, size in pieces))
     at = 0
-    for ids, codes, size in pieces:
-        lists.update_entries(
-            number, at, size, FAISS.swig_ptr(np.ascontiguousarray(ids, np.int64)), codes
-        )
+    for row_L, codes, size in pieces:
+        rows = FAISS.swig_ptr(np.ascontiguousarray(row_L, np.int64))
+        lists.update_entries(number, at, size, rows, codes)
         at += size

@@ -1,7 +1,6 @@
-"""A finished index that changes: new parts of its table come in, locations go out, every byte is
-looked at.
+"""Changes of a finished index: new parts of its table are added, locations removed, bytes verified.
 
-What was there is not built again: growing adds parts to the index, removing notes the locations in
+Nothing is built again: extending adds parts to the index, removing notes the locations in
 `index.json`.
 """
 
@@ -10,25 +9,23 @@ import tempfile
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, replace
-from typing import Any
 
-import faiss
 import numpy as np
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
+from pipeline.core.filters import Filter
 from pipeline.core.lock import locks_output
 from pipeline.core.progress import console
 from pipeline.core.records import Split, View
 from pipeline.features.table import FeatureTable, open_table
-from pipeline.index.build import finish_index
-from pipeline.index.filters import Filter
-from pipeline.index.ids import RowIds, local_copy
+from pipeline.index.faiss_io import FAISS, local_copy
+from pipeline.index.finish import finish_index
+from pipeline.index.ids import RowIds
 from pipeline.index.metadata import (
     IndexMetadata,
     PartMetadata,
     check_files,
-    metadata_dict,
     read_metadata,
     write_metadata,
 )
@@ -38,113 +35,117 @@ from pipeline.index.workspace import BuildWorkspace, rows_by_part
 
 
 @locks_output(lambda table, out, workers=0: out)
-def extend_index(table: str, out: str, workers: int = 0) -> dict[str, Any]:
-    """Add the rows of those parts of a table that an index does not hold yet; with none it is left
-    as it is.
+def extend_index(table: str, out: str, workers: int = 0) -> IndexMetadata:
+    """Add the rows of those parts of a table that an index does not hold yet; without any the index
+    is not touched.
 
-    Raises InputError when the table is of another network, or no longer holds what the index was
+    Raises InputError when the table is of another encoder, or no longer holds what the index was
     built from.
     """
     start = time.perf_counter()
-    told, whole = read_metadata(out), open_table(table)
-    split, view = told.asked["split"], told.asked["view"]
-    chosen = whole.select(Split(split) if split else None, View(view) if view else None)
-    _check_same_table(out, told, chosen)
-    held = told.table_parts
-    missing = [name for name in chosen.parts if name not in held]
-    added = rows_by_part(chosen.only(missing))
+    metadata, whole_table = read_metadata(out), open_table(table)
+    split, view = metadata.settings["split"], metadata.settings["view"]
+    selected = whole_table.select(Split(split) if split else None, View(view) if view else None)
+    _check_same_table(out, metadata, selected)
+    indexed = metadata.table_parts
+    missing = selected.with_parts([name for name in selected.parts if name not in indexed])
+    added = rows_by_part(missing)
     if not added:
-        console.print(f"{out} holds all of {table}: {told.rows} rows; nothing to do")
-        return metadata_dict(told)
-    faiss.omp_set_num_threads(
-        os.cpu_count() or 1
-    )  # Ray sets OMP_NUM_THREADS in its jobs; this one uses all cores
-    check_files(out, told.trained, whole=True)
-    identity = {"extends": [asdict(part) for part in told.parts], "by": chosen.only(missing).digest}
-    workshop = BuildWorkspace(out=out, table=chosen, identity=identity, workers=workers)
-    workshop.reuse_trained()
-    parts = workshop.build(added, told.unit_rows, told.part_rows, told.rows, len(told.parts))
-    facts = replace(
-        told,
-        rows=told.rows + sum(added.values()),
-        parts=told.parts + parts,
-        table=storage.absolute(whole.path),
+        console.print(f"{out} holds all of {table}: {metadata.rows} rows; nothing to do")
+        return metadata
+    FAISS.omp_set_num_threads(os.cpu_count() or 1)  # Ray sets OMP_NUM_THREADS in its jobs
+    check_files(out, metadata.trained, content=True)
+    identity = {"extends": [asdict(part) for part in metadata.parts], "by": missing.digest}
+    workspace = BuildWorkspace(out, selected, identity, workers)
+    workspace.reuse_trained()
+    parts = workspace.build(
+        added, metadata.unit_rows, metadata.part_rows, metadata.rows, len(metadata.parts)
     )
-    now = chosen.only([*held, *added])  # the order of the index's rows
-    others = whole.select(Split.QUERY) if split == Split.GALLERY else None
-    return finish_index(out, facts, sample_queries(now, rows_by_part(now), others), workshop, start)
+    metadata = replace(
+        metadata,
+        rows=metadata.rows + sum(added.values()),
+        parts=metadata.parts + parts,
+        table=storage.absolute(whole_table.path),
+    )
+    in_order = selected.with_parts([*indexed, *added])  # the order of the index's rows
+    others = whole_table.select(Split.QUERY) if split == Split.GALLERY else None
+    queries = sample_queries(in_order, rows_by_part(in_order), others)
+    return finish_index(out, metadata, queries, workspace, start)
 
 
 @locks_output(lambda out, locations: out)
-def remove_locations(out: str, locations: Iterable[str]) -> dict[str, Any]:
-    """Make locations of an index answer no more. Their vectors stay in its files until it is built
-    again.
+def remove_locations(out: str, locations: Iterable[str]) -> IndexMetadata:
+    """Filter locations out of every search of an index. Their vectors stay in its files until it is
+    built again.
 
-    Raises InputError, and removes none, when one of them is not there.
+    Raises InputError, and removes none, when the index does not hold one of them.
     """
-    told, wanted = read_metadata(out), frozenset(locations)
+    metadata, wanted = read_metadata(out), frozenset(locations)
     with tempfile.TemporaryDirectory() as scratch:
-        thinned = [_mark_removed(out, part, wanted, scratch) for part in told.parts]
-    parts = tuple(part for part, _ in thinned)
-    gone = {
+        marked = [_mark_removed(out, part, wanted, scratch) for part in metadata.parts]
+    parts = tuple(part for part, _ in marked)
+    removed = {
         name
-        for part, before in zip(parts, told.parts, strict=True)
+        for part, before in zip(parts, metadata.parts, strict=True)
         for name in set(part.removed) - {*before.removed}
     }
-    unknown = sorted(wanted - gone)
-    if unknown:
+    if unknown := sorted(wanted - removed):
         raise InputError(
-            f"{out} has no rows of {len(unknown)} of the locations to remove, such as {unknown[0]}; nothing was removed; check "
-            "their names in its ids.parquet"
+            f"{out} has no rows of {len(unknown)} of the locations to remove, such as "
+            f"{unknown[0]}; nothing was removed; check their names in its ids.parquet"
         )
-    facts = replace(told, parts=parts)
-    write_metadata(out, facts)
-    left = sum(answering for _, answering in thinned)
-    console.print(f"{out}: {len(gone)} locations removed, {left:,} of {told.rows:,} rows answer")
-    return metadata_dict(facts)
+    metadata = replace(metadata, parts=parts)
+    write_metadata(out, metadata)
+    left = sum(rows for _, rows in marked)
+    console.print(
+        f"{out}: {len(removed)} locations removed, {left:,} of {metadata.rows:,} rows are left"
+    )
+    return metadata
 
 
 def verify_index(out: str) -> IndexMetadata:
-    """Look at every byte of an index.
+    """Compare every byte of an index with its checksums.
 
-    Raises InputError where one is not what was written.
+    Raises InputError where one differs.
     """
-    told = read_metadata(out)
-    check_files(out, told.trained, whole=True)
-    Index(out, whole=True)
+    metadata = read_metadata(out)
+    check_files(out, metadata.trained, content=True)
+    Index(out, verify=True)
     console.print(
-        f"{out}: {told.rows:,} rows in {len(told.parts)} parts, every byte as it was written"
+        f"{out}: {metadata.rows:,} rows in {len(metadata.parts)} parts, every byte as it was "
+        "written"
     )
-    return told
+    return metadata
 
 
 def _mark_removed(
     out: str, part: PartMetadata, locations: frozenset[str], scratch: str
 ) -> tuple[PartMetadata, int]:
     """The part with those of the locations that it holds among the removed ones, and how many of
-    its rows answer then.
+    its rows are left.
     """
     check_files(out, part.files)
     ids = RowIds(local_copy(storage.join(out, part.ids), scratch))
-    rows = np.flatnonzero(ids.mask(Filter(locations=locations)))
-    found = set(ids.take(rows, ["location"])["location"].to_pylist())
-    thinned = replace(part, removed=tuple(sorted({*part.removed, *found})))
-    return thinned, part.rows - int(
-        np.count_nonzero(ids.mask(Filter(locations=frozenset(thinned.removed))))
-    )
+    row_R = np.flatnonzero(ids.mask(Filter(locations=locations)))
+    held = set(ids.take(row_R, ["location"])["location"].to_pylist())
+    removed = tuple(sorted({*part.removed, *held}))
+    gone = int(np.count_nonzero(ids.mask(Filter(locations=frozenset(removed)))))
+    return replace(part, removed=removed), part.rows - gone
 
 
-def _check_same_table(out: str, told: IndexMetadata, table: FeatureTable) -> None:
+def _check_same_table(out: str, metadata: IndexMetadata, table: FeatureTable) -> None:
     """Raise InputError where a table is not the one that the index was built from, with more."""
-    if told.fingerprint != table.fingerprint:
+    if metadata.fingerprint != table.fingerprint:
         raise InputError(
-            f"{out} is of network {told.fingerprint[:12]} and {table.path} of {table.fingerprint[:12]}; expected one; embed "
-            "with the index's network (jobs/embed_gallery.py --checkpoint), or build another index"
+            f"{out} is of network {metadata.fingerprint[:12]} and {table.path} of "
+            f"{table.fingerprint[:12]}; expected one; embed with the index's network "
+            "(jobs/embed_gallery.py --checkpoint), or build another index"
         )
-    held, now = told.table_parts, table.shards
-    changed = sorted(name for name, shard in held.items() if now.get(name) != shard)
+    indexed, current = metadata.table_parts, table.shards
+    changed = sorted(name for name, shard in indexed.items() if current.get(name) != shard)
     if changed:
         raise InputError(
-            f"{table.path} no longer holds {len(changed)} of the {len(held)} parts that {out} was built from, such as "
-            f"{changed[0]}; expected the same and more; build the index again"
+            f"{table.path} no longer holds {len(changed)} of the {len(indexed)} parts that {out} "
+            f"was built from, such as {changed[0]}; expected the same and more; build the index "
+            "again"
         )

@@ -7,7 +7,6 @@ Shapes: K candidates, F features.
 """
 
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 
@@ -88,8 +87,8 @@ def write_calibration(path: str, calibration: Calibration) -> None:
     json_files.write_checksummed(path, header | asdict(calibration))
 
 
-def read_calibration(path: str, index_metadata: dict[str, Any]) -> Calibration:
-    """Read and validate the calibration of the index with this metadata.
+def read_calibration(path: str, fingerprint: str) -> Calibration:
+    """Read and validate the calibration of an index whose encoder has this fingerprint.
 
     Raises InputError when the file is not a calibration, or one of another encoder.
     """
@@ -105,10 +104,10 @@ def read_calibration(path: str, index_metadata: dict[str, Any]) -> Calibration:
             f"{path} is not a calibration of schema {SCHEMA_VERSION} ({error!r}); expected what "
             "jobs/calibrate.py writes; delete it and calibrate again"
         ) from None
-    if calibration.fingerprint != index_metadata["fingerprint"]:
+    if calibration.fingerprint != fingerprint:
         raise InputError(
             f"{path} was made with encoder {calibration.fingerprint[:12]} and the index with "
-            f"{index_metadata['fingerprint'][:12]}, expected the same; calibrate again with "
+            f"{fingerprint[:12]}, expected the same; calibrate again with "
             "jobs/calibrate.py"
         )
     return calibration
@@ -127,10 +126,10 @@ def _check_model(calibration: Calibration) -> None:
         raise ValueError("a scale of 0")
 
 
-def find_calibration(index: str, index_metadata: dict[str, Any]) -> Calibration | None:
+def find_calibration(index: str, fingerprint: str) -> Calibration | None:
     """The calibration beside an index; None where there is none.
 
     Raises InputError when it is not one, or one of another encoder.
     """
     path = storage.join(index, CALIBRATION_FILE)
-    return read_calibration(path, index_metadata) if storage.exists(path) else None
+    return read_calibration(path, fingerprint) if storage.exists(path) else None

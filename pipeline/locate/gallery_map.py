@@ -60,12 +60,12 @@ class GalleryMap:
 def read_gallery_map(index: Index) -> GalleryMap:
     """The rows of an index, or MAX_GALLERY_ROWS evenly spaced ones; removed locations are left
     out."""
-    total = index.told.rows
+    total = index.metadata.rows
     rows = np.unique(np.linspace(0, total - 1, min(total, MAX_GALLERY_ROWS)).astype(np.int64))
-    names = index.names(rows[None])
+    names = index.ids_of(rows[None])
     location_N = np.asarray(names["location"].to_pylist(), dtype=np.str_)
     kept_N = np.ones(len(rows), np.bool_)
-    for part in index.told.parts:
+    for part in index.metadata.parts:
         in_part_N = (rows >= part.first_row) & (rows < part.first_row + part.rows)
         kept_N &= ~(in_part_N & np.isin(location_N, np.array(part.removed, dtype=np.str_)))
     lat_lon = [names[name].to_numpy().astype(np.float64) for name in ("lat", "lon")]

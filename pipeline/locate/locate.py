@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.core.arrays import Doubles, Floats
-from pipeline.index.filters import Filter
+from pipeline.core.filters import Filter
 from pipeline.index.searcher import Hit, Searchable
 from pipeline.locate.calibration import Calibration
 from pipeline.locate.consensus import Consensus, find_consensus

@@ -46,8 +46,8 @@ def open_verified(path: str) -> OpenedIndex:
 
     Raises InputError when there is no index at `path`, or a calibration of another encoder.
     """
-    index = Index(path, whole=True)  # few searches would meet a damaged inverted list, and late
-    calibration = find_calibration(path, index.facts)
+    index = Index(path, verify=True)  # few searches would meet a damaged inverted list, and late
+    calibration = find_calibration(path, index.metadata.fingerprint)
     spacing_m = None if calibration else read_gallery_map(index).spacing_m
     return OpenedIndex(index=index, calibration=calibration, spacing_m=spacing_m)
 
@@ -111,7 +111,7 @@ def _read(path: str) -> bytes | None:
 def validate_index(new: Index, old: Index) -> None:
     """Raise InputError where an index cannot replace the old one, and whatever a trial search
     raises."""
-    found, expected = new.told.fingerprint, old.told.fingerprint
+    found, expected = new.metadata.fingerprint, old.metadata.fingerprint
     if found != expected:
         raise InputError(
             f"it was made by encoder {found[:12]}, the service's is {expected[:12]}, expected the "

@@ -6,12 +6,13 @@ Shapes: Q photos that can be decoded, D dimensions.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 from pipeline.core.arrays import Floats
+from pipeline.core.filters import Filter
 from pipeline.core.geo import Circle
 from pipeline.core.records import Rejection
-from pipeline.index.filters import Filter
+from pipeline.index.metadata import IndexMetadata
 from pipeline.locate.locate import Answer, locate_embeddings
 from pipeline.service.live_index import LiveIndex
 from pipeline.service.request import LocateRequest
@@ -46,13 +47,13 @@ class ServiceStatus:
 class Predictor:
     """The encoder and the index, loaded."""
 
-    def __init__(self, index: str, encoder_for: Callable[[dict[str, Any]], Encoder]) -> None:
+    def __init__(self, index: str, encoder_for: Callable[[IndexMetadata], Encoder]) -> None:
         """`encoder_for` makes the encoder that fits an index with this metadata.
 
         Raises InputError when either cannot be used.
         """
         self.live = LiveIndex(index)
-        self._encoder = encoder_for(self.live.current.index.facts)
+        self._encoder = encoder_for(self.live.current.index.metadata)
 
     def predict(self, requests: Sequence[LocateRequest]) -> list[Outcome]:
         """One outcome per request, in order. The whole batch is one forward pass and one index."""
@@ -81,9 +82,9 @@ class Predictor:
     def status(self) -> ServiceStatus:
         opened = self.live.current
         return ServiceStatus(
-            fingerprint=opened.index.told.fingerprint,
+            fingerprint=opened.index.metadata.fingerprint,
             rows=len(opened.index),
-            factory=opened.index.told.factory,
+            factory=opened.index.metadata.factory,
             calibrated=opened.calibration is not None,
             refused=self.live.refused,
         )

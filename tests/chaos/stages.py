@@ -98,8 +98,8 @@ def index_content(folder: Path) -> Content:
     }
     return found | {
         "rows": len(index),
-        "factory": index.facts["factory"],
-        "fingerprint": index.facts["fingerprint"],
+        "factory": index.metadata.factory,
+        "fingerprint": index.metadata.fingerprint,
     }
 
 

@@ -16,7 +16,7 @@ from pipeline.core.json_files import write_checksummed
 from pipeline.core.records import Split, View
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.settings import EvaluationSettings
-from pipeline.features.table import PartFooter, PartRows, write_part
+from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.shards.manifest import Manifest, Shard
 
 COLUMNS = [

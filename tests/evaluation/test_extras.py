@@ -14,7 +14,7 @@ from pipeline.core.errors import InputError
 from pipeline.evaluation import breakdowns
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.settings import EvaluationSettings
-from pipeline.features.table import PartFooter, PartRows, write_part
+from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.retrieval.tasks import RESULTS_SCHEMA
 from pipeline.shards.shard_set import open_shards
 from tests.evaluation.test_evaluate import TEST_SET, made_table

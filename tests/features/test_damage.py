@@ -17,18 +17,13 @@ import pytest
 
 from pipeline.core import json_files, rejections, storage
 from pipeline.core.errors import InputError
+from pipeline.core.geo import Box
+from pipeline.core.integrity import FileChecksum
 from pipeline.core.records import Rejection, Split, View
-from pipeline.features.part import (
-    PartFooter,
-    PartRows,
-    read_header,
-    read_rejected,
-    verify_part,
-    write_part,
-    write_rejected,
-)
+from pipeline.features.part import PartFooter, PartRows, read_header, verify_part, write_part
+from pipeline.features.rejected import read_rejected, write_rejected
 from pipeline.features.row_reader import RowReader
-from pipeline.features.table import Box, open_table
+from pipeline.features.table import open_table
 from pipeline.index.metadata import (
     METADATA_FILE,
     IndexMetadata,
@@ -108,7 +103,10 @@ def look_at_table(part: Path) -> list[Any]:
         ]
         seen += [np.nan_to_num(labels.lons).tolist(), rows.embeddings().tobytes()]
     seen.append(
-        [(name, rows.to_pylist()) for name, rows in table.select(Split.GALLERY).numbered(["key"])]
+        [
+            (name, rows.to_pylist())
+            for name, rows in table.select(Split.GALLERY).numbered_rows(["key"])
+        ]
     )
     seen.append(
         RowReader(str(part.parent), DIMENSION).read(part.name, "s" * 64, np.arange(ROWS)).tobytes()
@@ -254,7 +252,7 @@ def test_index_json_damaged_is_rejected(tmp_path: Path) -> None:
         first_row=0,
         rows=5,
         table_parts={"gallery-drone-000000.parquet": "s" * 64},
-        files={"index.faiss": {"bytes": 9, "sha256": "0" * 64}},
+        files={"index.faiss": FileChecksum(bytes=9, sha256="0" * 64)},
     )
     facts = IndexMetadata(
         factory="Flat",
@@ -262,12 +260,13 @@ def test_index_json_damaged_is_rejected(tmp_path: Path) -> None:
         rows=5,
         dimension=8,
         fingerprint="f" * 64,
+        encoding=None,
         table="/t",
-        asked={"split": None},
-        why="few rows",
+        settings={"split": None},
+        reason="few rows",
         refine="none",
         on_disk=False,
-        effort=SearchParams(breadth=1),
+        search_params=SearchParams(nprobe_or_ef=1),
         target_recall=0.9,
         unit_rows=9,
         part_rows=9,
@@ -316,7 +315,7 @@ def test_calibration_damaged_is_rejected(tmp_path: Path) -> None:
     )
     path = tmp_path / "calibration.json"
     write_calibration(str(path), calibration)
-    look = raising_if_missing(path, lambda: read_calibration(str(path), {"fingerprint": "f" * 64}))
+    look = raising_if_missing(path, lambda: read_calibration(str(path), "f" * 64))
     assert count_detected(path, look, 400) > 300
 
 

@@ -9,13 +9,18 @@ import pytest
 from pipeline.batches.ordered import CHANGED
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.features.embed import Encoder, EncoderSpec, embed_gallery
-from pipeline.features.part import read_rejected
+from pipeline.features.embed import embed_gallery
+from pipeline.features.embed_worker import Encoder, EncoderSpec
+from pipeline.features.encoding import EncodingConfig
+from pipeline.features.part import read_footer
+from pipeline.features.rejected import read_rejected
 from pipeline.features.settings import EmbeddingSettings
-from pipeline.features.table import open_table, read_footer
+from pipeline.features.table import open_table
 from pipeline.shards.manifest import read_manifest
 from pipeline.shards.shard_set import open_shards
 from tests.damaging import update_checksum
+
+ENCODING = EncodingConfig(mirror=False, resizer="torch", precision="float32")
 
 
 def mean_colour_network(fingerprint: str = "f" * 64) -> EncoderSpec:
@@ -29,7 +34,7 @@ def mean_colour_network(fingerprint: str = "f" * 64) -> EncoderSpec:
 
         return encode
 
-    return EncoderSpec(fingerprint=fingerprint, image_size=32, factory=factory)
+    return EncoderSpec(fingerprint=fingerprint, encoding=ENCODING, image_size=32, factory=factory)
 
 
 def test_embed_writes_one_row_per_image(

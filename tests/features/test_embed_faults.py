@@ -20,13 +20,18 @@ import pytest
 
 from pipeline.core import cluster, json_files, storage
 from pipeline.core.cluster import Node
-from pipeline.core.errors import InputError
-from pipeline.features.embed import Encoder, EncoderSpec, IncompleteEmbedding, embed_gallery
-from pipeline.features.part import part_names, read_footer, read_rejected
+from pipeline.core.errors import Incomplete, InputError
+from pipeline.features.embed import embed_gallery
+from pipeline.features.embed_worker import Encoder, EncoderSpec
+from pipeline.features.encoding import EncodingConfig
+from pipeline.features.part import part_names, read_footer
+from pipeline.features.rejected import read_rejected
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table, verify_table
 from pipeline.shards.manifest import Shard, read_manifest
 from tests.damaging import update_checksum
+
+ENCODING = EncodingConfig(mirror=False, resizer="pillow", precision="float32")
 
 
 def network_of_colours(
@@ -59,7 +64,7 @@ def network_of_colours(
 
         return encode
 
-    return EncoderSpec(fingerprint="f" * 64, image_size=16, resizer="pillow", factory=factory)
+    return EncoderSpec(fingerprint="f" * 64, encoding=ENCODING, image_size=16, factory=factory)
 
 
 def settings_of(shards: str | Path, out: str | Path, **more: Any) -> EmbeddingSettings:
@@ -120,7 +125,7 @@ def test_embed_skips_shard_that_kills_its_worker(
     pids.mkdir()
     blacken(copied, shard)
     with pytest.raises(
-        IncompleteEmbedding, match=rf"1 of \d+ shards .* again: {shard.name} \(lost 3 workers: "
+        Incomplete, match=rf"1 of \d+ shards .* again: {shard.name} \(lost 3 workers: "
     ):
         embed_gallery(settings_of(copied, out), network_of_colours(spoil="kill", pids=str(pids)))
     # Two at first, and one for each death after which there was more to do.
@@ -148,7 +153,7 @@ def test_embed_unexpected_error_skips_one_shard(tmp_path: Path, copied: Path) ->
     shard = a_shard(copied)
     blacken(copied, shard)
     with pytest.raises(
-        IncompleteEmbedding,
+        Incomplete,
         match=rf"{shard.name} \(lost 3 workers: ZeroDivisionError: a kernel failed\)",
     ):
         embed_gallery(
@@ -161,7 +166,7 @@ def test_embed_rejects_nan_embeddings(tmp_path: Path, copied: Path) -> None:
     shard = a_shard(copied)
     blacken(copied, shard)
     with pytest.raises(
-        IncompleteEmbedding,
+        Incomplete,
         match=rf"the network gives {shard.split}-{shard.view}-\S+ an embedding of length nan",
     ):
         embed_gallery(settings_of(copied, tmp_path / "table"), network_of_colours(spoil="nan"))
@@ -177,7 +182,7 @@ def test_embed_skips_truncated_tar_until_repaired(
     whole = tar.read_bytes()
     tar.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(
-        IncompleteEmbedding, match=rf"{shard.name} \(unusable: \S+{shard.name}\.tar has \d+ bytes"
+        Incomplete, match=rf"{shard.name} \(unusable: \S+{shard.name}\.tar has \d+ bytes"
     ):
         embed_gallery(settings_of(copied, out), network_of_colours(pids=str(pids)))
     assert len(list(pids.iterdir())) <= 2  # no worker was lost over it
@@ -228,7 +233,7 @@ def test_embed_full_disk_stops_and_resumes(
 ) -> None:
     out = tmp_path / "table"
     with pytest.raises(
-        IncompleteEmbedding, match=r"cannot be written \(No space left on device\).*to go on"
+        Incomplete, match=r"cannot be written \(No space left on device\).*to resume"
     ):
         embed_gallery(
             settings_of(tiny_shards, out, workers=1), network_of_colours(at_start=full_disk())

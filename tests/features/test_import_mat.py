@@ -15,8 +15,9 @@ from pipeline.evaluation import exports
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.settings import EvaluationSettings
 from pipeline.features.import_mat import import_features
+from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.features.settings import ImportSettings
-from pipeline.features.table import PartFooter, PartRows, open_table, write_part
+from pipeline.features.table import open_table
 from tests.evaluation.test_evaluate import TEST_SET, made_table
 
 FIGURES = ("queries", "gallery", "r1", "r5", "r10", "r1p", "ap")

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.core.arrays import Floats
 from pipeline.core.records import Split, View
-from pipeline.features.table import Floats, PartFooter, PartRows, open_table, write_part
+from pipeline.features.part import PartFooter, PartRows, write_part
+from pipeline.features.table import open_table
 from pipeline.retrieval.metrics import Protocol
 from pipeline.retrieval.ranking import BlockSizes
 from pipeline.retrieval.tasks import Task, retrieve

@@ -11,16 +11,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.core.errors import InputError
+from pipeline.core.geo import Box
 from pipeline.core.records import Rejection, Split, View
-from pipeline.features.part import (
-    PartFooter,
-    PartRows,
-    read_footer,
-    read_rejected,
-    write_part,
-    write_rejected,
-)
-from pipeline.features.table import Box, FeatureTable, open_table, verify_table
+from pipeline.features.part import PartFooter, PartRows, read_footer, write_part
+from pipeline.features.rejected import read_rejected, write_rejected
+from pipeline.features.table import FeatureTable, open_table, verify_table
 
 FOOTER = PartFooter(fingerprint="f" * 64, shard_sha256="s" * 64, rows=5)
 
@@ -150,7 +145,7 @@ def test_table_rejects_part_with_missing_rows(tmp_path: Path) -> None:
     write(
         tmp_path, "query", "drone", 0, footer=PartFooter(fingerprint="f", shard_sha256="s", rows=6)
     )
-    with pytest.raises(InputError, match="says version 1 and 6 rows and holds 5"):
+    with pytest.raises(InputError, match="has 5 rows and its footer says 6"):
         open_table(str(tmp_path))
 
 

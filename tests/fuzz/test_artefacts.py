@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
+from pipeline.core.integrity import FileChecksum
 from pipeline.core.json_files import (
     CHECKSUM_KEY,
     checksum_of,
@@ -23,7 +24,9 @@ from pipeline.core.json_files import (
     read_checksummed,
 )
 from pipeline.core.records import Rejection, Split, View
-from pipeline.features.part import PartFooter, PartRows, read_rejected, write_part
+from pipeline.features.encoding import EncodingConfig
+from pipeline.features.part import PartFooter, PartRows, write_part
+from pipeline.features.rejected import read_rejected
 from pipeline.features.row_reader import RowReader
 from pipeline.features.table import open_table, verify_table
 from pipeline.index.metadata import (
@@ -66,19 +69,20 @@ MANIFEST = Manifest(
     packing={"source": "photos"},
     rejected=0,
 )
-FILE = {"bytes": 10, "sha256": "0" * 64}
+FILE = FileChecksum(bytes=10, sha256="0" * 64)
 FACTS = IndexMetadata(
     factory="Flat",
     metric="inner product",
     rows=2,
     dimension=4,
     fingerprint="0" * 64,
+    encoding=EncodingConfig(mirror=True, resizer="torch", precision="float32"),
     table="/nowhere",
-    asked={"split": None},
-    why="small",
+    settings={"split": None},
+    reason="small",
     refine="none",
     on_disk=False,
-    effort=SearchParams(breadth=1),
+    search_params=SearchParams(nprobe_or_ef=1),
     target_recall=0.95,
     unit_rows=2,
     part_rows=2,
@@ -182,7 +186,7 @@ def test_a_calibration(folder: Path, data: st.DataObject) -> None:
     write_calibration(str(path), CONFIDENCE)
     put(data, path, read_checksummed(str(path)))
     with bounded(InputError):
-        found = read_calibration(str(path), {"fingerprint": "0" * 64})
+        found = read_calibration(str(path), "0" * 64)
         assert np.isfinite(found.model.probabilities(np.zeros((1, len(FEATURE_NAMES))))).all()
 
 

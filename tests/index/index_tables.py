@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.features.table import Floats, PartFooter, PartRows, write_part
+from pipeline.core.arrays import Floats
+from pipeline.features.part import PartFooter, PartRows, write_part
 
 
 def clustered(count: int, dimension: int, seed: int, clusters: int = 30) -> Floats:

@@ -24,7 +24,7 @@ from pipeline.features.table import open_table
 from pipeline.index import build as index_build
 from pipeline.index import workspace
 from pipeline.index.build import build_index
-from pipeline.index.part import read_faiss
+from pipeline.index.faiss_io import read_faiss
 from pipeline.index.plan import GallerySpec, IndexPlan, plan_index
 from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings, parse_bytes
@@ -65,8 +65,8 @@ def test_build_by_units_equals_one_pass(
     monkeypatch.setattr("pipeline.index.plan.MIN_UNIT_ROWS", 250)
     monkeypatch.setattr("pipeline.index.plan.UNIT_SHARE", 0)
     units = build(table, tmp_path / "units", factory=factory)
-    assert units.told.unit_rows == 250
-    assert len(units.told.parts) == 1
+    assert units.metadata.unit_rows == 250
+    assert len(units.metadata.parts) == 1
     assert answers(units, table) == answers(whole, table)
 
 
@@ -89,7 +89,7 @@ def test_build_in_parts_answers_as_one(table: str, tmp_path: Path, factory: str)
         build(table, tmp_path / f"{parts}", factory=factory, parts=parts, target_recall=1.0)
         for parts in (1, 3)
     )
-    assert [part.rows for part in three.told.parts] == [400, 200, 400], (
+    assert [part.rows for part in three.metadata.parts] == [400, 200, 400], (
         "whole parts of the table, about a third each"
     )
     assert (tmp_path / "3" / "index-000001.faiss").exists()
@@ -107,7 +107,7 @@ KILLED = """
     from pipeline.index.build import build_index
     from pipeline.index.settings import IndexSettings
     from pipeline.core.records import Split, View
-    index_plan.LEAST_UNIT_ROWS, index_plan.UNIT_SHARE = 250, 0
+    index_plan.MIN_UNIT_ROWS, index_plan.UNIT_SHARE = 250, 0
     calls = 0
     def dying(name):
         original = getattr(index_work, name)
@@ -126,7 +126,7 @@ KILLED = """
 
 @pytest.mark.parametrize(
     ("at", "nth", "left"),
-    [("build_unit", 1, 0), ("build_unit", 3, 2), ("merge", 1, 4), ("write_ids", 1, 4)],
+    [("build_unit", 1, 0), ("build_unit", 3, 2), ("merge_units", 1, 4), ("write_ids", 1, 4)],
 )
 def test_build_killed_resumes_to_the_same_answers(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str, nth: int, left: int
@@ -170,7 +170,7 @@ def test_build_does_not_resume_another_plan(
     monkeypatch.undo()
     assert (out / "_building" / "unit-000000.faiss").exists()
     index = build(table, out, factory="IVF4,Flat")
-    assert index.told.factory == "IVF4,Flat"
+    assert index.metadata.factory == "IVF4,Flat"
     assert not (out / "_building").exists()
     assert answers(index, table) == answers(
         build(table, tmp_path / "other", factory="IVF4,Flat"), table
@@ -191,12 +191,12 @@ def test_lists_on_disk_answer_as_in_memory(
             search_bytes=1,
             build_bytes=1,
             expected_recall=0.9,
-            why="",
+            reason="",
         )
 
     monkeypatch.setattr(index_build, "plan_index", on_disk)
     mapped = build(table, tmp_path / "mapped")
-    assert (mapped.told.on_disk, len(mapped.told.parts)) == (True, 2)
+    assert (mapped.metadata.on_disk, len(mapped.metadata.parts)) == (True, 2)
     monkeypatch.setattr(index_build, "plan_index", lambda gallery: on_disk(gallery, on_disk=False))
     read = build(table, tmp_path / "read")
     assert answers(mapped, table) == answers(read, table)
@@ -231,8 +231,8 @@ def test_build_passes_strong_directions_to_planner(tmp_path: Path) -> None:
             target_recall=0.9,
         )
     assert told == [None, 32]
-    assert index.told.factory.startswith("PCA32,")
-    assert index.facts["recall_at_10"] >= 0.9
+    assert index.metadata.factory.startswith("PCA32,")
+    assert index.metadata.measured["recall_at_10"] >= 0.9
 
 
 def test_index_metadata_describes_the_build(table: str, tmp_path: Path) -> None:
@@ -247,23 +247,26 @@ def test_index_metadata_describes_the_build(table: str, tmp_path: Path) -> None:
     assert facts["build_seconds"] > 0
     assert 40 < facts["bytes_per_vector"] < 80
     assert facts["parts"][0]["table_parts"]["gallery-satellite-000000.parquet"] == "shard 0"
-    assert index.told.effort.breadth < 8, "no more lists than it takes"
+    assert index.metadata.search_params.nprobe_or_ef < 8, "no more lists than it takes"
 
 
 def test_build_reports_unreachable_recall(
     table: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     index = build(table, tmp_path / "index", factory="IVF8,PQ2x4", target_recall=0.99)
-    assert index.facts["recall_at_10"] < 0.99
-    assert "however hard the search tries, below the target of 0.99" in capsys.readouterr().err
+    assert index.metadata.measured["recall_at_10"] < 0.99
+    assert "with the most thorough search, below the target of 0.99" in capsys.readouterr().err
 
 
 def test_build_of_all_rows_excludes_own_row_from_recall(table: str, tmp_path: Path) -> None:
     index = build(
         table, tmp_path / "index", factory="IVF8,PQ2x4", split=None, view=None, target_recall=0.99
     )
-    assert index.facts["recall_queries_from"] == "rows of the index, each looking for others"
-    assert index.facts["recall_at_1"] < 0.9
+    assert (
+        index.metadata.measured["recall_queries_from"]
+        == "rows of the index, each looking for others"
+    )
+    assert index.metadata.measured["recall_at_1"] < 0.9
 
 
 def test_build_finished_index_is_a_no_op(
@@ -292,7 +295,7 @@ def test_build_finished_index_is_a_no_op(
         ({"memory_budget": "1MB"}, "raise --memory-budget"),
         ({"memory_budget": "lots"}, "expected a number with KB, MB, GB or TB"),
         ({"target_recall": 1.5}, "expected a fraction"),
-        ({"parts": 0}, "expected at least one part"),
+        ({"parts": 0}, "--parts is 0, expected at least 1"),
         ({"refine": True}, "found --refine without --factory"),
         ({"table": "/nowhere"}, "no feature table at /nowhere"),
     ],
@@ -314,7 +317,7 @@ def test_open_index_names_torn_or_missing_file(table: str, tmp_path: Path, name:
     with pytest.raises(InputError, match=f"{name} has .* bytes, expected .*build the index again"):
         Index(str(out))
     (out / name).unlink()
-    with pytest.raises(InputError, match=f"{name} is not there"):
+    with pytest.raises(InputError, match=f"{name} is missing"):
         Index(str(out))
     (out / name).write_bytes(os.urandom(len(whole)))
     if name != "ids.parquet":  # which searching does not read

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.core.errors import InputError
+from pipeline.core.integrity import checksum_ok, write_checksum
 from pipeline.core.records import Split, View
 from pipeline.evaluation.evaluate import plan_tasks
 from pipeline.evaluation.settings import EvaluationSettings
@@ -17,7 +18,6 @@ from pipeline.features.table import open_table
 from pipeline.index.build import build_index
 from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings
-from pipeline.index.units import checksum_ok, write_checksum
 from pipeline.index.update import extend_index, verify_index
 from tests.damaging import count_detected, damaged_versions, raising_if_missing
 from tests.index.index_tables import write_gallery
@@ -86,7 +86,7 @@ def test_large_index_is_hashed_by_verify_only(
     with pytest.raises(
         InputError, match=r"ids.arrow holds other bytes than were written.*build the index again"
     ):
-        Index(str(out), whole=True)
+        Index(str(out), verify=True)
 
 
 class Killed(Exception):

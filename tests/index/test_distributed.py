@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from pipeline.core.errors import InputError
+from pipeline.core.filters import Filter
 from pipeline.core.geo import Circle
 from pipeline.core.records import Split, View
 from pipeline.features.table import open_table
 from pipeline.index.build import build_index
 from pipeline.index.distributed import DistributedIndex
-from pipeline.index.filters import Filter
 from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings
 from pipeline.index.update import remove_locations
@@ -43,11 +43,11 @@ def test_distributed_answers_equal_one_process(index: tuple[str, str], ray_clust
     queries_QD = open_table(table).select(Split.QUERY).embeddings()
     here = Index(path)
     with DistributedIndex(path, actors=2) as spread:
-        assert len(here.told.parts) == 3
-        assert (len(spread), spread.dimension, spread.facts["fingerprint"]) == (
+        assert len(here.metadata.parts) == 3
+        assert (len(spread), spread.dimension, spread.metadata.fingerprint) == (
             599,
             32,
-            here.facts["fingerprint"],
+            here.metadata.fingerprint,
         )
         for where in (
             None,

@@ -83,7 +83,7 @@ def test_plan_ignores_vectors_without_row_access(gallery: GallerySpec) -> None:
 def test_plan_few_rows_are_searched_exactly() -> None:
     plan = plan_index(GallerySpec(rows=EXACT_ROWS, dimension=2048, budget=4e9, target_recall=0.95))
     assert (plan.factory, plan.training_rows, plan.expected_recall) == ("Flat", 0, 1.0)
-    assert plan.why == "exact search: 100,000 rows are few enough to look at each"
+    assert plan.reason == "exact search: 100,000 rows are few enough to compare each"
     assert (
         plan_index(
             GallerySpec(rows=EXACT_ROWS + 1, dimension=2048, budget=4e9, target_recall=0.95)
@@ -101,7 +101,7 @@ def test_plan_memory_matches_the_index() -> None:
     )
     assert plan.factory == "IVF2048,SQ8"
     assert plan.search_bytes == pytest.approx(2.056e9 + 2048 * 2048 * 4 + 300e6, rel=0.01)
-    assert plan.why == "lists of 8-bit codes: 2,056 bytes a row"
+    assert plan.reason == "lists of 8-bit codes: 2,056 bytes a row"
 
 
 def test_plan_tight_budget_uses_disk_or_smaller_codes() -> None:

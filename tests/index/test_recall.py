@@ -62,8 +62,8 @@ def test_recall_by_hand(built: tuple[str, Index]) -> None:
     """
     table, index = built
     queries = open_table(table).select(Split.QUERY).embeddings()[:2]
-    most = SearchParams(breadth=16, candidates=60)
-    nearest = index.search_rows(queries, 10, effort=most)[1]
+    most = SearchParams(nprobe_or_ef=16, rerank_factor=60)
+    nearest = index.search_rows(queries, 10, params=most)[1]
     wrong = nearest.copy()
     wrong[0, :4] = [10_000, 10_001, 10_002, 10_003]
     held = RecallQueries(
@@ -74,13 +74,13 @@ def test_recall_by_hand(built: tuple[str, Index]) -> None:
 
 def test_search_param_grid_grows() -> None:
     lists = list(search_param_grid(new_index("IVF12,SQ8", 32), "none"))
-    assert [effort.breadth for effort in lists] == [1, 2, 4, 8, 12]
+    assert [effort.nprobe_or_ef for effort in lists] == [1, 2, 4, 8, 12]
     graph = list(search_param_grid(new_index("HNSW8,SQ8", 32), "none"))
-    assert graph[0].breadth == 16
-    assert all(later.breadth > earlier.breadth for earlier, later in pairwise(graph))
+    assert graph[0].nprobe_or_ef == 16
+    assert all(later.nprobe_or_ef > earlier.nprobe_or_ef for earlier, later in pairwise(graph))
     assert len(list(search_param_grid(new_index("Flat", 32), "none"))) == 1
     refined = list(search_param_grid(new_index("PCA16,IVF4,SQ8", 32), "table"))
-    assert [(e.breadth, e.candidates) for e in refined] == [
+    assert [(e.nprobe_or_ef, e.rerank_factor) for e in refined] == [
         (1, 10),
         (2, 10),
         (4, 10),
@@ -103,12 +103,14 @@ def test_tune_takes_the_least_params_at_target(built: tuple[str, Index]) -> None
     ladder = list(search_param_grid(new_index("IVF16,PQ4x4fs", 32), "table"))
     effort, _, at_10 = tune(index, held, iter(ladder), 0.9)
     assert at_10 >= 0.9
-    less = [step for step in ladder if step.breadth < effort.breadth]
+    less = [step for step in ladder if step.nprobe_or_ef < effort.nprobe_or_ef]
     assert all(measure_recall(index, held, step)[1] < 0.9 for step in less)
     assert (
-        effort.candidates == 1
+        effort.rerank_factor == 1
         or measure_recall(
-            index, held, SearchParams(breadth=effort.breadth, candidates=effort.candidates // 2)
+            index,
+            held,
+            SearchParams(nprobe_or_ef=effort.nprobe_or_ef, rerank_factor=effort.rerank_factor // 2),
         )[1]
         < 0.9
     )

@@ -10,12 +10,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.core import storage
+from pipeline.core.arrays import Floats
 from pipeline.core.errors import InputError
+from pipeline.core.filters import Filter
 from pipeline.core.geo import Box, Circle
 from pipeline.core.records import Split, View
-from pipeline.features.table import Floats, open_table
+from pipeline.features.table import open_table
 from pipeline.index.build import build_index
-from pipeline.index.filters import Filter
 from pipeline.index.metadata import SearchParams
 from pipeline.index.part import FILTERED_EXACT_ROWS, NO_ROW
 from pipeline.index.searcher import Index, merge_results
@@ -65,7 +66,7 @@ def brute_force(table: str, where: Filter | None, k: int) -> tuple[Floats, list[
     scores_QN = queries_QD @ gallery.embeddings().T
     masks = [
         (where or Filter()).mask(rows.combine_chunks().to_batches()[0])
-        for _, rows in gallery.numbered(["view", "location", "lat", "lon"])
+        for _, rows in gallery.numbered_rows(["view", "location", "lat", "lon"])
     ]
     scores_QN[:, ~np.concatenate(masks)] = -np.inf
     best_QK = np.argsort(-scores_QN, axis=1, kind="stable")[
@@ -146,8 +147,10 @@ def test_search_without_the_table_uses_codes(
 def test_search_reranked_scores_are_exact(table: str, tmp_path: Path) -> None:
     out = build(table, tmp_path / "index", factory="IVF4,PQ4x4fs", refine=True, target_recall=0.01)
     queries_QD, keys, scores = brute_force(table, None, 10)
-    rough = Index(out).search(queries_QD, 10, effort=SearchParams(breadth=4))
-    refined = Index(out).search(queries_QD, 10, effort=SearchParams(breadth=4, candidates=30))
+    rough = Index(out).search(queries_QD, 10, params=SearchParams(nprobe_or_ef=4))
+    refined = Index(out).search(
+        queries_QD, 10, params=SearchParams(nprobe_or_ef=4, rerank_factor=30)
+    )
     right = [
         np.mean(
             [

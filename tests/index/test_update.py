@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from pipeline.core.errors import InputError
+from pipeline.core.filters import Filter
 from pipeline.core.records import Split, View
 from pipeline.features.table import open_table
 from pipeline.index import workspace
 from pipeline.index.build import build_index
-from pipeline.index.filters import Filter
 from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings
 from pipeline.index.update import extend_index, remove_locations, verify_index
@@ -54,9 +54,9 @@ def test_extend_finds_new_parts(table: Path, tmp_path: Path, factory: str) -> No
     write_gallery(table, parts=2, first=2)
     with pytest.raises(InputError, match="2 more by now; say --extend"):
         build(table, tmp_path / "index", factory)
-    facts = extend_index(str(table), out)
-    assert (facts["rows"], len(Index(out)), len(facts["parts"])) == (800, 800, 2)
-    assert facts["recall_at_10"] >= 0.96
+    metadata = extend_index(str(table), out)
+    assert (metadata.rows, len(Index(out)), len(metadata.parts)) == (800, 800, 2)
+    assert metadata.measured["recall_at_10"] >= 0.96
     assert (tmp_path / "index" / "index.faiss").stat().st_mtime_ns == first, (
         "what was there was not built again"
     )
@@ -95,7 +95,7 @@ def test_extend_killed_leaves_the_index_unchanged(
         extend_index(str(table), out)
     assert keys(out, table) == before
     monkeypatch.undo()
-    assert extend_index(str(table), out)["rows"] == 600
+    assert extend_index(str(table), out).rows == 600
 
 
 @pytest.mark.parametrize("factory", FACTORIES)

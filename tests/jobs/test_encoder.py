@@ -1,5 +1,5 @@
-"""A checkpoint as the embedder's workers build it: the same images to check it by each time, and a
-fingerprint that tells.
+"""The encoder that a worker builds from a checkpoint: its probe images, its fingerprint, and its
+agreement with the plain encoder.
 """
 
 from dataclasses import replace
@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from jobs.encoding import encoder as encoders
-from jobs.encoding.encoder import PROBE_IMAGES, first_images, make_encoder_spec
+from jobs.encoding import encoder as encoder_module
+from jobs.encoding import probe_images
+from jobs.encoding.encoder import make_encoder_spec
+from jobs.encoding.probe_images import PROBE_IMAGES, ImageBytes, first_images
 from jobs.encoding.settings import EncoderSettings
 from jobs.training.recipes import smoke
 from jobs.training.settings import RunConfig
@@ -22,6 +24,7 @@ from model.inference.int8 import PrecisionError
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split
 from pipeline.features.embed import embed_gallery
+from pipeline.features.encoding import EncodingConfig
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table
 from pipeline.images.transforms import Resizer
@@ -35,85 +38,80 @@ def checkpoint(tiny_shards: str) -> bytes:
     )
 
 
-def asked(shards: str, **changes: object) -> EmbeddingSettings:
+def settings_of(shards: str, **changes: object) -> EmbeddingSettings:
     return EmbeddingSettings(**({"shards": shards, "out": "none"} | changes))  # type: ignore[arg-type]
 
 
-def images_of(
-    embedding: EmbeddingSettings, size: int, resizer: Resizer, count: int
-) -> encoders.Bytes:
+def images_of(embedding: EmbeddingSettings, size: int, resizer: Resizer, count: int) -> ImageBytes:
     shards = open_or_scan(embedding.shards, embedding.split, embedding.view)
     return first_images(shards, size, resizer, count)
 
 
-def test_check_images_are_constant_and_of_every_view(
-    tiny_shards: str,
-) -> None:
-    first, again = (images_of(asked(tiny_shards), 32, "torch", 12) for _ in range(2))
+def test_first_images_are_the_same_for_every_split(tiny_shards: str) -> None:
+    first, again = (images_of(settings_of(tiny_shards), 32, "torch", 12) for _ in range(2))
     assert first.shape == (12, 3, 32, 32)
     assert np.array_equal(first, again)
-    # Queries and gallery may be embedded one after the other: what calibrates int8 must not depend
-    # on it.
-    assert np.array_equal(first, images_of(asked(tiny_shards, split=Split.QUERY), 32, "torch", 12))
+    # Queries and gallery may be embedded one after the other: the images that calibrate int8 must
+    # not depend on it.
+    of_queries = images_of(settings_of(tiny_shards, split=Split.QUERY), 32, "torch", 12)
+    assert np.array_equal(first, of_queries)
 
 
-def test_encoder_spec_reports_shard_without_decodable_image(
+def test_first_images_refuse_shards_without_a_decodable_image(
     tiny_shards: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(encoders, "decode_samples", lambda samples, *given: iter([]))
+    monkeypatch.setattr(probe_images, "decode_samples", lambda samples, *given: iter([]))
     with pytest.raises(InputError, match="none of the first images of"):
-        images_of(asked(tiny_shards), 32, "torch", PROBE_IMAGES)
+        images_of(settings_of(tiny_shards), 32, "torch", PROBE_IMAGES)
 
 
-def test_worker_encoder_equals_plain_encoder(tiny_shards: str, checkpoint: bytes) -> None:
-    made = make_encoder_spec(checkpoint, "it", asked(tiny_shards)).factory(1)
-    images = images_of(asked(tiny_shards), 64, "torch", 5)
+def test_worker_encoder_agrees_with_the_plain_encoder(tiny_shards: str, checkpoint: bytes) -> None:
+    encoder = make_encoder_spec(checkpoint, "it", settings_of(tiny_shards)).factory(1)
+    images = images_of(settings_of(tiny_shards), 64, "torch", 5)
     plain = embed(build_encoder(loads(checkpoint)), torch.from_numpy(images)).numpy()
-    assert np.abs(made(images) - plain).max() < 1e-4
-    assert "folded encoder in float32: cosine with the plain one 1.0" in made.remarks[-1]  # type: ignore[attr-defined]
+    assert np.abs(encoder(images) - plain).max() < 1e-4
+    assert "folded encoder in float32: cosine with the plain one 1.0" in encoder.remarks[-1]  # type: ignore[attr-defined]
 
 
-def test_fingerprint_includes_settings_that_change_numbers(
-    tiny_shards: str, checkpoint: bytes
-) -> None:
+def test_fingerprint_covers_the_encoding(tiny_shards: str, checkpoint: bytes) -> None:
     def fingerprint(**changes: Any) -> str:
-        return make_encoder_spec(
-            checkpoint, "it", asked(tiny_shards), EncoderSettings(**changes)
-        ).fingerprint
+        settings = EncoderSettings(**changes)
+        return make_encoder_spec(checkpoint, "it", settings_of(tiny_shards), settings).fingerprint
 
     assert fingerprint() == fingerprint(precision="float32") == fingerprint(compiling="never")
-    assert (
-        len(
-            {
-                fingerprint(),
-                fingerprint(mirror=False),
-                fingerprint(resizer="pillow"),
-                fingerprint(precision="bfloat16"),
-            }
-        )
-        == 4
-    )
+    different = {
+        fingerprint(),
+        fingerprint(mirror=False),
+        fingerprint(resizer="pillow"),
+        fingerprint(precision="bfloat16"),
+    }
+    assert len(different) == 4
 
 
-def test_int8_unavailable_is_rejected_before_workers(
+def test_int8_unavailable_is_refused_before_any_worker_starts(
     tiny_shards: str, checkpoint: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def without(device: str) -> None:
+    def unavailable(device: str) -> None:
         raise PrecisionError("this CPU has none; choose --precision float32")
 
-    monkeypatch.setattr(encoders, "require_int8", without)
+    monkeypatch.setattr(encoder_module, "require_int8", unavailable)
+    settings = EncoderSettings(precision="int8")
     with pytest.raises(InputError, match="choose --precision float32"):
-        make_encoder_spec(checkpoint, "it", asked(tiny_shards), EncoderSettings(precision="int8"))
+        make_encoder_spec(checkpoint, "it", settings_of(tiny_shards), settings)
 
 
-def test_encoder_remarks_reach_the_terminal(
+def test_table_records_the_encoding_and_remarks_are_printed(
     tmp_path: Path,
     tiny_shards: str,
     checkpoint: bytes,
     ray_cluster: None,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    embedding = asked(tiny_shards, out=str(tmp_path), split=Split.QUERY)
-    embed_gallery(embedding, make_encoder_spec(checkpoint, "it", embedding))
+    embedding = settings_of(tiny_shards, out=str(tmp_path), split=Split.QUERY)
+    spec = make_encoder_spec(checkpoint, "it", embedding, EncoderSettings(resizer="pillow"))
+    embed_gallery(embedding, spec)
     assert "folded encoder in float32" in capsys.readouterr().err
-    assert open_table(str(tmp_path)).rows > 0
+    table = open_table(str(tmp_path))
+    assert table.rows > 0
+    assert table.encoding == spec.encoding
+    assert spec.encoding == EncodingConfig(mirror=True, resizer="pillow", precision="float32")

@@ -1,4 +1,4 @@
-"""Photos are embedded as the gallery was, whatever its settings were, and by no other network."""
+"""Photos are encoded as the gallery was, by the encoding in the index, and by no other network."""
 
 import io
 from typing import Any
@@ -8,16 +8,17 @@ import pytest
 import torch
 from PIL import Image
 
+from jobs.encoding.encoder import encoder_fingerprint
 from jobs.encoding.photo_encoder import PhotoEncoder
-from model.checkpoint import Checkpoint, dumps, fingerprint, loads
+from model.checkpoint import Checkpoint, dumps, loads
 from model.config import PVDAConfig
 from model.inference.embed import embed
-from model.inference.precision import describe_preprocessing
 from model.pvda import FeatureEncoder
 from pipeline.batches.ordered import stack
 from pipeline.core.errors import InputError
+from pipeline.features.encoding import EncodingConfig
 from pipeline.images.decode import decode
-from pipeline.images.transforms import Resizer, preprocessing_name, resize
+from pipeline.images.transforms import Resizer, resize
 
 
 @pytest.fixture
@@ -29,11 +30,12 @@ def checkpoint(lively_encoder: FeatureEncoder) -> bytes:
     )
 
 
-def facts(
+def identity_of(
     checkpoint: bytes, resizer: Resizer = "torch", mirror: bool = True, precision: Any = "float32"
-) -> dict[str, Any]:
-    said = describe_preprocessing(f"{preprocessing_name(resizer)}, mirror {mirror}", precision)
-    return {"fingerprint": fingerprint(loads(checkpoint), said)}
+) -> tuple[str, EncodingConfig]:
+    """Fingerprint and encoding, as the metadata of an index has them."""
+    encoding = EncodingConfig(mirror=mirror, resizer=resizer, precision=precision)
+    return encoder_fingerprint(loads(checkpoint), encoding), encoding
 
 
 def photo(seed: int, size: int = 90) -> bytes:
@@ -44,11 +46,11 @@ def photo(seed: int, size: int = 90) -> bytes:
 
 
 @pytest.mark.parametrize(("resizer", "mirror"), [("torch", True), ("pillow", False)])
-def test_photo_encoder_embeds_as_the_gallery(
+def test_photo_encoder_embeds_as_the_gallery_was(
     checkpoint: bytes, lively_encoder: FeatureEncoder, resizer: Resizer, mirror: bool
 ) -> None:
     photos = [photo(1), photo(2)]
-    encoder = PhotoEncoder(checkpoint, "last.pt", facts(checkpoint, resizer, mirror))
+    encoder = PhotoEncoder(checkpoint, "last.pt", *identity_of(checkpoint, resizer, mirror))
     found_QD, rejected = encoder.encode(photos)
     images_B3HW = torch.from_numpy(stack([resize(decode(data), 64, resizer) for data in photos]))
     assert rejected == [None, None]
@@ -56,27 +58,51 @@ def test_photo_encoder_embeds_as_the_gallery(
 
 
 def test_photo_encoder_takes_the_precision_of_the_index(checkpoint: bytes) -> None:
-    encoder = PhotoEncoder(checkpoint, "last.pt", facts(checkpoint, precision="bfloat16"))
-    assert encoder.precision == "bfloat16"
+    encoder = PhotoEncoder(checkpoint, "last.pt", *identity_of(checkpoint, precision="bfloat16"))
+    assert encoder.encoding.precision == "bfloat16"
+    assert "encoder in bfloat16" in encoder.remarks[-1]
 
 
-def test_photo_encoder_reports_damaged_photo_in_order(checkpoint: bytes) -> None:
-    encoder = PhotoEncoder(checkpoint, "last.pt", facts(checkpoint))
+def test_encode_reports_a_damaged_photo_and_keeps_the_order(checkpoint: bytes) -> None:
+    encoder = PhotoEncoder(checkpoint, "last.pt", *identity_of(checkpoint))
     photos = [photo(1), photo(2)[:-40], b"", photo(3)]
     found_QD, rejected = encoder.encode(photos, ["a", "b", "c", "d"])
     alone_QD, _ = encoder.encode([photo(3)])
     assert found_QD.shape == (2, encoder.dimension)
     assert np.allclose(found_QD[1], alone_QD[0], atol=1e-5)
     assert [one and (one.path, one.reason) for one in rejected] == [
-        None, ("b", "truncated image"), ("c", "empty file"), None,
-    ]  # fmt: skip
+        None,
+        ("b", "truncated image"),
+        ("c", "empty file"),
+        None,
+    ]
 
 
-def test_photo_encoder_without_photos_gives_no_rows(checkpoint: bytes) -> None:
-    encoder = PhotoEncoder(checkpoint, "last.pt", facts(checkpoint))
+def test_encode_of_no_photo_gives_no_rows(checkpoint: bytes) -> None:
+    encoder = PhotoEncoder(checkpoint, "last.pt", *identity_of(checkpoint))
     assert encoder.encode([])[0].shape == (0, encoder.dimension)
 
 
-def test_photo_encoder_rejects_another_network(checkpoint: bytes) -> None:
+def test_photo_encoder_refuses_another_network(checkpoint: bytes) -> None:
+    _, encoding = identity_of(checkpoint)
     with pytest.raises(InputError, match=r"last.pt did not make this index.*abcabcabcabc"):
-        PhotoEncoder(checkpoint, "last.pt", {"fingerprint": "abc" * 20})
+        PhotoEncoder(checkpoint, "last.pt", "abc" * 20, encoding)
+
+
+def test_photo_encoder_refuses_another_encoding(checkpoint: bytes) -> None:
+    fingerprint, _ = identity_of(checkpoint)
+    _, pillow = identity_of(checkpoint, "pillow")
+    with pytest.raises(InputError, match=r"last.pt did not make this index"):
+        PhotoEncoder(checkpoint, "last.pt", fingerprint, pillow)
+
+
+def test_photo_encoder_refuses_an_index_of_imported_features(checkpoint: bytes) -> None:
+    with pytest.raises(InputError, match=r"another program made.*jobs/embed_gallery\.py"):
+        PhotoEncoder(checkpoint, "last.pt", "f" * 64, None)
+
+
+def test_photo_encoder_needs_the_shards_of_an_int8_index(checkpoint: bytes) -> None:
+    encoding = EncodingConfig(mirror=True, resizer="torch", precision="int8", calibration="c" * 8)
+    fingerprint = encoder_fingerprint(loads(checkpoint), encoding)
+    with pytest.raises(InputError, match=r"encoded in int8.*expected --shards"):
+        PhotoEncoder(checkpoint, "last.pt", fingerprint, encoding)

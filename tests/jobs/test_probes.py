@@ -11,10 +11,9 @@ from jobs.training.probes import embed_view, probe, view_gap
 from jobs.training.recipes import smoke
 from model.pvda import FeatureEncoder
 from pipeline.batches.training import StreamConfig, TrainingStream
-from pipeline.core.arrays import Pixels
+from pipeline.core.arrays import Floats, Pixels
 from pipeline.core.errors import InputError
 from pipeline.core.records import View
-from pipeline.features.table import Floats
 from pipeline.images.decode import DecodeError, decode
 from pipeline.shards.shard_set import open_shards
 

@@ -1,15 +1,13 @@
 """Fitting a calibration on made-up galleries: right answers, the threshold, the agreement
 radius."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
+from pipeline.core.arrays import Floats
 from pipeline.core.errors import InputError
+from pipeline.core.filters import Filter
 from pipeline.core.records import View
-from pipeline.features.table import Floats
-from pipeline.index.filters import Filter
 from pipeline.index.searcher import Hit
 from pipeline.locate.calibrate import (
     CalibrationContext,
@@ -215,7 +213,6 @@ class Rows:
             hit(name, 1 - n / 1000, 0.0 if name == "own" else 5000.0 * n)
             for n, name in enumerate(names)
         ]
-        self.facts: dict[str, Any] = {}
         self.dimension = 2
 
     def __len__(self) -> int:

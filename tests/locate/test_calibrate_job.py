@@ -10,15 +10,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from jobs.encoding.encoder import encoder_fingerprint
 from jobs.encoding.photo_encoder import PhotoEncoder
 from jobs.stages.calibrate import calibrate_index
 from jobs.stages.settings import CalibrateSettings
-from model.checkpoint import Checkpoint, dumps, fingerprint, loads
+from model.checkpoint import Checkpoint, dumps, loads
 from model.config import PVDAConfig
 from model.pvda import FeatureEncoder
 from pipeline.core.errors import InputError
-from pipeline.features.table import PartFooter, PartRows, write_part
-from pipeline.images.transforms import preprocessing_name, resize
+from pipeline.features.encoding import EncodingConfig
+from pipeline.features.part import PartFooter, PartRows, write_part
+from pipeline.images.transforms import resize
 from pipeline.index.build import build_index
 from pipeline.index.settings import IndexSettings
 from pipeline.locate.calibration import find_calibration
@@ -27,6 +29,7 @@ from pipeline.shards.settings import PackingSettings
 from pipeline.sources.university1652 import University1652
 
 HELD_OUT, TRAINED, GALLERY_ROWS = 20, 3, 40
+ENCODING = EncodingConfig(mirror=True, resizer="torch", precision="float32")
 
 
 def image(seed: int, size: int = 64) -> bytes:
@@ -57,8 +60,8 @@ def world(tmp_path: Path, ray_cluster: None, lively_encoder: FeatureEncoder) -> 
     plain = Checkpoint(network=network, recipe={}, locations=[], epoch=0, history=[], state=state)
     data = dumps(replace(plain, locations=[f"{number:04d}" for number in range(TRAINED)]))
     (tmp_path / "last.pt").write_bytes(data)
-    mark = fingerprint(loads(data), f"{preprocessing_name()}, mirror True")
-    rows_ND, _ = PhotoEncoder(data, "last.pt", {"fingerprint": mark}).encode(
+    mark = encoder_fingerprint(loads(data), ENCODING)
+    rows_ND, _ = PhotoEncoder(data, "last.pt", mark, ENCODING).encode(
         [image(5000 + n) for n in range(GALLERY_ROWS)]
     )
     names = [f"g{number}" for number in range(GALLERY_ROWS)]
@@ -71,7 +74,7 @@ def world(tmp_path: Path, ray_cluster: None, lively_encoder: FeatureEncoder) -> 
         lons=[None] * GALLERY_ROWS,
         embeddings_BD=rows_ND,
     )
-    footer = PartFooter(fingerprint=mark, shard_sha256="s", rows=GALLERY_ROWS)
+    footer = PartFooter(fingerprint=mark, shard_sha256="s", rows=GALLERY_ROWS, encoding=ENCODING)
     write_part(str(tmp_path / "table" / "gallery-satellite-000000.parquet"), rows, footer)
     build_index(IndexSettings(table=str(tmp_path / "table"), out=str(tmp_path / "index")))
     return {
@@ -90,8 +93,8 @@ def test_calibrate_job_uses_held_out_locations(
         0.5, abs=0.1
     )  # a photo of something else may hit by chance
     assert (made.gallery_rows, made.spacing_m, made.agreement_radius_m) == (GALLERY_ROWS, None, 0)
-    facts = json.loads((tmp_path / "index" / "index.json").read_text())
-    assert find_calibration(world["index"], facts) == made
+    metadata = json.loads((tmp_path / "index" / "index.json").read_text())
+    assert find_calibration(world["index"], metadata["fingerprint"]) == made
     assert (tmp_path / "index" / "calibration.svg").read_text().startswith("<svg")
     capsys.readouterr()
     assert calibrate_index(CalibrateSettings(**world)) == made

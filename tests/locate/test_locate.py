@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.core.arrays import Floats
 from pipeline.core.errors import InputError
+from pipeline.core.filters import Filter
 from pipeline.core.records import View
-from pipeline.features.table import Floats
-from pipeline.index.filters import Filter
 from pipeline.index.searcher import Hit
 from pipeline.locate.calibration import (
     Calibration,
@@ -80,7 +80,6 @@ class Gallery:
 
     def __init__(self, hits: list[Hit]) -> None:
         self.hits, self.requested_k = hits, [0]
-        self.facts: dict[str, Any] = {}
         self.dimension = 4
 
     def __len__(self) -> int:
@@ -151,8 +150,8 @@ def test_relative_scores_by_hand() -> None:
 
 def test_calibration_round_trip(tmp_path: Any) -> None:
     write_calibration(str(tmp_path / "calibration.json"), calibration())
-    assert find_calibration(str(tmp_path), {"fingerprint": "f" * 64}) == calibration()
-    assert find_calibration(str(tmp_path / "elsewhere"), {"fingerprint": "f" * 64}) is None
+    assert find_calibration(str(tmp_path), "f" * 64) == calibration()
+    assert find_calibration(str(tmp_path / "elsewhere"), "f" * 64) is None
 
 
 @pytest.mark.parametrize(
@@ -166,13 +165,13 @@ def test_calibration_round_trip(tmp_path: Any) -> None:
 def test_calibration_invalid_file_is_refused(tmp_path: Any, text: str, sentence: str) -> None:
     (tmp_path / "calibration.json").write_text(text)
     with pytest.raises(InputError, match=sentence):
-        read_calibration(str(tmp_path / "calibration.json"), {"fingerprint": "f" * 64})
+        read_calibration(str(tmp_path / "calibration.json"), "f" * 64)
 
 
 def test_calibration_of_another_encoder_is_refused(tmp_path: Any) -> None:
     write_calibration(str(tmp_path / "calibration.json"), calibration())
     with pytest.raises(InputError, match="encoder ffffffffffff and the index with 000"):
-        read_calibration(str(tmp_path / "calibration.json"), {"fingerprint": "0" * 64})
+        read_calibration(str(tmp_path / "calibration.json"), "0" * 64)
 
 
 def test_apply_track_decides_uncertain_photo_in_any_order() -> None:

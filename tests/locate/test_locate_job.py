@@ -11,18 +11,20 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from jobs.encoding.encoder import encoder_fingerprint
 from jobs.encoding.photo_encoder import PhotoEncoder
 from jobs.stages.locate import locate as main
 from jobs.stages.locate import locate_photos
 from jobs.stages.settings import LocateSettings
-from model.checkpoint import Checkpoint, dumps, fingerprint, loads
+from model.checkpoint import Checkpoint, dumps, loads
 from model.config import PVDAConfig
 from model.pvda import FeatureEncoder
 from pipeline.core import storage
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.geo import Circle
-from pipeline.features.table import PartFooter, PartRows, write_part
-from pipeline.images.transforms import preprocessing_name, resize
+from pipeline.features.encoding import EncodingConfig
+from pipeline.features.part import PartFooter, PartRows, write_part
+from pipeline.images.transforms import resize
 from pipeline.index.build import build_index
 from pipeline.index.settings import IndexSettings
 from pipeline.locate.calibration import Calibration, write_calibration
@@ -30,6 +32,7 @@ from pipeline.locate.logistic import LogisticModel
 
 LOCATIONS = 12
 STEP = 1e-3  # degrees between places, about 111 m
+ENCODING = EncodingConfig(mirror=True, resizer="torch", precision="float32")
 
 
 def photo(number: int, blur: int = 80) -> bytes:
@@ -50,8 +53,8 @@ def world(tmp_path: Path, lively_encoder: FeatureEncoder) -> dict[str, str]:
         Checkpoint(network=network, recipe={}, locations=[], epoch=0, history=[], state=state)
     )
     (tmp_path / "last.pt").write_bytes(data)
-    mark = fingerprint(loads(data), f"{preprocessing_name()}, mirror True")
-    rows_ND, _ = PhotoEncoder(data, "last.pt", {"fingerprint": mark}).encode(
+    mark = encoder_fingerprint(loads(data), ENCODING)
+    rows_ND, _ = PhotoEncoder(data, "last.pt", mark, ENCODING).encode(
         [photo(number) for number in range(LOCATIONS)]
     )
     names = [f"{number:04d}" for number in range(LOCATIONS)]

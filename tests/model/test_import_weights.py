@@ -388,7 +388,7 @@ def test_import_torchvision_reports_untrained_refinement(
     assert (
         len(prints | {network.fingerprint for network in networks}) == 4
     )  # tables of other preprocessing do not mix
-    assert networks[0].resizer == "pillow"
+    assert networks[0].encoding.resizer == "pillow"
 
 
 def test_import_weights_lists_names_of_another_depth(tmp_path: Path) -> None:

@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.core.arrays import Floats
 from pipeline.core.records import View
-from pipeline.features.table import Floats, PartFooter, PartRows, open_table, write_part
+from pipeline.features.part import PartFooter, PartRows, write_part
+from pipeline.features.table import open_table
 from pipeline.retrieval.embedding_set import embedding_set_from_array
 from pipeline.retrieval.parts import (
     cosines_by_part,

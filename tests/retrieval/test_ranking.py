@@ -7,10 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.core.arrays import Floats
 from pipeline.core.errors import InputError
-from pipeline.features.table import (
-    Floats,
-)
 from pipeline.retrieval import exact_scores, metrics
 from pipeline.retrieval.embedding_set import (
     EmbeddingSet,

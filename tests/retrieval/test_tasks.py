@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pipeline.core.records import Split, View
-from pipeline.features.table import FeatureTable, PartFooter, PartRows, open_table, write_part
+from pipeline.features.part import PartFooter, PartRows, write_part
+from pipeline.features.table import FeatureTable, open_table
 from pipeline.retrieval.tasks import Task, possible_tasks, retrieve
 from tests.retrieval.test_ranking import unit
 

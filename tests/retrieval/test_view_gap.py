@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.features.table import Floats
+from pipeline.core.arrays import Floats
 from pipeline.retrieval import view_gap
 from pipeline.retrieval.embedding_set import EmbeddingSet, embedding_set_from_array
 from pipeline.retrieval.subsets import RowSample, evenly_spaced, take_rows, vectors_by_key

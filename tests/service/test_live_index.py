@@ -13,10 +13,12 @@ import pytest
 from aiohttp.test_utils import TestClient, TestServer
 
 from pipeline.core import json_files
+from pipeline.core.arrays import Floats
 from pipeline.core.errors import InputError
 from pipeline.core.records import Rejection
-from pipeline.features.table import Floats, PartFooter, PartRows, write_part
+from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.index.build import build_index
+from pipeline.index.metadata import IndexMetadata
 from pipeline.index.settings import IndexSettings
 from pipeline.locate.locate import Answer
 from pipeline.service import live_index
@@ -64,7 +66,7 @@ def replace(path: Path, new: Path) -> None:
 class WidthEncoder:
     """Encodes a photo 16 + n pixels wide as location n; one of 15 cannot be decoded."""
 
-    def __init__(self, facts: dict[str, Any]) -> None:
+    def __init__(self, metadata: IndexMetadata | None = None) -> None:
         self.batches: list[int] = []
 
     def encode(self, photos: Sequence[bytes]) -> tuple[Floats, list[Rejection | None]]:

@@ -29,13 +29,13 @@ from model.config import PVDAConfig
 from model.pvda import FeatureEncoder
 from pipeline.core import json_files
 from pipeline.core.errors import InputError
-from pipeline.features.table import PartFooter, PartRows, write_part
+from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.index.build import build_index
 from pipeline.index.settings import IndexSettings
 from pipeline.service import replicas
 from pipeline.service.engine import NotReady
 from pipeline.service.replicas import Replica
-from tests.jobs.test_photo_encoder import facts, photo
+from tests.jobs.test_photo_encoder import identity_of, photo
 from tests.processes import command_line, descendants
 
 ROOT = Path(__file__).parents[2]
@@ -50,8 +50,7 @@ def checkpoint_and_index(tmp_path: Path, lively_encoder: FeatureEncoder) -> tupl
         Checkpoint(network=config, recipe={}, locations=[], epoch=0, history=[], state=state)
     )
     (tmp_path / "last.pt").write_bytes(data)
-    made_by = facts(data)
-    embeddings_BD, _ = PhotoEncoder(data, "last.pt", made_by).encode(
+    embeddings_BD, _ = PhotoEncoder(data, "last.pt", *identity_of(data)).encode(
         [photo(seed) for seed in range(3)]
     )
     part = PartRows(
@@ -63,7 +62,9 @@ def checkpoint_and_index(tmp_path: Path, lively_encoder: FeatureEncoder) -> tupl
         lons=[8.0] * 3,
         embeddings_BD=embeddings_BD,
     )
-    footer = PartFooter(fingerprint=made_by["fingerprint"], shard_sha256="s", rows=3)
+    footer = PartFooter(
+        fingerprint=identity_of(data)[0], shard_sha256="s", rows=3, encoding=identity_of(data)[1]
+    )
     write_part(str(tmp_path / "table" / "a.parquet"), part, footer)
     build_index(IndexSettings(table=str(tmp_path / "table"), out=str(tmp_path / "index")))
     return tmp_path / "last.pt", tmp_path / "index"

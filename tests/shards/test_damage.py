@@ -16,10 +16,10 @@ from jobs.training.settings import TrainSettings
 from pipeline.batches.training import StreamConfig, TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.features.embed import Encoder, pending_shards
-from pipeline.features.embed_worker import EncoderSpec
+from pipeline.features.embed import plan_embedding
 from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.features.settings import EmbeddingSettings
+from pipeline.features.table_writer import FeatureTableWriter
 from pipeline.shards.manifest import DAMAGED_FILE, Shard, read_manifest
 from pipeline.shards.pack import pack
 from pipeline.shards.shard_set import open_shards
@@ -218,12 +218,9 @@ def test_pending_shards_with_verify_finds_damaged_pages(out: Path, tmp_path: Pat
         footer = PartFooter(fingerprint="f" * 64, shard_sha256=shard.sha256, rows=count)
         write_part(str(table / f"{shard.name}.parquet"), rows, footer)
 
-    def never(threads: int) -> Encoder:
-        raise AssertionError
-
     def missing(settings: EmbeddingSettings) -> list[Shard]:
-        network = EncoderSpec(fingerprint="f" * 64, image_size=16, factory=never)
-        return pending_shards(settings, network, manifest.shards)
+        writer = FeatureTableWriter(settings.out, "f" * 64, settings.dtype)
+        return list(plan_embedding(settings, writer).pending)
 
     asked = EmbeddingSettings(shards=str(out), out=str(table))
     assert missing(replace(asked, verify=True)) == []

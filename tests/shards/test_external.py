@@ -16,7 +16,9 @@ from PIL import Image
 from pipeline.batches.training import StreamConfig, TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.features.embed import Encoder, EncoderSpec, embed_gallery
+from pipeline.features.embed import embed_gallery
+from pipeline.features.embed_worker import Encoder, EncoderSpec
+from pipeline.features.encoding import EncodingConfig
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table
 from pipeline.shards.external import external_metadata
@@ -25,6 +27,8 @@ from pipeline.shards.samples import read_samples
 from pipeline.shards.shard_set import open_or_scan, open_shards
 
 TWO = (Split.GALLERY, View.SATELLITE)
+
+ENCODING = EncodingConfig(mirror=False, resizer="torch", precision="float32")
 
 
 def picture(shade: int) -> bytes:
@@ -190,7 +194,7 @@ def test_external_shards_are_embedded_and_resumed(
 
         return encode
 
-    network = EncoderSpec(fingerprint="f" * 64, image_size=16, factory=factory)
+    network = EncoderSpec(fingerprint="f" * 64, encoding=ENCODING, image_size=16, factory=factory)
     out, (split, view) = str(tmp_path / "table"), TWO
     settings = EmbeddingSettings(shards=foreign, out=out, workers=1, split=split, view=view)
     assert embed_gallery(settings, network) == 10

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core.errors import InputError
+from pipeline.core.filters import Filter
 from pipeline.core.geo import Box, Circle, haversine_m
 from pipeline.core.records import View
-from pipeline.index.filters import Filter
 
 LATS = [0.0, 10.0, -10.0, 89.9999, None]
 LONS = [179.999, 20.0, -179.0, 0.0, None]
