@@ -27,7 +27,7 @@ class Item:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Whole:
+class Report:
     items: tuple[Item, ...]
     count: int
     share: float
@@ -73,12 +73,12 @@ def test_json_of_another_kind_is_refused(tmp_path: Path) -> None:
 
 
 def test_from_json_builds_the_dataclass() -> None:
-    whole = from_json(Whole, VALID)
+    report = from_json(Report, VALID)
     first = Item(name="a", view=View.SATELLITE, pair=(1.0, 2))
-    assert whole.items == (first, Item(name="b"))
-    assert isinstance(whole.share, float)
-    assert isinstance(whole.items[1].view, View)
-    assert whole.anything == [None, {}]
+    assert report.items == (first, Item(name="b"))
+    assert isinstance(report.share, float)
+    assert isinstance(report.items[1].view, View)
+    assert report.anything == [None, {}]
     rejection = Rejection(path="a", reason="b", found="c" * 900)
     assert from_json(Rejection, asdict(rejection)) == rejection
 
@@ -86,48 +86,48 @@ def test_from_json_builds_the_dataclass() -> None:
 @pytest.mark.parametrize(
     ("field", "value", "sentence"),
     [
-        ("count", "3", "Whole.count is '3', expected a valid integer"),
-        ("count", True, "Whole.count is True, expected a valid integer"),
-        ("count", 3.0, "Whole.count is 3.0, expected a valid integer"),
-        ("count", None, "Whole.count is None, expected a valid integer"),
-        ("share", "1", "Whole.share is '1', expected a valid number"),
-        ("share", True, "Whole.share is True, expected a valid number"),
-        ("share", float("nan"), "Whole.share is nan, expected a finite number"),
-        ("share", float("-inf"), "Whole.share is -inf, expected a finite number"),
-        ("share", 10**400, "Whole.share is 1000.*, expected a finite number"),
-        ("done", 1, "Whole.done is 1, expected a valid boolean"),
-        ("kind", "some", "Whole.kind is 'some', expected 'few' or 'many'"),
-        ("counts", {"x": 1.5}, "Whole.counts.x is 1.5, expected a valid integer"),
-        ("counts", [1], r"Whole.counts is \[1\], expected an object"),
-        ("items", {}, r"Whole.items is \{\}, expected a valid array"),
-        ("items", [[]], r"Whole.items\[0\] is \[\], expected an object"),
-        ("items", [{"name": "a"}, {"name": 5}], r"Whole.items\[1\].name is 5, expected a val"),
-        ("items", [{"name": "a", "view": "moon"}], r"Whole.items\[0\].view is 'moon', expected 'd"),
-        ("items", [{"name": "a", "pair": [1]}], r"Whole.items\[0\].pair\S* "),
-        ("items", [{"name": "a", "pair": [1, 2, 3]}], r"Whole.items\[0\].pair\S* "),
-        ("items", [{"view": "drone"}], r"Whole.items\[0\] has no field 'name'"),
-        ("items", [{"name": "a", "b": 1}], r"Whole.items\[0\] has an unknown field 'b'"),
-        ("items", [{"name": "\ud800"}], r"Whole.items\[0\].name is not UTF-8 text"),
-        ("counts", {"\ud800": 1}, "Whole.counts is not UTF-8 text"),
-        ("anything", {"a": ["\udcff"]}, r"Whole.anything.a\[0\] is not UTF-8 text"),
+        ("count", "3", "Report.count is '3', expected a valid integer"),
+        ("count", True, "Report.count is True, expected a valid integer"),
+        ("count", 3.0, "Report.count is 3.0, expected a valid integer"),
+        ("count", None, "Report.count is None, expected a valid integer"),
+        ("share", "1", "Report.share is '1', expected a valid number"),
+        ("share", True, "Report.share is True, expected a valid number"),
+        ("share", float("nan"), "Report.share is nan, expected a finite number"),
+        ("share", float("-inf"), "Report.share is -inf, expected a finite number"),
+        ("share", 10**400, "Report.share is 1000.*, expected a finite number"),
+        ("done", 1, "Report.done is 1, expected a valid boolean"),
+        ("kind", "some", "Report.kind is 'some', expected 'few' or 'many'"),
+        ("counts", {"x": 1.5}, "Report.counts.x is 1.5, expected a valid integer"),
+        ("counts", [1], r"Report.counts is \[1\], expected an object"),
+        ("items", {}, r"Report.items is \{\}, expected a valid array"),
+        ("items", [[]], r"Report.items\[0\] is \[\], expected an object"),
+        ("items", [{"name": "a"}, {"name": 5}], r"Report.items\[1\].name is 5, expected a val"),
+        ("items", [{"name": "a", "view": "moon"}], r"Report.items\[0\].view is 'moon', expected 'd"),
+        ("items", [{"name": "a", "pair": [1]}], r"Report.items\[0\].pair\S* "),
+        ("items", [{"name": "a", "pair": [1, 2, 3]}], r"Report.items\[0\].pair\S* "),
+        ("items", [{"view": "drone"}], r"Report.items\[0\] has no field 'name'"),
+        ("items", [{"name": "a", "b": 1}], r"Report.items\[0\] has an unknown field 'b'"),
+        ("items", [{"name": "\ud800"}], r"Report.items\[0\].name is not UTF-8 text"),
+        ("counts", {"\ud800": 1}, "Report.counts is not UTF-8 text"),
+        ("anything", {"a": ["\udcff"]}, r"Report.anything.a\[0\] is not UTF-8 text"),
     ],
 )  # fmt: skip
 def test_from_json_names_the_hostile_field(field: str, value: Any, sentence: str) -> None:
     with pytest.raises(ValueError, match=f"^{sentence}"):
-        from_json(Whole, VALID | {field: value})
+        from_json(Report, VALID | {field: value})
 
 
 def test_from_json_refuses_endless_nesting() -> None:
     deep: Any = []
     for _ in range(400):
         deep = [deep]
-    with pytest.raises(ValueError, match="Whole is nested too deeply"):
-        from_json(Whole, VALID | {"anything": deep})
-    with pytest.raises(ValueError, match=r"Whole is \[1\], expected an object"):
-        from_json(Whole, [1])
+    with pytest.raises(ValueError, match="Report is nested too deeply"):
+        from_json(Report, VALID | {"anything": deep})
+    with pytest.raises(ValueError, match=r"Report is \[1\], expected an object"):
+        from_json(Report, [1])
 
 
 def test_from_json_cuts_long_values() -> None:
     with pytest.raises(ValueError, match="unknown field") as refused:
-        from_json(Whole, VALID | {"x" * 9_000: 1})
+        from_json(Report, VALID | {"x" * 9_000: 1})
     assert len(str(refused.value)) < 400
