@@ -3,13 +3,13 @@
 In: samples. Out: each with its pixels, or with the reason why it has none.
 """
 
-import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.core.arrays import Pixels
+from pipeline.core.integrity import sha256_of
 from pipeline.core.prefetch import prefetch_map
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.transforms import Resizer, resize
@@ -25,7 +25,7 @@ def check_unchanged(sample: Sample) -> None:
     a millisecond or more.
     """
     packed = sample.metadata.get("sha256")
-    if packed is not None and hashlib.sha256(sample.data).hexdigest() != packed:
+    if packed is not None and sha256_of(sample.data) != packed:
         raise DecodeError(CHANGED, "other bytes than were packed")
 
 

@@ -6,7 +6,6 @@ blank tile of the sea may come many times, each at its own position, and Univers
 are in its gallery too: these are not duplicates.
 """
 
-import hashlib
 from collections import defaultdict
 from collections.abc import Iterable
 from typing import Any
@@ -15,6 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline.core import storage
+from pipeline.core.integrity import sha256_of
 from pipeline.core.records import ImageRecord, Rejection
 from pipeline.shards.shard_set import ShardSet
 from pipeline.sources.base import Source
@@ -70,10 +70,7 @@ def new_records(
         earlier = packed.get(record.key)
         if earlier is None:
             new.append(record)
-        elif (
-            _is_same_file(record, earlier)
-            or hashlib.sha256(source.read(record)).hexdigest() == earlier["sha256"]
-        ):
+        elif _is_same_file(record, earlier) or sha256_of(source.read(record)) == earlier["sha256"]:
             known += 1
         else:
             found = f"{earlier['path']}, in {storage.absolute(shards.path)}, has its key"

@@ -8,14 +8,15 @@ would have written, and per sample the JSON that it would have written.
 import math
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from typing import IO, Any, cast
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
+from pipeline.core.integrity import HashingStream
 from pipeline.core.progress import console, progress
 from pipeline.core.records import Split, View, escape_non_utf8, is_position, make_key
 from pipeline.shards.manifest import MANIFEST, Manifest, Shard
-from pipeline.shards.tar_guard import HashedStream
 from pipeline.shards.tar_reader import IMAGE_SUFFIXES, read_members
 
 EXTERNAL = {"source": "others"}
@@ -44,7 +45,7 @@ def scan_tars(folder: str, tars: list[str], split: Split, view: View) -> Manifes
                 continue
             path, samples = storage.join(folder, f"{name}.tar"), 0
             with storage.open_read(path) as stream:
-                hashed = HashedStream(stream)
+                hashed = HashingStream(stream)
                 for key, _ in read_members(cast(IO[bytes], hashed), path, IMAGE_SUFFIXES):
                     samples += 1
                     if key in seen:
@@ -58,7 +59,7 @@ def scan_tars(folder: str, tars: list[str], split: Split, view: View) -> Manifes
             found.append(
                 Shard(
                     name=name, split=split, view=view, samples=samples,
-                    bytes=hashed.bytes, sha256=hashed.digest.hexdigest(),
+                    **asdict(hashed.checksum),
                 )
             )  # fmt: skip
             meter.advance(samples=sum(shard.samples for shard in found))

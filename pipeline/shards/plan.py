@@ -3,12 +3,12 @@
 In: records. Out: plans of shards, each of one split and view, and the records that are refused.
 """
 
-import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
+from pipeline.core.integrity import sha256_of
 from pipeline.core.records import ImageRecord, Rejection, Split, View
 from pipeline.shards.manifest import Manifest
 
@@ -32,7 +32,7 @@ class ShardPlan:
         """
         content = [config, self.name, self.records]
         text = json.dumps(content, sort_keys=True, default=vars)
-        return hashlib.sha256(text.encode()).hexdigest()
+        return sha256_of(text.encode())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +84,7 @@ def plan_shards(
             )
     groups: dict[tuple[Split, View], list[tuple[str, ImageRecord]]] = defaultdict(list)
     for key, record in keyed.items():
-        groups[record.split, record.view].append((hashlib.sha256(key.encode()).hexdigest(), record))
+        groups[record.split, record.view].append((sha256_of(key.encode()), record))
     plans = []
     for (split, view), members in sorted(groups.items()):
         ordered = [record for _, record in sorted(members, key=lambda member: member[0])]

@@ -6,12 +6,12 @@ has, packed again and compared with the manifest's hashes before they replace th
 Extended sets can be repaired too: rerun each packing command; it repairs the shards it wrote.
 """
 
-import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from pipeline.core import rejections, storage
 from pipeline.core.errors import InputError
+from pipeline.core.integrity import sha256_of
 from pipeline.core.records import ImageRecord
 from pipeline.shards.manifest import Manifest, Shard, read_damaged, write_damaged
 from pipeline.shards.plan import ShardPlan
@@ -82,7 +82,7 @@ def _plan_repairs(
     refused = rejections.rejected_paths(shards.path)
     unassigned = sorted(
         (key for key, record in by_key.items() if key not in known and record.name not in refused),
-        key=lambda key: hashlib.sha256(key.encode()).hexdigest(),
+        key=lambda key: sha256_of(key.encode()),
     )
     plans: list[tuple[Shard, ShardPlan | None]] = []
     for shard in sorted(damaged, key=lambda shard: shard.name):

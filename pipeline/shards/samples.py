@@ -10,10 +10,10 @@ from typing import IO, Any, cast
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
+from pipeline.core.integrity import HashingStream
 from pipeline.core.records import KEY_PATTERN, Split, View, excerpt, is_position, is_utf8
 from pipeline.shards.external import external_metadata
 from pipeline.shards.manifest import repair_hint
-from pipeline.shards.tar_guard import HashedStream
 from pipeline.shards.tar_reader import (
     IMAGE_SUFFIXES,
     METADATA_SUFFIXES,
@@ -71,10 +71,10 @@ def read_samples(
 def _read_hashed(tar: str, sha256: str) -> Iterator[tuple[str, dict[str, bytes]]]:
     """`read_tar`, which compares the hash after the tar's end."""
     with storage.open_read(tar) as stream:
-        hashed = HashedStream(stream)
+        hashed = HashingStream(stream)
         yield from read_members(cast(IO[bytes], hashed), tar, IMAGE_SUFFIXES + METADATA_SUFFIXES)
         hashed.drain()
-    if hashed.digest.hexdigest() != sha256:
+    if hashed.checksum.sha256 != sha256:
         raise InputError(
             f"{tar} has not the hash that the manifest says, expected what was packed; "
             f"{repair_hint(tar.rpartition('/')[0])}"

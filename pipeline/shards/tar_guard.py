@@ -6,7 +6,6 @@ header, a zeroed header, and the end of the file for the end of the tar, fills t
 file with as many zeros as its header states, and reads a member name of any length.
 """
 
-import hashlib
 import re
 import tarfile
 from typing import IO
@@ -126,21 +125,3 @@ def _check_pax(data: bytes) -> None:
         if not length:
             raise tarfile.ReadError("it has a pax header that cannot be read")
         position += length
-
-
-class HashedStream:
-    """A stream that counts and hashes what is read through it."""
-
-    def __init__(self, stream: IO[bytes]) -> None:
-        self._stream, self.digest, self.bytes = stream, hashlib.sha256(), 0
-
-    def read(self, size: int = -1) -> bytes:
-        data = self._stream.read(size)
-        self.digest.update(data)
-        self.bytes += len(data)
-        return data
-
-    def drain(self) -> None:
-        """Read to the end of the file."""
-        while self.read(1 << 20):
-            pass

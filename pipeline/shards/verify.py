@@ -3,7 +3,6 @@
 In: a ShardSet. Out: a sentence for each damage.
 """
 
-import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -13,11 +12,11 @@ import ray
 
 from pipeline.core import cluster, storage
 from pipeline.core.errors import InputError
+from pipeline.core.integrity import HashingStream, sha256_of
 from pipeline.core.progress import progress
 from pipeline.shards.manifest import Shard, write_damaged
 from pipeline.shards.record_table import part_intact, read_part
 from pipeline.shards.shard_set import ShardSet, first_three
-from pipeline.shards.tar_guard import HashedStream
 from pipeline.shards.tar_reader import IMAGE_SUFFIXES, METADATA_SUFFIXES, read_members
 
 
@@ -67,14 +66,14 @@ def check_shard(root: str, shard: Shard) -> list[str]:
     wrong: list[str] = []
     images: list[tuple[str, str]] = []  # key and sha256
     with storage.open_read(path) as stream:
-        hashed = HashedStream(stream)
+        hashed = HashingStream(stream)
         suffixes = IMAGE_SUFFIXES + METADATA_SUFFIXES
         try:
             for key, members in read_members(cast(IO[bytes], hashed), path, suffixes):
                 stated = json.loads(members.pop("json"))["sha256"]
                 [image] = members.values()
                 images.append((key, stated))
-                if hashlib.sha256(image).hexdigest() != stated:
+                if sha256_of(image) != stated:
                     wrong.append(f"{path}: the image of {key} has not the hash that its JSON says")
         except InputError as error:
             wrong.append(str(error))
@@ -82,9 +81,10 @@ def check_shard(root: str, shard: Shard) -> list[str]:
             after = images[-1][0] if images else "its beginning"
             wrong.append(f"{path}: the sample behind {after} is damaged ({error})")
         hashed.drain()
-    if hashed.bytes != shard.bytes:
-        wrong.append(f"{path} has {hashed.bytes} bytes, the manifest says {shard.bytes}")
-    elif hashed.digest.hexdigest() != shard.sha256:
+    found = hashed.checksum
+    if found.bytes != shard.bytes:
+        wrong.append(f"{path} has {found.bytes} bytes, the manifest says {shard.bytes}")
+    elif found.sha256 != shard.sha256:
         wrong.append(f"{path} has not the hash that the manifest says")
     if len(images) != shard.samples:
         wrong.append(f"{path} holds {len(images)} images, the manifest says {shard.samples}")

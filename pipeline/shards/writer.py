@@ -5,7 +5,6 @@ In: a plan and its source. Out: two files, each complete or absent; the same inp
 bytes.
 """
 
-import hashlib
 import io
 import json
 import tarfile
@@ -14,6 +13,7 @@ from dataclasses import asdict, dataclass
 from typing import IO, Any, cast
 
 from pipeline.core import storage
+from pipeline.core.integrity import HashingStream, sha256_of
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import ImageRecord, Rejection
 from pipeline.images.decode import DecodeError, decode
@@ -69,7 +69,7 @@ def write_shard(
 
     rejected, rows = [], []
     with storage.atomic_write(storage.join(out, f"{plan.name}.tar")) as stream:
-        hashed = HashedWriter(stream)
+        hashed = HashingStream(stream)
         near = not plan.records or storage.is_local(plan.records[0].path)
         threads = READERS if near else REMOTE_READERS
         members = prefetch_map(prepare, plan.records, threads, READ_AHEAD)
@@ -84,7 +84,7 @@ def write_shard(
                 rows.append(record_table.row(record, plan.name, member.metadata, len(member.data)))
     shard = Shard(
         name=plan.name, split=plan.split, view=plan.view,
-        samples=len(rows), bytes=hashed.tell(), sha256=hashed.digest.hexdigest(),
+        samples=len(rows), **asdict(hashed.checksum),
     )  # fmt: skip
     packed = Packed(shard=shard, plan=digest, rejected=tuple(rejected))
     record_table.write_part(out, packed, rows)
@@ -110,7 +110,7 @@ def read_member(record: ImageRecord, source: Source, check: Check) -> Member:
         "geotag": None if record.geotag is None else asdict(record.geotag),
         "taken_at": record.taken_at,
         "source": name_of(source),
-        "sha256": hashlib.sha256(data).hexdigest(),
+        "sha256": sha256_of(data),
         "width": width,
         "height": height,
     }
@@ -131,7 +131,7 @@ def _read_checked(
     return data, size
 
 
-def open_tar(stream: "HashedWriter") -> tarfile.TarFile:
+def open_tar(stream: HashingStream) -> tarfile.TarFile:
     """A tar to be written into a stream."""
     return tarfile.open(fileobj=cast(IO[bytes], stream), mode="w", format=tarfile.USTAR_FORMAT)
 
@@ -145,18 +145,3 @@ def add_file(tar: tarfile.TarFile, name: str, data: bytes) -> None:
     header.size = len(data)
     header.uname = header.gname = "root"
     tar.addfile(header, io.BytesIO(data))
-
-
-class HashedWriter:
-    """A stream that counts and hashes the bytes that are written through it."""
-
-    def __init__(self, stream: IO[bytes]) -> None:
-        self._stream, self.digest, self._bytes = stream, hashlib.sha256(), 0
-
-    def write(self, data: bytes) -> int:
-        self.digest.update(data)
-        self._bytes += len(data)
-        return self._stream.write(data)
-
-    def tell(self) -> int:
-        return self._bytes

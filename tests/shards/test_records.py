@@ -18,12 +18,13 @@ from jobs import make_shards
 from jobs.stages.settings import MakeShardsSettings
 from pipeline.core import storage
 from pipeline.core.errors import Incomplete, InputError
+from pipeline.core.integrity import FileChecksum, HashingStream
 from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View, make_key
 from pipeline.shards.pack import pack
 from pipeline.shards.record_table import read_part
 from pipeline.shards.shard_set import open_shards
 from pipeline.shards.verify import verify
-from pipeline.shards.writer import HashedWriter, add_file, open_tar
+from pipeline.shards.writer import add_file, open_tar
 from pipeline.sources.university1652 import University1652
 from tests.shards.imagery import SOURCE, imagery, said
 
@@ -168,7 +169,7 @@ def test_records_round_trip_through_shards(
 def test_tar_bytes_are_those_of_the_recorded_hash() -> None:
     """The hash was recorded from the tars that this project's own writer made, before tarfile."""
     stream = io.BytesIO()
-    hashed = HashedWriter(stream)
+    hashed = HashingStream(stream)
     with open_tar(hashed) as tar:
         add_file(tar, "train-drone-a-0.jpg", bytes(range(256)) * 3)
         add_file(tar, "train-drone-a-0.json", b'{"key": "train-drone-a-0"}')
@@ -176,7 +177,7 @@ def test_tar_bytes_are_those_of_the_recorded_hash() -> None:
         add_file(tar, "x" * 96 + ".jpg", bytes(1024))
     recorded = "54f37695d31a8ba63295c3e6897535e8f8ebf80561537144890f7f223f174089"
     assert hashlib.sha256(stream.getvalue()).hexdigest() == recorded
-    assert (hashed.digest.hexdigest(), hashed.tell()) == (recorded, 10240)
+    assert hashed.checksum == FileChecksum(bytes=10240, sha256=recorded)
 
 
 def test_job_verifies_and_exports_a_finished_set(
