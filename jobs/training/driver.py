@@ -15,6 +15,7 @@ from jobs.training.ray_group import show_report, train_on_ray
 from jobs.training.settings import RECIPE, RUN_CONFIG_FILE, RunConfig, TrainSettings
 from jobs.training.state import WorkerContext, open_stream
 from jobs.training.worker import train_worker
+from model.backbones.base import build_backbone
 from model.pvda import FeatureEncoder
 from model.weights.load import load_backbone, read_state_dict
 from pipeline.core import storage
@@ -69,7 +70,7 @@ def check_input(settings: TrainSettings, run: RunConfig, resumes: bool) -> int:
     """
     try:
         with torch.device("meta"):
-            encoder = FeatureEncoder(run.recipe.network)
+            FeatureEncoder(run.recipe.network)
     except ValueError as error:  # a width or an image size that this backbone cannot have
         raise InputError(str(error)) from None
     shards = open_shards(run.shards)
@@ -79,7 +80,8 @@ def check_input(settings: TrainSettings, run: RunConfig, resumes: bool) -> int:
         shards.require_tars(shards.manifest.of(Split.TRAIN))
     steps = open_stream(run, WorkerContext(world_size=max(1, settings.workers))).steps
     if run.weights is not None and not resumes:
-        load_backbone(encoder.backbone, read_state_dict(run.weights), run.weights)
+        backbone = build_backbone(run.recipe.network.backbone, run.recipe.network.width)
+        load_backbone(backbone, read_state_dict(run.weights), run.weights)
     return steps
 
 

@@ -8,7 +8,7 @@ import random
 import signal
 import threading
 import time
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -17,17 +17,13 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from jobs.training.checkpoints import CheckpointWriter, find_checkpoint, list_archived
+from jobs.training.checkpoints import CheckpointWriter, list_archived
 from jobs.training.driver import train
-from jobs.training.metrics import MetricAccumulator, NotFinite
 from jobs.training.recipes import Recipe, smoke
-from jobs.training.settings import RunConfig, RunOptions, TrainSettings
+from jobs.training.settings import TrainSettings
 from model.checkpoint import Checkpoint, loads
-from model.errors import CheckpointError
-from model.pvda import FeatureEncoder
 from model.training import Training
-from pipeline.core import storage
-from pipeline.core.errors import Incomplete, InputError
+from pipeline.core.errors import Incomplete
 from tests.launcher import Launcher, RunningJob
 from tests.processes import command_line, descendants, send_signal
 
@@ -229,43 +225,6 @@ def test_find_checkpoint_falls_back_from_damaged_one(
     assert list_archived(str(tmp_path)) == ["checkpoint-0002-00002.pt"]
 
 
-def made(epoch: int, step: int = 0) -> Checkpoint:
-    recipe = tiny()
-    return Checkpoint(
-        network=recipe.network,
-        recipe=json.loads(json.dumps(asdict(recipe))),
-        locations=[],
-        epoch=epoch,
-        step=step,
-        history=[],
-        state={"modules": {"encoder": FeatureEncoder(recipe.network).state_dict()}},
-        metric_sums={"x": torch.tensor(0.1)},
-    )
-
-
-def test_checkpoints_on_any_storage() -> None:
-    run = RunConfig(shards="nowhere", out="memory://run-folder/run", recipe=tiny(), keep=2)
-    assert find_checkpoint(run) is None
-    checkpoints = CheckpointWriter(run, None)
-    for epoch in (1, 2, 3):
-        checkpoints.write(made(epoch, step=epoch))
-    assert storage.list_names(run.out) == ["checkpoint-0002-00002.pt", "last.pt"]
-    storage.write_bytes(storage.join(run.out, "last.pt"), b"torn")
-    said: list[str] = []
-    found = find_checkpoint(run, said.append)
-    assert found is not None
-    assert (found[0], found[1].epoch, found[1].step) == ("checkpoint-0002-00002.pt", 2, 2)
-    assert len(said) == 1
-    CheckpointWriter(run, found).write(made(4))  # a damaged file is not kept
-    assert storage.list_names(run.out) == ["checkpoint-0002-00002.pt", "last.pt"]
-    storage.remove(storage.join(run.out, "last.pt"))
-    assert find_checkpoint(run, said.append) is not None
-    assert "last.pt is missing" in said[-1]
-    storage.write_bytes(storage.join(run.out, "checkpoint-0002-00002.pt"), b"torn")
-    with pytest.raises(CheckpointError, match="is not a checkpoint"):
-        find_checkpoint(run)
-
-
 def test_train_diverging_keeps_the_last_good_checkpoint(
     tiny_shards: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -287,30 +246,3 @@ def test_train_diverging_keeps_the_last_good_checkpoint(
     held = loads((tmp_path / "last.pt").read_bytes())
     assert [row["epoch"] for row in rows(tmp_path)] == [1, 2]
     assert (held.epoch, held.step) == (2, 0)
-
-
-def test_metric_accumulator_resumes_and_reports_non_finite() -> None:
-    steps = [{"a": torch.tensor(0.1 * n), "b": torch.tensor(1.0 / (n + 1))} for n in range(6)]
-    whole, first = MetricAccumulator(), MetricAccumulator()
-    for step in steps:
-        whole.add(step)
-    for step in steps[:3]:
-        first.add(step)
-    held = first.state_dict()
-    second = MetricAccumulator(first.steps, held)
-    for step in steps[3:]:
-        second.add(step)
-    assert whole.means() == second.means()
-    assert second.seconds >= float(held["seconds"]) > 0
-    whole.add({"a": torch.tensor(float("inf")), "b": torch.tensor(0.0)})
-    whole.add({"a": torch.tensor(float("-inf")), "b": torch.tensor(0.0)})
-    with pytest.raises(NotFinite, match="a is nan"):
-        whole.means()
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"keep": 0}, {"checkpoint_epochs": 0}, {"checkpoint_minutes": -1.0}]
-)
-def test_run_options_reject_keeping_no_checkpoint(wrong: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match=r"expected (at least 1|0 or more)"):
-        RunOptions(**wrong)

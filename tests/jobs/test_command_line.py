@@ -1,4 +1,4 @@
-"""The command line that all jobs share: quick help, settings as a file, one command for all jobs."""
+"""The command line of all jobs: quick help, settings as a file, one command."""
 
 import json
 import subprocess
@@ -195,7 +195,8 @@ def test_a_closed_pipe_ends_a_job_in_silence() -> None:
     command = f'{sys.executable} -c "$SCRIPT" | head -c 1'
     ended = subprocess.run(
         ["bash", "-c", f"set -o pipefail; {command}"],
-        capture_output=True, cwd=ROOT, check=False, text=True, env={"SCRIPT": script, "PATH": "/usr/bin:/bin"},
+        capture_output=True, cwd=ROOT, check=False, text=True,
+        env={"SCRIPT": script, "PATH": "/usr/bin:/bin"},
     )  # fmt: skip
     assert (ended.stdout, ended.stderr) == ("x", "")
     assert ended.returncode == 141

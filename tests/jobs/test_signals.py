@@ -180,7 +180,7 @@ def told(words: str, things: dict[str, Path]) -> list[str]:
 def begin(
     job: str, words: list[str], log: Path, mark: str = ""
 ) -> tuple["subprocess.Popen[bytes]", Path]:
-    """A job in a session of its own, with a Ray of its own, whose every process carries the mark."""
+    """A job in its own session, with its own Ray, whose every process carries the mark."""
     environment = os.environ | {
         MARK: mark or uuid.uuid4().hex,
         "RAY_ADDRESS": "local",

@@ -2,71 +2,28 @@
 cannot run.
 """
 
-import json
-import os
-import signal
-import threading
-import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
-import ray
 import torch
-from ray.exceptions import RayActorError
-from ray.util.queue import Queue
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from jobs.command_line.cli import expand
 from jobs.train import main
 from jobs.training.checkpoints import read_checkpoint
 from jobs.training.driver import train
-from jobs.training.ray_group import listen
-from jobs.training.recipes import Recipe, paper, smoke
-from jobs.training.settings import RECIPE, RunConfig, TrainSettings
+from jobs.training.recipes import paper
+from jobs.training.settings import RECIPE, RunConfig
 from jobs.training.state import WorkerContext, initial_checkpoint
 from jobs.training.worker import train_worker
-from model.checkpoint import build_encoder, dumps, loads
+from model.checkpoint import build_encoder, loads
 from model.errors import CheckpointError
 from pipeline.core.arrays import Pixels
-from pipeline.core.errors import Incomplete, InputError
-from pipeline.core.progress import progress
+from pipeline.core.errors import InputError
 from pipeline.images.decode import DecodeError, decode
 from pipeline.shards.samples import read_samples
-
-
-def tiny(epochs: int = 2) -> Recipe:
-    """Three steps an epoch on the tiny world's six satellite images."""
-    recipe = smoke(epochs)
-    network = replace(
-        recipe.network, width=0.25, part_dim=16, discriminator_channels=16, dropout=0.5
-    )
-    return replace(recipe, network=network, batch_size=2)
-
-
-def settings(shards: str, out: Path, recipe: Recipe, **changes: object) -> TrainSettings:
-    given = {
-        "recipe": recipe,
-        "shards": shards,
-        "out": str(out),
-        "workers": 0,
-        "checkpoint_minutes": 0.0,
-    }
-    return TrainSettings(**(given | changes))  # type: ignore[arg-type]
-
-
-def rows(out: Path) -> list[dict[str, object]]:
-    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
-
-
-def rows_of(shards: str, out: Path) -> list[dict[str, object]]:
-    train(settings(shards, out, tiny(1)))
-    return rows(out)
-
-
-def weights(path: Path) -> dict[str, torch.Tensor]:
-    return loads((path / "last.pt").read_bytes()).encoder_weights
+from tests.jobs.tiny_runs import rows, rows_of, settings, tiny, weights
 
 
 def test_train_writes_checkpoint_curves_and_encoder(tiny_shards: str, tmp_path: Path) -> None:
@@ -124,21 +81,6 @@ def test_train_finished_run_is_a_no_op(
         train(settings(tiny_shards, tmp_path, tiny(3)))
 
 
-def test_train_old_run_resumes_with_pillow_resizer(tiny_shards: str, tmp_path: Path) -> None:
-    path = Path(train(settings(tiny_shards, tmp_path, replace(tiny(1), resizer="pillow"))))
-    held = loads(path.read_bytes())
-    path.write_bytes(
-        dumps(
-            replace(
-                held, recipe={name: held.recipe[name] for name in held.recipe if name != "resizer"}
-            )
-        )
-    )
-    train(settings(tiny_shards, tmp_path, replace(tiny(1), resizer="pillow")))  # nothing to do
-    with pytest.raises(InputError, match="with another resizer"):
-        train(settings(tiny_shards, tmp_path, tiny(1)))
-
-
 def test_train_counts_damaged_images_per_epoch(
     tiny_shards: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -169,49 +111,6 @@ def test_train_counts_damaged_images_per_epoch(
         assert ("the first of them is train-drone-" in note) == (number == 3)
 
 
-def test_train_by_ray_takes_the_same_steps(
-    tiny_shards: str, tmp_path: Path, ray_cluster: None
-) -> None:
-    train(settings(tiny_shards, tmp_path / "here", tiny(1)))
-    train(settings(tiny_shards, tmp_path / "ray", tiny(1), workers=1))
-    here, there = weights(tmp_path / "here"), weights(tmp_path / "ray")
-    # Another number of threads may sum in another order, and AdamW makes whole steps of a last
-    # bit's sign.
-    assert all(
-        torch.allclose(here[name].float(), there[name].float(), atol=1e-3, rtol=1e-3)
-        for name in here
-    )
-    [one], [other] = rows(tmp_path / "here"), rows(tmp_path / "ray")
-    assert one["location_loss"] == pytest.approx(other["location_loss"], rel=1e-4)
-    assert [row["epoch"] for row in rows(tmp_path / "ray")] == [1]
-
-
-def test_train_sync_bn_without_gpus_is_rejected(
-    tiny_shards: str, tmp_path: Path, ray_cluster: None
-) -> None:
-    recipe = replace(tiny(1), sync_bn=True)
-    with pytest.raises(InputError, match="2 workers have no GPUs, expected GPUs"):
-        train(settings(tiny_shards, tmp_path, recipe, workers=2))
-
-
-def test_train_worker_input_error_is_not_retried(
-    tiny_shards: str, tmp_path: Path, ray_cluster: None, capfd: pytest.CaptureFixture[str]
-) -> None:
-    rates = replace(tiny(1).optimization, backbone_lr=1e30, head_lr=1e30, classifier_lr=1e30)
-    with pytest.raises(Incomplete, match="training diverged in epoch 1"):
-        train(
-            settings(
-                tiny_shards,
-                tmp_path,
-                replace(tiny(1), optimization=rates),
-                workers=1,
-                checkpoint_minutes=60.0,
-            )
-        )
-    assert "lost a worker" not in capfd.readouterr().err
-    assert not (tmp_path / "last.pt").exists()
-
-
 def test_train_row_has_losses_gradients_and_view_gap(tiny_shards: str, tmp_path: Path) -> None:
     train(settings(tiny_shards, tmp_path, replace(tiny(2), hold_out=0.5), probe_epochs=2))
     first, second = rows(tmp_path)
@@ -236,13 +135,6 @@ def test_train_row_has_losses_gradients_and_view_gap(tiny_shards: str, tmp_path:
     board = EventAccumulator(str(tmp_path / "tensorboard"))
     board.Reload()
     assert wanted | looked <= set(board.Tags()["scalars"])
-
-
-def test_train_two_ray_workers_share_one_network(
-    tiny_shards: str, tmp_path: Path, ray_cluster: None
-) -> None:
-    path = train(settings(tiny_shards, tmp_path, replace(tiny(1), batch_size=3), workers=2))
-    assert loads(Path(path).read_bytes()).history[0]["step"] == 1
 
 
 def test_train_starts_from_given_weights(tiny_shards: str, tmp_path: Path) -> None:
@@ -317,22 +209,3 @@ def test_recipe_paper_has_the_papers_settings() -> None:
         (60, 120),
     )
     assert (recipe.batch_size, recipe.augmentation.pad, recipe.augmentation.rotation) == (8, 10, 90)
-
-
-def test_queue_put_after_shutdown_raises(ray_cluster: None) -> None:
-    """SIGTERM lets an actor finish what it was asked; asked without an end, it neither went nor
-    answered (seed 22).
-    """
-    told = Queue(actor_options={"num_cpus": 0})
-    actor: Any = told.actor
-    pid: int = ray.get(actor.__ray_call__.remote(lambda queue: os.getpid()))
-    with progress(None, "training", "steps") as meter:
-        listener = threading.Thread(target=listen, args=(told, meter, []), daemon=True)
-        listener.start()
-        time.sleep(0.5)  # it asks
-        os.kill(pid, signal.SIGTERM)
-        time.sleep(0.5)  # the actor has heard
-        with pytest.raises(RayActorError):
-            ray.get(actor.put.remote({"steps": 1}), timeout=20)
-        listener.join(20)
-    assert not listener.is_alive()

@@ -2,7 +2,6 @@
 sentence.
 """
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import pytest
 import safetensors.torch
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
 from jobs.embed_gallery import main as embed_gallery
 from jobs.encoding.encoder import make_encoder_spec
@@ -19,195 +17,28 @@ from jobs.encoding.settings import EncoderSettings
 from jobs.stages.import_weights import import_weights
 from jobs.stages.settings import EmbedSettings, ImportWeightsSettings
 from model.backbones.resnet import ResNet
-from model.checkpoint import Checkpoint, build_encoder, load_encoder, loads
+from model.checkpoint import build_encoder, load_encoder, loads
 from model.errors import CheckpointError
 from model.pvda import LocationClassifier
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table
-
-State = dict[str, Tensor]
-MEAN, DEVIATION = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
-
-
-# A twin of the original network, written from its description and from nothing of ours.
-
-
-def made_up(
-    blocks: tuple[int, ...] = (2, 2, 2, 2), grown: int = 1, base: int = 16, seed: int = 0
-) -> State:
-    """Random weights of a ResNet under torchvision's names; `grown` is 4 with bottlenecks, 1
-    without.
-    """
-    generator, state = torch.Generator().manual_seed(seed), State()
-
-    def conv(name: str, out: int, into: int, side: int) -> None:
-        deviation = math.sqrt(2 / (into * side * side))
-        state[f"{name}.weight"] = (
-            torch.randn(out, into, side, side, generator=generator) * deviation
-        )
-
-    conv("conv1", base, 3, 7)
-    state |= norm("bn1", base, generator)
-    into = base
-    for layer, count in enumerate(blocks, start=1):
-        width = base * 2 ** (layer - 1)
-        for block in range(count):
-            at, out = f"layer{layer}.{block}", width * grown
-            shapes = (
-                [(width, into, 3), (out, width, 3)]
-                if grown == 1
-                else [(width, into, 1), (width, width, 3), (out, width, 1)]
-            )
-            for number, (to, of, side) in enumerate(shapes, start=1):
-                conv(f"{at}.conv{number}", to, of, side)
-                state |= norm(f"{at}.bn{number}", to, generator)
-            if block == 0 and (layer > 1 or grown > 1):
-                conv(f"{at}.downsample.0", out, into, 1)
-                state |= norm(f"{at}.downsample.1", out, generator)
-            into = out
-    return state
-
-
-def norm(name: str, size: int, generator: torch.Generator) -> State:
-    def noise() -> Tensor:
-        return 0.1 * torch.randn(size, generator=generator)
-
-    values = {
-        "weight": 1 + noise(),
-        "bias": noise(),
-        "running_mean": noise(),
-        "running_var": 1 + noise().abs(),
-    }
-    return {f"{name}.{key}": value for key, value in values.items()} | {
-        f"{name}.num_batches_tracked": torch.tensor(87)
-    }
-
-
-def three_view_net(
-    backbone: State, parts: int = 4, part_dim: int = 24, locations: int = 5
-) -> State:
-    """As LPN saves a network whose UAV and satellite images share a backbone: it appears under both
-    names.
-    """
-    generator = torch.Generator().manual_seed(7)
-    fc = {"fc.weight": torch.ones(1000, 8), "fc.bias": torch.ones(1000)}
-    state = {
-        f"{view}.model.{key}": value
-        for view in ("model_1", "model_3")
-        for key, value in (backbone | fc).items()
-    }
-    state |= {
-        f"model_2.model.{key}": value + 1 for key, value in (backbone | fc).items()
-    }  # street images
-    channels = max(
-        value.shape[0] for key, value in backbone.items() if key.startswith("layer4") and value.ndim
-    )
-    for part in range(parts):
-        at = f"classifier{part}"
-        state[f"{at}.add_block.0.weight"] = torch.randn(
-            part_dim, channels, generator=generator
-        ) / math.sqrt(channels)
-        state[f"{at}.add_block.0.bias"] = torch.randn(part_dim, generator=generator)
-        state |= norm(f"{at}.add_block.1", part_dim, generator)
-        state[f"{at}.classifier.0.weight"] = torch.randn(locations, part_dim, generator=generator)
-        state[f"{at}.classifier.0.bias"] = torch.randn(locations, generator=generator)
-    return state
-
-
-def normalised(state: State, at: str, x: Tensor) -> Tensor:
-    mean, variance, weight, bias = (
-        state[f"{at}.{key}"] for key in ("running_mean", "running_var", "weight", "bias")
-    )
-    return F.batch_norm(x, mean, variance, weight, bias, eps=1e-5)
-
-
-def twin_maps(state: State, x: Tensor) -> Tensor:
-    """ResNet with stride 1 in layer4."""
-    x = F.relu(normalised(state, "bn1", F.conv2d(x, state["conv1.weight"], stride=2, padding=3)))
-    x = F.max_pool2d(x, 3, 2, 1)
-    for layer, stride in ((1, 1), (2, 2), (3, 2), (4, 1)):
-        block = 0
-        while f"layer{layer}.{block}.conv1.weight" in state:
-            at, step, y = f"layer{layer}.{block}", stride if block == 0 else 1, x
-            convs = [n for n in (1, 2, 3) if f"{at}.conv{n}.weight" in state]
-            for n in convs:
-                weight = state[f"{at}.conv{n}.weight"]
-                here = (
-                    step if n == len(convs) - 1 else 1
-                )  # on the first of two, the second of three
-                y = normalised(
-                    state,
-                    f"{at}.bn{n}",
-                    F.conv2d(y, weight, stride=here, padding=weight.shape[-1] // 2),
-                )
-                y = F.relu(y) if n < len(convs) else y
-            if f"{at}.downsample.0.weight" in state:
-                x = normalised(
-                    state,
-                    f"{at}.downsample.1",
-                    F.conv2d(x, state[f"{at}.downsample.0.weight"], stride=step),
-                )
-            x, block = F.relu(x + y), block + 1
-    return x
-
-
-def twin_parts(state: State, images: Tensor, parts: int) -> Tensor:
-    """What LPN calls a feature: (B, D, P), centre first, each ring its box with the hole filled
-    with zeros.
-    """
-    images = (images.float() / 255 - MEAN[:, None, None]) / DEVIATION[:, None, None]
-    backbone = {
-        key.removeprefix("model_1.model."): value
-        for key, value in state.items()
-        if key.startswith("model_1")
-    }
-    maps = twin_maps(backbone, images)
-    centre, step = maps.shape[2] // 2, maps.shape[2] // (2 * parts)
-    features = []
-    for part in range(1, parts + 1):
-        half = part * step if part < parts else centre
-        box = maps[:, :, centre - half : centre + half, centre - half : centre + half].clone()
-        hole = (part - 1) * step
-        box[:, :, half - hole : half + hole, half - hole : half + hole] = 0
-        mean = torch.nn.AdaptiveAvgPool2d(1)(box).flatten(1)
-        at = f"classifier{part - 1}.add_block"
-        features.append(
-            normalised(
-                state, f"{at}.1", F.linear(mean, state[f"{at}.0.weight"], state[f"{at}.0.bias"])
-            )
-        )
-    return torch.stack(features, 2)
-
-
-def twin_embedding(state: State, images: Tensor, parts: int) -> Tensor:
-    summed = twin_parts(state, images, parts) + twin_parts(state, images.flip(3), parts)
-    unit: Tensor = summed / (summed.norm(dim=1, keepdim=True) * math.sqrt(parts))
-    # LPN lays the numbers of all parts side by side; ours stand part after part. Inner products are
-    # the same.
-    return unit.transpose(1, 2).flatten(1)
-
-
-def photos(size: int, count: int = 2) -> Tensor:
-    """Fields of random colours, 8 by 8: images of noise would all look alike."""
-    fields = torch.randint(
-        0, 256, (count, 3, 8, 8), dtype=torch.uint8, generator=torch.Generator().manual_seed(1)
-    )
-    return fields.repeat_interleave(size // 8, 2).repeat_interleave(size // 8, 3)
-
-
-def saved(state: State, path: Path) -> str:
-    torch.save(state, path)
-    return str(path)
-
-
-def imported(tmp_path: Path, state: State, image_size: int = 128) -> Checkpoint:
-    given = saved(state, tmp_path / "net_119.pth")
-    out = import_weights(
-        ImportWeightsSettings(lpn=given, out=str(tmp_path / "ours.pt"), image_size=image_size)
-    )
-    return loads(Path(out).read_bytes())
+from tests.model.lpn_twin import (
+    DEVIATION,
+    MEAN,
+    State,
+    changed,
+    imported,
+    made_up,
+    photos,
+    saved,
+    three_view_net,
+    twin_embedding,
+    twin_maps,
+    twin_parts,
+    without,
+)
 
 
 @pytest.mark.parametrize(
@@ -259,10 +90,6 @@ def test_import_lpn_records_its_source(tmp_path: Path, capsys: pytest.CaptureFix
     assert "ours.pt: ResNet-18, 4 rings of 24 numbers, 128 px, 5 locations" in said
 
 
-def without(state: State, start: str) -> State:
-    return {key: value for key, value in state.items() if not key.startswith(start)}
-
-
 def test_import_lpn_variants_of_backbones_are_equal(
     tmp_path: Path,
 ) -> None:
@@ -291,10 +118,6 @@ def test_import_lpn_variants_of_backbones_are_equal(
             assert torch.equal(found[key], tensor) or (name == "no counts" and "num_batches" in key)
 
 
-def changed(key: str, value: Callable[[Tensor], Tensor]) -> Callable[[State], State]:
-    return lambda state: state | {key: value(state[key])}
-
-
 REFUSED: dict[str, tuple[Callable[[State], State], str]] = {
     "UAVs have their own": (
         changed("model_3.model.layer1.0.conv1.weight", lambda t: t + 1),
@@ -310,7 +133,8 @@ REFUSED: dict[str, tuple[Callable[[State], State], str]] = {
     ),
     "a tensor is missing": (
         lambda state: without(state, "classifier2.add_block.1.running_var"),
-        r"does not fit resnet18 with 4 rings: classifier2\.add_block\.1\.running_var is missing; expected",
+        r"does not fit resnet18 with 4 rings: "
+        r"classifier2\.add_block\.1\.running_var is missing; expected",
     ),
     "a layer is missing": (
         lambda state: without(without(state, "model_1.model.bn1"), "model_3.model.bn1"),

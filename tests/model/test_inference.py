@@ -133,8 +133,8 @@ def test_compile_is_skipped_where_it_does_not_pay(
         assert encoder.kind == "folded"
         assert said[0].startswith("compiling the encoder for batches of 4")
         assert (
-            said[1]
-            == "the encoder cannot be compiled here (RuntimeError: no C++ compiler); continuing uncompiled"
+            said[1] == "the encoder cannot be compiled here (RuntimeError: no C++ compiler); "
+            "continuing uncompiled"
         )
 
 

@@ -6,88 +6,25 @@ Shapes: B images of a view, C channels of the maps, H x W pixels or cells, L loc
 
 import copy
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.optim import SGD, Adam, AdamW
 
-from model.checkpoint import Checkpoint, dumps, loads
-from model.config import Optimization, PVDAConfig
+from model.config import Optimization
 from model.losses import location_loss
 from model.schedule import ScheduleState
 from model.training import EncoderWithClassifier, Training
-
-TINY = PVDAConfig(
-    backbone="resnet18",
-    width=0.25,
-    image_size=64,
-    parts=2,
-    part_dim=8,
-    dropout=0.0,
-    discriminator_channels=8,
+from tests.model.tiny_training import (
+    NOW,
+    TINY,
+    assert_same,
+    batch,
+    changed,
+    make,
+    weights,
 )
-LOCATIONS = 5
-NOW = ScheduleState(alpha=0.9, lr_scale=1.0)
-
-
-def make(
-    config: PVDAConfig = TINY, optimization: Optimization | None = None, adversary: bool = True
-) -> Training:
-    torch.manual_seed(0)
-    training = Training(config, optimization or Optimization(), LOCATIONS, adversary=adversary)
-    torch.manual_seed(1)  # as the training loop does: dropout does not depend on what was built
-    return training
-
-
-def batch(
-    seed: int = 0, drones: int = 3, satellites: int = 3
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """UAV images and their locations, satellite images and theirs."""
-    source = torch.Generator().manual_seed(seed)
-    drone, satellite = (
-        torch.randint(low, low + 150, (count, 3, 64, 64), dtype=torch.uint8, generator=source)
-        for count, low in ((drones, 0), (satellites, 100))
-    )
-    location1_B, location2_B = (
-        torch.randint(0, LOCATIONS, (n,), generator=source) for n in (drones, satellites)
-    )
-    return drone, location1_B, satellite, location2_B
-
-
-def weights(training: Training) -> dict[str, dict[str, Tensor]]:
-    """Parameters of each network, as they are now."""
-    return {
-        network: {name: parameter.detach().clone() for name, parameter in module.named_parameters()}
-        for network, module in training.modules.items()
-    }
-
-
-def changed(before: dict[str, dict[str, Tensor]], after: dict[str, dict[str, Tensor]]) -> set[str]:
-    """The networks of which any weight differs."""
-    return {
-        network
-        for network, held in before.items()
-        if any(not torch.equal(held[n], after[network][n]) for n in held)
-    }
-
-
-def assert_same(one: Any, other: Any) -> None:
-    """Two nested states are equal to the last bit."""
-    assert type(one) is type(other)
-    if isinstance(one, Tensor):
-        assert torch.equal(one, other)
-    elif isinstance(one, dict):
-        assert one.keys() == other.keys()
-        for name in one:
-            assert_same(one[name], other[name])
-    elif isinstance(one, list):
-        for mine, its in zip(one, other, strict=True):
-            assert_same(mine, its)
-    else:
-        assert one == other
 
 
 def watched_step(training: Training) -> list[dict[str, dict[str, Tensor]]]:
@@ -253,26 +190,6 @@ def test_alpha_moves_the_encoder_only() -> None:
     assert changed(weights(gentle), weights(strong)) == {"encoder"}
 
 
-def test_step_scales_each_groups_rate() -> None:
-    training = make()
-    training.step(*batch(), ScheduleState(alpha=0.9, lr_scale=0.8))
-    assert training.learning_rates == pytest.approx(
-        {"backbone": 0.0008, "head": 0.008, "classifier": 0.008, "discriminator": 0.0016}
-    )
-    assert {len(g["params"]) for g in training.optimizers[0].param_groups} == {60, 2 * 4, 2 * 2}
-
-
-def test_optimizers_are_sgd_or_adamw() -> None:
-    of_encoder, of_discriminator = make().optimizers
-    assert type(of_encoder) is SGD
-    assert type(of_discriminator) is Adam
-    for group in of_encoder.param_groups:
-        assert (group["momentum"], group["nesterov"], group["weight_decay"]) == (0.9, True, 5e-4)
-    [group] = of_discriminator.param_groups
-    assert (group["betas"], group["weight_decay"]) == ((0.9, 0.999), 0)
-    assert type(make(optimization=Optimization(optimizer="adamw")).optimizers[0]) is AdamW
-
-
 def test_step_reports_losses_and_accuracy() -> None:
     training = make()
     measures = training.step(*batch(), NOW)
@@ -315,80 +232,7 @@ def test_step_reports_gradient_norms() -> None:
         torch.testing.assert_close(measures[f"gradient_norm/{name}"], length, rtol=1e-3, atol=0.0)
 
 
-def test_step_in_bfloat16_keeps_float32_weights() -> None:
-    torch.manual_seed(0)
-    half = Training(TINY, Optimization(), LOCATIONS, precision="bfloat16")
-    whole = make()
-    rough, exact = half.step(*batch(), NOW), whole.step(*batch(), NOW)
-    assert {measure.dtype for measure in rough.values()} == {torch.float32}
-    assert {parameter.dtype for parameter in half.model.parameters()} == {torch.float32}
-    assert float(rough["location_loss"]) == pytest.approx(float(exact["location_loss"]), rel=0.05)
-    assert rough["location_loss"] != exact["location_loss"]
-    assert not Training(TINY, Optimization(), LOCATIONS, precision="auto").bfloat16  # on a CPU
-
-
-def test_compile_failure_keeps_networks_and_reports(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def broken(self: nn.Module) -> None:
-        def fail(*_: Tensor) -> None:
-            self.encoder.backbone.bn1.running_mean.add_(1)  # type: ignore[union-attr, operator]
-            raise RuntimeError("no C++ compiler\nand a long story")
-
-        self._compiled_call_impl = fail
-
-    monkeypatch.setattr(nn.Module, "compile", broken)
-    torch.manual_seed(0)
-    uncompiled = Training(TINY, Optimization(), LOCATIONS, compile_for=3)
-    assert uncompiled.compile_error == "RuntimeError: no C++ compiler"
-    plain = make()
-    assert plain.compile_error is None
-    torch.manual_seed(1)
-    uncompiled.step(*batch(), NOW)
-    plain.step(*batch(), NOW)
-    assert_same(uncompiled.state_dict(), plain.state_dict())
-
-
 def test_training_overfits_repeated_images() -> None:
     training = make()
     first, *_, last = [float(training.step(*batch(), NOW)["location_loss"]) for _ in range(30)]
     assert last < first / 2
-
-
-@pytest.mark.parametrize("kind", ["sgd", "adamw"])
-def test_training_state_resumes_bit_by_bit(kind: Any) -> None:
-    config, optimization = replace(TINY, dropout=0.5), Optimization(optimizer=kind)
-    whole = make(config, optimization)
-    for seed in range(2):
-        whole.step(*batch(seed), NOW)
-    held = Checkpoint(
-        network=config, recipe={}, locations=[], epoch=1, history=[], state=whole.state_dict()
-    )
-    data = dumps(held)
-    for seed in range(2, 4):
-        whole.step(*batch(seed), NOW)
-
-    torch.manual_seed(99)
-    resumed = Training(config, optimization, LOCATIONS)
-    resumed.load_state_dict(loads(data).state)
-    for seed in range(2, 4):
-        resumed.step(*batch(seed), NOW)
-    assert_same(resumed.state_dict(), whole.state_dict())
-
-
-def test_load_state_rejects_another_adversary() -> None:
-    with pytest.raises(KeyError, match="discriminator"):
-        make().load_state_dict(make(adversary=False).state_dict())
-
-
-def test_joint_bn_encodes_both_views_in_one_batch() -> None:
-    torch.manual_seed(0)
-    learner = EncoderWithClassifier(TINY, 3, joint_bn=True)
-    images_B3HW = torch.randint(0, 256, (5, 3, 64, 64), dtype=torch.uint8)
-    maps1, maps2, logits1, logits2 = learner(images_B3HW[:2], images_B3HW[2:])
-    maps_BCHW, g_BPD = learner.encoder(images_B3HW)
-    assert torch.equal(torch.cat([maps1, maps2]), maps_BCHW)
-    assert torch.allclose(torch.cat([logits1, logits2]), learner.classifier(g_BPD))
-    apart = EncoderWithClassifier(TINY, 3)
-    apart.load_state_dict(learner.state_dict())
-    assert not torch.allclose(apart(images_B3HW[:2], images_B3HW[2:])[0], maps1, atol=1e-3)

@@ -1,0 +1,91 @@
+"""Training by a group of Ray Train workers."""
+
+import os
+import signal
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import ray
+import torch
+from ray.exceptions import RayActorError
+from ray.util.queue import Queue
+
+from jobs.training.driver import train
+from jobs.training.ray_group import listen
+from model.checkpoint import loads
+from pipeline.core.errors import Incomplete, InputError
+from pipeline.core.progress import progress
+from tests.jobs.tiny_runs import rows, settings, tiny, weights
+
+
+def test_train_by_ray_takes_the_same_steps(
+    tiny_shards: str, tmp_path: Path, ray_cluster: None
+) -> None:
+    train(settings(tiny_shards, tmp_path / "here", tiny(1)))
+    train(settings(tiny_shards, tmp_path / "ray", tiny(1), workers=1))
+    here, there = weights(tmp_path / "here"), weights(tmp_path / "ray")
+    # Another number of threads may sum in another order, and AdamW makes whole steps of a last
+    # bit's sign.
+    assert all(
+        torch.allclose(here[name].float(), there[name].float(), atol=1e-3, rtol=1e-3)
+        for name in here
+    )
+    [one], [other] = rows(tmp_path / "here"), rows(tmp_path / "ray")
+    assert one["location_loss"] == pytest.approx(other["location_loss"], rel=1e-4)
+    assert [row["epoch"] for row in rows(tmp_path / "ray")] == [1]
+
+
+def test_train_sync_bn_without_gpus_is_rejected(
+    tiny_shards: str, tmp_path: Path, ray_cluster: None
+) -> None:
+    recipe = replace(tiny(1), sync_bn=True)
+    with pytest.raises(InputError, match="2 workers have no GPUs, expected GPUs"):
+        train(settings(tiny_shards, tmp_path, recipe, workers=2))
+
+
+def test_train_worker_input_error_is_not_retried(
+    tiny_shards: str, tmp_path: Path, ray_cluster: None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rates = replace(tiny(1).optimization, backbone_lr=1e30, head_lr=1e30, classifier_lr=1e30)
+    with pytest.raises(Incomplete, match="training diverged in epoch 1"):
+        train(
+            settings(
+                tiny_shards,
+                tmp_path,
+                replace(tiny(1), optimization=rates),
+                workers=1,
+                checkpoint_minutes=60.0,
+            )
+        )
+    assert "lost a worker" not in capfd.readouterr().err
+    assert not (tmp_path / "last.pt").exists()
+
+
+def test_train_two_ray_workers_share_one_network(
+    tiny_shards: str, tmp_path: Path, ray_cluster: None
+) -> None:
+    path = train(settings(tiny_shards, tmp_path, replace(tiny(1), batch_size=3), workers=2))
+    assert loads(Path(path).read_bytes()).history[0]["step"] == 1
+
+
+def test_queue_put_after_shutdown_raises(ray_cluster: None) -> None:
+    """SIGTERM lets an actor finish what it was asked; asked without an end, it neither went nor
+    answered (seed 22).
+    """
+    told = Queue(actor_options={"num_cpus": 0})
+    actor: Any = told.actor
+    pid: int = ray.get(actor.__ray_call__.remote(lambda queue: os.getpid()))
+    with progress(None, "training", "steps") as meter:
+        listener = threading.Thread(target=listen, args=(told, meter, []), daemon=True)
+        listener.start()
+        time.sleep(0.5)  # it asks
+        os.kill(pid, signal.SIGTERM)
+        time.sleep(0.5)  # the actor has heard
+        with pytest.raises(RayActorError):
+            ray.get(actor.put.remote({"steps": 1}), timeout=20)
+        listener.join(20)
+    assert not listener.is_alive()

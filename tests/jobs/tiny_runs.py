@@ -1,0 +1,45 @@
+"""Runs of a tiny recipe, and what they left."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from jobs.training.driver import train
+from jobs.training.recipes import Recipe, smoke
+from jobs.training.settings import TrainSettings
+from model.checkpoint import loads
+
+
+def tiny(epochs: int = 2) -> Recipe:
+    """Three steps an epoch on the tiny world's six satellite images."""
+    recipe = smoke(epochs)
+    network = replace(
+        recipe.network, width=0.25, part_dim=16, discriminator_channels=16, dropout=0.5
+    )
+    return replace(recipe, network=network, batch_size=2)
+
+
+def settings(shards: str, out: Path, recipe: Recipe, **changes: object) -> TrainSettings:
+    given = {
+        "recipe": recipe,
+        "shards": shards,
+        "out": str(out),
+        "workers": 0,
+        "checkpoint_minutes": 0.0,
+    }
+    return TrainSettings(**(given | changes))  # type: ignore[arg-type]
+
+
+def rows(out: Path) -> list[dict[str, object]]:
+    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+def rows_of(shards: str, out: Path) -> list[dict[str, object]]:
+    train(settings(shards, out, tiny(1)))
+    return rows(out)
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return loads((path / "last.pt").read_bytes()).encoder_weights
