@@ -1,1 +1,10 @@
-"""TODO room."""
+"""FAISS indexes: a feature table in, an index on disk out, opened for searching.
+
+In: a feature table and a memory budget (`build.build_index`). Out: a folder with FAISS files, the
+ids of their rows, and `index.json`; `searcher.Index` opens it and finds hits, `distributed` spreads
+it over a cluster, `update` extends, reduces and verifies it.
+
+Begin with `plan.py`, which chooses the kind of index; then `build.py`, the stage, which trains
+(`train.py`), builds work units (`units.py`, `workspace.py`) and measures recall (`recall.py`,
+`finish.py`); then `searcher.py` and `part.py`, one search. `metadata.py` is what `index.json` holds.
+"""

@@ -1,4 +1,4 @@
-"""Embedding: a part per shard, rows exactly once, done parts skipped, other networks refused."""
+"""Embedding: a part per shard, each row once, finished parts skipped, other encoders rejected."""
 
 import shutil
 from pathlib import Path
@@ -23,7 +23,7 @@ from tests.damaging import update_checksum
 ENCODING = EncodingConfig(mirror=False, resizer="torch", precision="float32")
 
 
-def mean_colour_network(fingerprint: str = "f" * 64) -> EncoderSpec:
+def mean_colour_encoder(fingerprint: str = "f" * 64) -> EncoderSpec:
     """An encoder that needs no training: the unit vector of the mean colour."""
 
     def factory(threads: int) -> Encoder:
@@ -42,7 +42,7 @@ def test_embed_writes_one_row_per_image(
 ) -> None:
     out = str(tmp_path / "table")
     count = embed_gallery(
-        EmbeddingSettings(shards=tiny_shards, out=out, batch_size=3), mean_colour_network()
+        EmbeddingSettings(shards=tiny_shards, out=out, batch_size=3), mean_colour_encoder()
     )
     manifest = read_manifest(tiny_shards)
     assert count == sum(shard.samples for shard in manifest.shards)
@@ -66,13 +66,13 @@ def test_embed_rerun_embeds_missing_parts_only(
     )
     shards = read_manifest(tiny_shards).of(Split.GALLERY, View.DRONE)
     assert len(shards) > 1
-    assert embed_gallery(settings, mean_colour_network()) == sum(shard.samples for shard in shards)
+    assert embed_gallery(settings, mean_colour_encoder()) == sum(shard.samples for shard in shards)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     times = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
-    assert embed_gallery(settings, mean_colour_network()) == 0
+    assert embed_gallery(settings, mean_colour_encoder()) == 0
     lost = tmp_path / f"{shards[0].name}.parquet"
     lost.unlink()
-    assert embed_gallery(settings, mean_colour_network()) == shards[0].samples
+    assert embed_gallery(settings, mean_colour_encoder()) == shards[0].samples
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     assert all(
         path.stat().st_mtime_ns == times[path.name] for path in tmp_path.iterdir() if path != lost
@@ -85,30 +85,30 @@ def test_embed_rejects_table_of_another_network(
     settings = EmbeddingSettings(
         shards=tiny_shards, out=str(tmp_path), split=Split.QUERY, view=View.SATELLITE
     )
-    embed_gallery(settings, mean_colour_network())
+    embed_gallery(settings, mean_colour_encoder())
     with pytest.raises(
         InputError, match=r"was made by network f+, this checkpoint is g+; choose another --out"
     ):
-        embed_gallery(settings, mean_colour_network("g" * 64))
+        embed_gallery(settings, mean_colour_encoder("g" * 64))
 
 
 def test_embed_names_absent_split_or_view(tmp_path: Path, tiny_shards: str) -> None:
     with pytest.raises(InputError, match="none of it was asked for"):
         embed_gallery(
             EmbeddingSettings(shards=tiny_shards, out=str(tmp_path), view=View.STREET),
-            mean_colour_network(),
+            mean_colour_encoder(),
         )
     with pytest.raises(InputError, match="not a finished set of shards"):
         embed_gallery(
-            EmbeddingSettings(shards=str(tmp_path), out=str(tmp_path)), mean_colour_network()
+            EmbeddingSettings(shards=str(tmp_path), out=str(tmp_path)), mean_colour_encoder()
         )
 
 
 def test_embed_skips_and_reports_undecodable_image(
     tmp_path: Path, tiny_shards: str, ray_cluster: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Packing refuses such images; this one was changed later, and tar and manifest by somebody who
-    meant it.
+    """Packing rejects such images; this one was changed later, with the checksums of tar and
+    manifest.
     """
     shard = read_manifest(tiny_shards).of(Split.QUERY, View.SATELLITE)[0]
     data = bytearray((Path(tiny_shards) / f"{shard.name}.tar").read_bytes())
@@ -120,7 +120,7 @@ def test_embed_skips_and_reports_undecodable_image(
     settings = EmbeddingSettings(
         shards=str(tmp_path), out=str(tmp_path / "table"), split=Split.QUERY, view=View.SATELLITE
     )
-    embed_gallery(settings, mean_colour_network())
+    embed_gallery(settings, mean_colour_encoder())
     footer = read_footer(str(tmp_path / "table" / f"{shard.name}.parquet"))
     assert footer.rows == shard.samples - 1
     assert [rejection.reason for rejection in footer.rejected] == [CHANGED]
@@ -130,7 +130,7 @@ def test_embed_skips_and_reports_undecodable_image(
         footer.rejected[0].path,
         CHANGED,
     )
-    assert embed_gallery(settings, mean_colour_network()) == 0
+    assert embed_gallery(settings, mean_colour_encoder()) == 0
 
 
 def test_embed_accepts_uris(tmp_path: Path, tiny_shards: str, ray_cluster: None) -> None:
@@ -138,4 +138,4 @@ def test_embed_accepts_uris(tmp_path: Path, tiny_shards: str, ray_cluster: None)
     settings = EmbeddingSettings(
         shards=Path(tiny_shards).as_uri(), out=out, split=Split.QUERY, view=View.DRONE
     )
-    assert embed_gallery(settings, mean_colour_network()) == open_table(out).rows > 0
+    assert embed_gallery(settings, mean_colour_encoder()) == open_table(out).rows > 0

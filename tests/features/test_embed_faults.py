@@ -1,14 +1,15 @@
-"""Whatever goes wrong while embedding, the table ends up with the bytes of an undisturbed run's,
-and nothing beside them.
+"""After any fault the table ends up with the bytes of an undisturbed run, and no other files.
 
 Random kills, of workers and of the stage, are in tests/chaos.
 """
 
 import errno
 import hashlib
+import io
 import os
 import shutil
 import signal
+import tarfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from pipeline.core import cluster, json_files, storage
 from pipeline.core.cluster import Node
@@ -34,15 +36,15 @@ from tests.damaging import update_checksum
 ENCODING = EncodingConfig(mirror=False, resizer="pillow", precision="float32")
 
 
-def network_of_colours(
+def mean_colour_encoder(
     seconds: float = 0.0,
     pids: str = "",
     at_start: Callable[[], None] = lambda: None,
-    spoil: str = "",
+    fault: str = "",
 ) -> EncoderSpec:
     """An encoder that needs no weights: the mean colour's unit vector. It takes `seconds` a batch,
-    and its worker leaves its process id in the folder `pids`; what `spoil` names happens to a black
-    image."""
+    and its worker writes its process id into the folder `pids`; `fault` names what happens to a
+    black image."""
 
     def factory(threads: int) -> Encoder:
         at_start()
@@ -52,13 +54,13 @@ def network_of_colours(
         def encode(images_B3HW: np.ndarray) -> np.ndarray:
             time.sleep(seconds)
             black_B = images_B3HW.max((1, 2, 3)) == 0
-            if spoil == "kill" and black_B.any():
+            if fault == "kill" and black_B.any():
                 os.kill(os.getpid(), signal.SIGKILL)
-            if spoil == "raise" and black_B.any():
+            if fault == "raise" and black_B.any():
                 raise ZeroDivisionError("a kernel failed")
             mean_B3 = images_B3HW.mean((2, 3)).astype(np.float32) + 1
             unit_B3: np.ndarray = mean_B3 / np.linalg.norm(mean_B3, axis=1, keepdims=True)
-            if spoil == "nan":
+            if fault == "nan":
                 unit_B3[black_B] = np.nan
             return unit_B3
 
@@ -73,7 +75,7 @@ def settings_of(shards: str | Path, out: str | Path, **more: Any) -> EmbeddingSe
     )
 
 
-def held(table: str | Path) -> dict[str, bytes]:
+def files_of(table: str | Path) -> dict[str, bytes]:
     """Every file of a table, hidden ones too."""
     files = (path for path in Path(table).rglob("*") if path.is_file())
     return {str(path.relative_to(table)): path.read_bytes() for path in files}
@@ -82,27 +84,22 @@ def held(table: str | Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory, tiny_shards: str) -> dict[str, bytes]:
     out = tmp_path_factory.mktemp("undisturbed")
-    embed_gallery(settings_of(tiny_shards, out, workers=1), network_of_colours())
-    return held(out)
+    embed_gallery(settings_of(tiny_shards, out, workers=1), mean_colour_encoder())
+    return files_of(out)
 
 
-def a_shard(shards: str | Path, number: int = 3) -> Shard:
+def shard_of(shards: str | Path, number: int = 3) -> Shard:
     return read_manifest(str(shards)).shards[number]
 
 
 @pytest.fixture
 def copied(tmp_path: Path, tiny_shards: str) -> Path:
-    """The shards, to be spoilt."""
+    """The shards, to be damaged."""
     return Path(shutil.copytree(tiny_shards, tmp_path / "shards"))
 
 
 def blacken(shards: Path, shard: Shard) -> None:
     """Put a black image in a shard's first place, of the same size as the one that was there."""
-    import io
-    import tarfile
-
-    from PIL import Image
-
     path = shards / f"{shard.name}.tar"
     with tarfile.open(path) as tar:
         member = next(one for one in tar.getmembers() if one.name.endswith(".jpg"))
@@ -121,13 +118,13 @@ def blacken(shards: Path, shard: Shard) -> None:
 def test_embed_skips_shard_that_kills_its_worker(
     tmp_path: Path, copied: Path, undisturbed: dict[str, bytes]
 ) -> None:
-    out, shard, pids = tmp_path / "table", a_shard(copied), tmp_path / "pids"
+    out, shard, pids = tmp_path / "table", shard_of(copied), tmp_path / "pids"
     pids.mkdir()
     blacken(copied, shard)
     with pytest.raises(
         Incomplete, match=rf"1 of \d+ shards .* again: {shard.name} \(lost 3 workers: "
     ):
-        embed_gallery(settings_of(copied, out), network_of_colours(spoil="kill", pids=str(pids)))
+        embed_gallery(settings_of(copied, out), mean_colour_encoder(fault="kill", pids=str(pids)))
     # Two at first, and one for each death after which there was more to do.
     assert 3 <= len(list(pids.iterdir())) <= 5
     [listed] = read_rejected(str(out)).to_pylist()
@@ -138,45 +135,45 @@ def test_embed_skips_shard_that_kills_its_worker(
     )
     kept = {
         name: data
-        for name, data in held(out).items()
+        for name, data in files_of(out).items()
         if name.endswith(".parquet") and "rejected" not in name
     }
     parts = {name: data for name, data in undisturbed.items() if name.endswith(".parquet")}
     assert kept == {name: data for name, data in parts.items() if name != f"{shard.name}.parquet"}
-    assert len(open_table(str(out)).parts) == len(parts) - 1  # what was given up is not missed
-    # The encoder is mended: only that shard is embedded, and the list is gone with its last entry.
-    assert embed_gallery(settings_of(copied, out), network_of_colours()) == shard.samples
-    assert held(out).keys() == undisturbed.keys()
+    assert len(open_table(str(out)).parts) == len(parts) - 1  # a skipped part is not expected
+    # The encoder is repaired: only that shard is embedded, and the list goes with its last entry.
+    assert embed_gallery(settings_of(copied, out), mean_colour_encoder()) == shard.samples
+    assert files_of(out).keys() == undisturbed.keys()
 
 
 def test_embed_unexpected_error_skips_one_shard(tmp_path: Path, copied: Path) -> None:
-    shard = a_shard(copied)
+    shard = shard_of(copied)
     blacken(copied, shard)
     with pytest.raises(
         Incomplete,
         match=rf"{shard.name} \(lost 3 workers: ZeroDivisionError: a kernel failed\)",
     ):
         embed_gallery(
-            settings_of(copied, tmp_path / "table", workers=1), network_of_colours(spoil="raise")
+            settings_of(copied, tmp_path / "table", workers=1), mean_colour_encoder(fault="raise")
         )
     assert len(part_names(str(tmp_path / "table"))) == len(read_manifest(str(copied)).shards) - 1
 
 
 def test_embed_rejects_nan_embeddings(tmp_path: Path, copied: Path) -> None:
-    shard = a_shard(copied)
+    shard = shard_of(copied)
     blacken(copied, shard)
     with pytest.raises(
         Incomplete,
         match=rf"the network gives {shard.split}-{shard.view}-\S+ an embedding of length nan",
     ):
-        embed_gallery(settings_of(copied, tmp_path / "table"), network_of_colours(spoil="nan"))
+        embed_gallery(settings_of(copied, tmp_path / "table"), mean_colour_encoder(fault="nan"))
     verify_table(str(tmp_path / "table"))
 
 
 def test_embed_skips_truncated_tar_until_repaired(
     tmp_path: Path, copied: Path, tiny_shards: str, undisturbed: dict[str, bytes]
 ) -> None:
-    out, shard, pids = tmp_path / "table", a_shard(copied), tmp_path / "pids"
+    out, shard, pids = tmp_path / "table", shard_of(copied), tmp_path / "pids"
     pids.mkdir()
     tar = copied / f"{shard.name}.tar"
     whole = tar.read_bytes()
@@ -184,12 +181,12 @@ def test_embed_skips_truncated_tar_until_repaired(
     with pytest.raises(
         Incomplete, match=rf"{shard.name} \(unusable: \S+{shard.name}\.tar has \d+ bytes"
     ):
-        embed_gallery(settings_of(copied, out), network_of_colours(pids=str(pids)))
+        embed_gallery(settings_of(copied, out), mean_colour_encoder(pids=str(pids)))
     assert len(list(pids.iterdir())) <= 2  # no worker was lost over it
     assert [row["shard"] for row in read_rejected(str(out)).to_pylist()] == [shard.name]
     tar.write_bytes(whole)
-    assert embed_gallery(settings_of(copied, out), network_of_colours()) == shard.samples
-    assert held(out) == undisturbed
+    assert embed_gallery(settings_of(copied, out), mean_colour_encoder()) == shard.samples
+    assert files_of(out) == undisturbed
 
 
 def test_embed_shard_without_images_gives_empty_part(tmp_path: Path, copied: Path) -> None:
@@ -199,18 +196,18 @@ def test_embed_shard_without_images_gives_empty_part(tmp_path: Path, copied: Pat
     tar.write_bytes(tar.read_bytes().replace(b"\xff\xd8\xff", b"\0\0\0"))
     update_checksum(copied, shard.name)
     total = sum(one.samples for one in manifest.shards)
-    assert embed_gallery(settings_of(copied, out), network_of_colours()) == total
+    assert embed_gallery(settings_of(copied, out), mean_colour_encoder()) == total
     footer = read_footer(storage.join(out, f"{shard.name}.parquet"))
     assert (footer.rows, len(footer.rejected)) == (0, shard.samples)
     assert open_table(out).embeddings().shape == (total - shard.samples, 3)
     assert len(read_rejected(out)) == shard.samples
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "table").rglob("*")}
-    assert embed_gallery(settings_of(copied, out), network_of_colours()) == 0
+    assert embed_gallery(settings_of(copied, out), mean_colour_encoder()) == 0
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "table").rglob("*")} == before
 
 
 def full_disk() -> Callable[[], None]:
-    """To be called in a worker: after two files, there is no room."""
+    """A function for a worker to call: after two files, the disk is full."""
 
     def fill() -> None:
         left, atomic_file = [2], storage.atomic_file
@@ -236,26 +233,28 @@ def test_embed_full_disk_stops_and_resumes(
         Incomplete, match=r"cannot be written \(No space left on device\).*to resume"
     ):
         embed_gallery(
-            settings_of(tiny_shards, out, workers=1), network_of_colours(at_start=full_disk())
+            settings_of(tiny_shards, out, workers=1), mean_colour_encoder(at_start=full_disk())
         )
     assert 2 <= len(part_names(str(out))) < len(undisturbed)
-    # A worker that was ended with the stage may leave a hidden half of a file.
+    # A worker that was stopped with the stage may leave a hidden partial file.
     assert all(
-        data == undisturbed[name] for name, data in held(out).items() if not name.startswith(".")
+        data == undisturbed[name]
+        for name, data in files_of(out).items()
+        if not name.startswith(".")
     )
-    embed_gallery(settings_of(tiny_shards, out), network_of_colours())
-    assert held(out) == undisturbed
+    embed_gallery(settings_of(tiny_shards, out), mean_colour_encoder())
+    assert files_of(out) == undisturbed
 
 
 def test_embed_sweeps_leftovers_and_repairs_torn_part(
     tmp_path: Path, tiny_shards: str, undisturbed: dict[str, bytes]
 ) -> None:
-    embed_gallery(settings_of(tiny_shards, tmp_path), network_of_colours())
+    embed_gallery(settings_of(tiny_shards, tmp_path), mean_colour_encoder())
     first, second = [name for name in sorted(undisturbed) if name.endswith(".parquet")][:2]
     (tmp_path / f".{first}.0123abcd").write_bytes(b"half")
     (tmp_path / second).write_bytes(undisturbed[second][:100])
-    embed_gallery(settings_of(tiny_shards, tmp_path), network_of_colours())
-    assert held(tmp_path) == undisturbed
+    embed_gallery(settings_of(tiny_shards, tmp_path), mean_colour_encoder())
+    assert files_of(tmp_path) == undisturbed
 
 
 @pytest.mark.parametrize("workers", [2, 3])
@@ -268,9 +267,9 @@ def test_embed_more_workers_than_cpus_still_finishes(
 ) -> None:
     monkeypatch.setattr(cluster, "nodes", lambda: [Node(cpus=2.0)])
     embed_gallery(
-        settings_of(tiny_shards, tmp_path, workers=workers), network_of_colours(seconds=0.01)
+        settings_of(tiny_shards, tmp_path, workers=workers), mean_colour_encoder(seconds=0.01)
     )
-    assert held(tmp_path) == undisturbed
+    assert files_of(tmp_path) == undisturbed
 
 
 def test_embed_gives_up_without_room_for_a_worker(
@@ -281,20 +280,20 @@ def test_embed_gives_up_without_room_for_a_worker(
         InputError,
         match=r"each asks for 1000 CPUs, and the largest of 1 nodes has \d+ CPUs; start nodes",
     ):
-        embed_gallery(settings, network_of_colours())
+        embed_gallery(settings, mean_colour_encoder())
 
 
 def test_embed_after_extension_embeds_new_shards_only(
     tmp_path: Path, copied: Path, undisturbed: dict[str, bytes], ray_cluster: None
 ) -> None:
     out, manifest = tmp_path / "table", copied / "manifest.json"
-    said = json_files.read_checksummed(str(manifest))
-    shards = said["shards"]
-    json_files.write_checksummed(str(manifest), said | {"shards": shards[:-2]})
-    embed_gallery(settings_of(copied, out), network_of_colours())
-    json_files.write_checksummed(str(manifest), said)
-    assert embed_gallery(settings_of(copied, out), network_of_colours()) == sum(
+    content = json_files.read_checksummed(str(manifest))
+    shards = content["shards"]
+    json_files.write_checksummed(str(manifest), content | {"shards": shards[:-2]})
+    embed_gallery(settings_of(copied, out), mean_colour_encoder())
+    json_files.write_checksummed(str(manifest), content)
+    assert embed_gallery(settings_of(copied, out), mean_colour_encoder()) == sum(
         one["samples"] for one in shards[-2:]
     )
-    assert held(out) == undisturbed
+    assert files_of(out) == undisturbed
     assert len(open_table(str(out)).labels().keys) == sum(one["samples"] for one in shards)

@@ -1,6 +1,4 @@
-"""Features to the field's .mat file and back, the challenge's answer file, and what is refused on
-the way.
-"""
+"""Features to the field's .mat file and back, the challenge's answer file, and invalid files."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,7 @@ FIGURES = ("queries", "gallery", "r1", "r5", "r10", "r1p", "ap")
 
 
 def saved(path: Path, **changed: Any) -> str:
-    """A file as the public test scripts save it: five images of two places, features of any length."""
+    """A file as the public test scripts save it: five images of two locations."""
     rng = np.random.default_rng(5)
     content: dict[str, Any] = {
         "gallery_f": rng.standard_normal((3, 4)).astype(np.float32), "gallery_label": [839, 840, 7],

@@ -1,8 +1,8 @@
 """The whole evaluation against a loop over queries, written from METHOD.md's definitions alone, and
 the official counts.
 
-The loop knows nothing of blocks, bounds or ranks by counting: it scores, sorts and walks one query
-after the other.
+The loop has no blocks, bounds or ranks by counting: it scores, sorts and walks one query after the
+other.
 """
 
 import math

@@ -1,6 +1,4 @@
-"""Single rows of a table: what pyarrow reads, wherever the rows lie in the file, and nothing from a
-part that has changed.
-"""
+"""Single rows of a table equal what pyarrow reads; changed parts are rejected."""
 
 from pathlib import Path
 
@@ -31,7 +29,8 @@ def test_row_reader_equals_pyarrow(tmp_path: Path, dtype: str) -> None:
 
 
 @given(
-    rows=st.integers(1, 60), dimension=st.integers(1, 40), page=st.sampled_from([64, 100, 1000]), group=st.integers(1, 40),
+    rows=st.integers(1, 60), dimension=st.integers(1, 40),
+    page=st.sampled_from([64, 100, 1000]), group=st.integers(1, 40),
     version=st.sampled_from(["1.0", "2.0"]), dtype=st.sampled_from(["float16", "float32"]),
 )  # fmt: skip
 @settings(max_examples=40)

@@ -1,4 +1,4 @@
-"""Feature tables for the tests of the index: unit vectors in clusters, as embeddings of places lie."""
+"""Feature tables for the tests of the index: unit vectors in clusters, as real embeddings are."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,7 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.core.arrays import Floats
+from pipeline.core.records import Split, View
 from pipeline.features.part import PartFooter, PartRows, write_part
+from pipeline.features.table import open_table
+from pipeline.index.build import build_index
+from pipeline.index.searcher import Index
+from pipeline.index.settings import IndexSettings
 
 
 def clustered(count: int, dimension: int, seed: int, clusters: int = 30) -> Floats:
@@ -19,9 +24,16 @@ def clustered(count: int, dimension: int, seed: int, clusters: int = 30) -> Floa
 
 
 def write_table_part(
-    table: Path, number: int, vectors: Floats, split: str = "gallery", view: str = "satellite", fingerprint: str = "f" * 64,
-    dtype: str = "float32", locations: Sequence[str] | None = None, shard: str | None = None,
-) -> None:  # fmt: skip
+    table: Path,
+    number: int,
+    vectors: Floats,
+    split: str = "gallery",
+    view: str = "satellite",
+    fingerprint: str = "f" * 64,
+    dtype: str = "float32",
+    locations: Sequence[str] | None = None,
+    shard: str | None = None,
+) -> None:
     """A part whose i-th row lies i thousandths of a degree north of the equator, at the part's
     number in degrees east.
     """
@@ -52,3 +64,22 @@ def write_gallery(
     if not first:
         write_table_part(table, 0, clustered(40, dimension, 1000), "query", "drone", dtype=dtype)
     return table
+
+
+def build(source: str, out: Path, **changes: object) -> Index:
+    """The index of a table's satellite gallery, built and opened."""
+    given = {
+        "table": source,
+        "out": str(out),
+        "split": Split.GALLERY,
+        "view": View.SATELLITE,
+        "target_recall": 0.5,
+    }
+    build_index(IndexSettings(**(given | changes)))  # type: ignore[arg-type]
+    return Index(str(out))
+
+
+def answers(index: Index, table: str) -> list[list[tuple[str, float]]]:
+    """Keys and scores of the hits of all queries of a table."""
+    found = index.search(open_table(table).select(Split.QUERY).embeddings(), 8)
+    return [[(hit.key, round(hit.score, 5)) for hit in hits] for hits in found]

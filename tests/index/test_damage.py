@@ -1,6 +1,4 @@
-"""A damaged index is refused before FAISS sees it; of what a killed build left, whole files alone
-are believed.
-"""
+"""Damage to an index is found before FAISS reads it; a killed build reuses intact files only."""
 
 import shutil
 from pathlib import Path

@@ -1,6 +1,4 @@
-"""An index spread over actors answers as one in this process does, and what is wrong with it is
-said as there.
-"""
+"""An index spread over actors returns the hits, and the errors, of one process."""
 
 from pathlib import Path
 

@@ -1,6 +1,4 @@
-"""The planner, by what must hold of any gallery: within the budget, more memory never worse, no
-where it is impossible.
-"""
+"""Invariants of the planner: within the budget, never less recall for more memory."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Recall as it is meant, and the least effort that reaches it."""
+"""Recall by hand-worked numbers, and the search parameters that reach a target."""
 
 from itertools import pairwise
 
@@ -57,9 +57,7 @@ def test_exact_search_equals_brute_force_for_any_blocks(
 
 
 def test_recall_by_hand(built: tuple[str, Index]) -> None:
-    """Of ten rows that exact search is said to find, the index finds those that are really the
-    nearest.
-    """
+    """Of ten rows that are given as exact search's, the index finds those that are the nearest."""
     table, index = built
     queries = open_table(table).select(Split.QUERY).embeddings()[:2]
     most = SearchParams(nprobe_or_ef=16, rerank_factor=60)

@@ -1,6 +1,4 @@
-"""Searching: finds what brute force finds, under any filter, in any kind of index; opens with plain
-FAISS.
-"""
+"""Searching equals brute force under any filter and in any kind of index; plain FAISS opens it."""
 
 from pathlib import Path
 
@@ -99,7 +97,7 @@ def test_search_equals_brute_force(table: str, tmp_path: Path) -> None:
 def test_search_filter_equals_brute_force(
     table: str, tmp_path_factory: pytest.TempPathFactory, factory: str, name: str
 ) -> None:
-    """Few rows are left, so each is scored by the table's own vectors, however rough the index's
+    """Few rows match, so each is scored by the table's own vectors, however coarse the index's
     codes are.
     """
     out = tmp_path_factory.getbasetemp() / f"filtered-{factory}"
@@ -118,8 +116,8 @@ def test_search_filter_equals_brute_force(
 def test_search_wide_filter_still_finds_k(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factory: str
 ) -> None:
-    """A third of the rows may answer, and the effort is that for all: lists are looked through
-    three times as many.
+    """A third of the rows match, and the search parameters are those for all rows: three times as
+    many lists are searched.
     """
     out = build(table, tmp_path / "index", factory=factory, refine=True, target_recall=0.9)
     monkeypatch.setattr("pipeline.index.part.FILTERED_EXACT_ROWS", 0)
@@ -134,7 +132,7 @@ def test_search_wide_filter_still_finds_k(
 def test_search_without_the_table_uses_codes(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factory: str
 ) -> None:
-    """Single vectors cannot be read from an object store: a narrow filter then looks at every code."""
+    """An object store gives no single vectors: a narrow filter then compares all codes."""
     out = build(table, tmp_path / "index", factory=factory)
     monkeypatch.setattr("pipeline.index.searcher.supports_row_reads", lambda path: False)
     where = FILTERS["locations"]

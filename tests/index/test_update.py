@@ -1,6 +1,4 @@
-"""Growing: what is added is found as if it had always been there, what is removed is not, and
-nothing foreign comes in.
-"""
+"""Extending, removing and verifying: new parts are found, removed locations are not."""
 
 import json
 import shutil
