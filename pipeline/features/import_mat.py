@@ -12,25 +12,27 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pipeline.core import storage
 from pipeline.core.arrays import Floats
 from pipeline.core.errors import InputError
 from pipeline.core.lock import locks_output
 from pipeline.core.records import Split, View, make_key
-from pipeline.features.mat_file import NUMBERS, IsHdf5, Unreadable, read_mat
+from pipeline.features.mat_file import REQUIRED, IsHdf5, Unreadable, read_mat
 from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.features.settings import ImportSettings
 
 PART_ROWS = 8_192
-JUNK_LABEL = -1
+JUNK_LABEL = "-1"
 "The official evaluation takes gallery rows of this label out of the ranking."
 
 
 @dataclass(frozen=True, kw_only=True)
 class _EmbeddingSet:
     features_ND: Floats
-    labels: list[int]
+    labels: list[str]
+    "Whole numbers, or names, as text."
     paths: list[list[str]]
     "Split at the slashes; empty where the file has none."
 
@@ -40,8 +42,8 @@ def import_features(settings: ImportSettings) -> dict[str, tuple[str, int]]:
     """Write OUT/queries and OUT/gallery; returns, for each, its path and rows.
 
     A location is the name of the image's folder where the file gives paths for both sets, else the
-    label as text. Vectors are brought to unit length. Raises InputError when the file is invalid,
-    or OUT holds other features.
+    label: a whole number as text, or a name. Vectors are brought to unit length. Raises InputError
+    when the file is invalid, or OUT holds other features.
     """
     if not storage.is_file(settings.mat):
         raise InputError(
@@ -50,6 +52,13 @@ def import_features(settings: ImportSettings) -> dict[str, tuple[str, int]]:
     data = storage.read_bytes(settings.mat)
     arrays = _load(settings.mat, data)
     sets = {name: _embedding_set(settings.mat, arrays, name) for name in ("query", "gallery")}
+    kinds = {name: arrays[f"{name}_label"].dtype.kind == "U" for name in sets}
+    if len(set(kinds.values())) > 1:
+        text, numbers = ("query", "gallery") if kinds["query"] else ("gallery", "query")
+        raise InputError(
+            f"{settings.mat} has {text}_label that are text and {numbers}_label that are numbers; "
+            "expected the same kind, since equal labels mean the same location; save both alike"
+        )
     widths = {name: one.features_ND.shape[1] for name, one in sets.items()}
     if len(set(widths.values())) > 1:
         raise InputError(
@@ -85,7 +94,7 @@ def _load(path: str, data: bytes) -> dict[str, Any]:
             f"{path} cannot be read as a .mat file ({error}); expected one that scipy.io.savemat "
             "wrote"
         ) from None
-    missing = [name for name in NUMBERS if name not in arrays]
+    missing = [name for name in REQUIRED if name not in arrays]
     if missing:
         raise InputError(
             f"{path} holds {', '.join(names)[:300] or 'nothing'}; expected {', '.join(missing)} "
@@ -98,13 +107,7 @@ def _embedding_set(path: str, arrays: dict[str, Any], name: str) -> _EmbeddingSe
     """The queries or the gallery of a file, without junk. Raises InputError."""
     with np.errstate(over="ignore"):  # an infinite length is refused below
         features_ND = np.asarray(arrays[f"{name}_f"], np.float32)
-    label_N = np.ravel(arrays[f"{name}_label"])
-    if not np.isfinite(label_N).all() or (np.abs(label_N) >= 2**63).any():
-        raise InputError(
-            f"{path} has {name}_label that are no whole numbers; expected one per image; save them "
-            "again"
-        )
-    labels = [int(label) for label in label_N]
+    labels = _labels(path, name, np.ravel(arrays[f"{name}_label"]))
     paths: list[str] = arrays.get(f"{name}_path", np.array([], np.str_)).tolist()
     if (
         features_ND.ndim != 2
@@ -135,6 +138,24 @@ def _embedding_set(path: str, arrays: dict[str, Any], name: str) -> _EmbeddingSe
     )
 
 
+def _labels(path: str, name: str, label_N: npt.NDArray[Any]) -> list[str]:
+    """The labels as text. Raises InputError for numbers with a fraction and for empty names."""
+    text = label_N.dtype.kind == "U"
+    if text:
+        invalid_N = label_N == ""
+    else:
+        with np.errstate(invalid="ignore"):  # infinity % 1
+            invalid_N = ~np.isfinite(label_N) | (np.abs(label_N) >= 2**63) | (label_N % 1 != 0)
+    if invalid_N.any():
+        row = int(np.argmax(invalid_N))
+        kind = "empty in places" if text else "no whole numbers"
+        raise InputError(
+            f"{path} has {name}_label that are {kind} (row {row} is {label_N[row].item()!r}); "
+            "expected one whole number or one name per image; save them again"
+        )
+    return label_N.tolist() if text else [str(int(label)) for label in label_N]
+
+
 def _write_table(
     table: str, embeddings: _EmbeddingSet, split: Split, view: View, fingerprint: str, by_path: bool
 ) -> int:
@@ -142,7 +163,7 @@ def _write_table(
     paths, labels = embeddings.paths, embeddings.labels
     if by_path and paths and len(paths[0]) > 2:  # .../query_drone/0001/image-01.jpeg
         view = next((one for one in View if str(one) in paths[0][-3]), view)
-    locations = [parts[-2] for parts in paths] if by_path else [str(label) for label in labels]
+    locations = [parts[-2] for parts in paths] if by_path else labels
     stems = [parts[-1].rsplit(".", 1)[0] for parts in paths] or [""] * len(labels)
     keys = _keys(split, view, locations, stems)
     names = [

@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-NUMBERS = ("gallery_f", "gallery_label", "query_f", "query_label")
+VECTORS = ("gallery_f", "query_f")
+LABELS = ("gallery_label", "query_label")
+REQUIRED = ("gallery_f", "gallery_label", "query_f", "query_label")
 PATHS = ("gallery_path", "query_path")
 NAMES = "names"
 "Under this name the reader returns the names of all arrays in the file."
@@ -31,7 +33,7 @@ class IsHdf5(ValueError):
 
 
 def read_mat(data: bytes) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
-    """The arrays of NUMBERS and PATHS that the file has, and the names of all its arrays.
+    """The arrays of REQUIRED and PATHS that the file has, and the names of all its arrays.
 
     Raises Unreadable, IsHdf5.
     """
@@ -54,7 +56,8 @@ def main() -> int:
 
     try:
         file = scipy.io.loadmat(io.BytesIO(sys.stdin.buffer.read()))
-        plain = {name: _numbers(name, file[name]) for name in NUMBERS if name in file}
+        plain = {name: _numbers(name, file[name]) for name in VECTORS if name in file}
+        plain |= {name: _labels(name, file[name]) for name in LABELS if name in file}
         plain |= {name: _texts(file[name]) for name in PATHS if name in file}
         names = np.array([name for name in file if not name.startswith("__")], np.str_)
         np.savez(sys.stdout.buffer, **{NAMES: names}, **plain)  # type: ignore[arg-type]
@@ -71,6 +74,21 @@ def _numbers(name: str, value: Any) -> npt.NDArray[Any]:
     if numbers.dtype.kind not in "fiub":
         raise ValueError(f"{name} holds {numbers.dtype}, not numbers")
     return numbers
+
+
+def _labels(name: str, value: Any) -> npt.NDArray[Any]:
+    """Numbers as numbers; names, whether in a matrix or in cells, as text."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "UO":
+        return _numbers(name, value)
+    cells = [
+        cell.item() if isinstance(cell, np.ndarray) and cell.size == 1 else cell
+        for cell in np.ravel(array)
+    ]
+    if not all(isinstance(cell, str) for cell in cells):
+        kinds = sorted({type(cell).__name__ for cell in cells if not isinstance(cell, str)})
+        raise ValueError(f"{name} has cells of {', '.join(kinds)}, not whole numbers or names")
+    return _texts(array)
 
 
 def _texts(value: Any) -> npt.NDArray[np.str_]:

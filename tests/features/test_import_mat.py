@@ -88,6 +88,27 @@ def test_import_mat_locations_from_paths_or_labels(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize("cells", [False, True])
+def test_import_mat_takes_text_labels_as_names(tmp_path: Path, cells: bool) -> None:
+    """Names of unlike length, as a matrix of padded characters or as cells."""
+    kind = object if cells else np.str_
+    labels = {
+        "query_label": np.array(["tower", "07"], kind),
+        "gallery_label": np.array(["tower", "-1", "07"], kind),
+    }
+    mat = saved(tmp_path / "t.mat", **labels, query_path=None, gallery_path=None)
+    import_features(ImportSettings(mat=mat, out=str(tmp_path / "t")))
+    for name in ("queries", "gallery"):
+        table = open_table(str(tmp_path / "t" / name))
+        assert table.labels().locations.tolist() == ["tower", "07"]
+
+
+def test_import_mat_takes_whole_floats_as_numbers(tmp_path: Path) -> None:
+    mat = saved(tmp_path / "f.mat", query_label=[839.0, 7.0], query_path=None)
+    import_features(ImportSettings(mat=mat, out=str(tmp_path / "f")))
+    assert open_table(str(tmp_path / "f" / "queries")).labels().locations.tolist() == ["839", "7"]
+
+
 def test_import_mat_views_from_paths(tmp_path: Path) -> None:
     turned = {
         "query_path": ["/d/query_satellite/0839/a.jpg", "/d/query_satellite/0007/b.jpg"],
@@ -112,6 +133,20 @@ def test_import_mat_drops_junk_as_official_code(tmp_path: Path) -> None:
         ({"query_label": [1, 2, 3]}, r"3 labels and 2 paths; expected one row"),
         ({"query_f": np.ones((2, 5))}, r"queries of 5 and a gallery of 4 dimensions"),
         ({"gallery_f": np.zeros((3, 4))}, r"row 0 of gallery_f .* has length 0"),
+        ({"query_label": [0.5, 7]}, r"query_label that are no whole numbers \(row 0 is 0.5\)"),
+        (
+            {"gallery_label": [1, np.nan, 7]},
+            r"no whole numbers \(row 1 is nan\); expected one whole",
+        ),
+        ({"query_label": ["0839", ""]}, r"empty in places \(row 1 is ''\); expected one whole"),
+        (
+            {"query_label": ["0839", "0007"]},
+            r"query_label that are text and gallery_label that are",
+        ),
+        (
+            {"query_label": np.array([{}, 7], object)},
+            r"query_label has cells of .*not whole numbers",
+        ),
     ],
 )
 def test_import_mat_rejects_mismatched_shapes(
