@@ -17,6 +17,7 @@ import numpy as np
 import pyproj
 import rasterio
 from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
 from pyproj.exceptions import CRSError, ProjError
 
 from pipeline.core.arrays import Doubles
@@ -46,6 +47,9 @@ class Georeference:
     "Pixel positions to coordinates; rotated and sheared transforms are fine."
     assume_wgs84: bool = False
     "Whether a datum without a known shift is taken for WGS84."
+    around: tuple[float, float] | None = None
+    """Rough latitude and longitude of the mosaic. Shifts of datums are valid for regions; PROJ uses
+    one of another region where it knows no better, unless it is told the region."""
 
     def degrees(self, pixels_N2: Doubles) -> Doubles:
         """(lat, lon) of pixel positions, (N, 2): latitude within +-90, longitude within +-180.
@@ -58,11 +62,11 @@ class Georeference:
         xs, ys = a * x + b * y + c, d * x + e * y + f
         near = (np.abs(xs) < MAX_COORDINATE) & (np.abs(ys) < MAX_COORDINATE)  # False for NaN
         xs, ys = np.where(near, xs, np.nan), np.where(near, ys, np.nan)
-        lon, lat = _to_wgs84(_transformer(self.crs, ballpark=False), xs, ys)
+        lon, lat = _to_wgs84(_transformer(self.crs, False, self.around), xs, ys)
         if self.assume_wgs84 or self.resembles_wgs84:
             lost = np.isnan(lon)
             lon[lost], lat[lost] = _to_wgs84(
-                _transformer(self.crs, ballpark=True), xs[lost], ys[lost]
+                _transformer(self.crs, True, self.around), xs[lost], ys[lost]
             )
         # A mosaic may run on beyond the date line.
         lon = np.where(np.abs(lon) > 180, (lon + 180) % 360 - 180, lon)
@@ -157,7 +161,7 @@ class Georeference:
         x, y = (np.array([value]) for value in self.affine @ pixel)
         answers: tuple[tuple[bool, Shift], ...] = ((False, "known"), (True, "unknown"))
         for ballpark, answer in answers:
-            if np.isfinite(_to_wgs84(_transformer(self.crs, ballpark), x, y)[0]).all():
+            if np.isfinite(_to_wgs84(_transformer(self.crs, ballpark, self.around), x, y)[0]).all():
                 return answer
         return "nowhere"
 
@@ -165,7 +169,8 @@ class Georeference:
         """How accurate the shift to WGS84 is at a position, metres, by the EPSG data set; None
         where that does not say.
         """
-        transformer = Transformer.from_crs(self.crs, WGS84, always_xy=True)
+        area = _area(self.around)
+        transformer = Transformer.from_crs(self.crs, WGS84, always_xy=True, area_of_interest=area)
         transformer.transform(*(self.affine @ pixel))
         try:  # of several operations the one that was right here; of one its own
             accuracy = transformer.get_last_used_operation().accuracy
@@ -194,15 +199,34 @@ def parse_crs(name: str) -> CRS | None:
         return None
 
 
+def locate_roughly(
+    crs: CRS, affine: rasterio.Affine, pixel: tuple[float, float]
+) -> tuple[float, float] | None:
+    """Latitude and longitude of a pixel to a hundredth of a degree, by any shift of the datum; None
+    where it is not on Earth.
+    """
+    loose = Georeference(crs=crs, affine=affine, assume_wgs84=True)
+    lat, lon = loose.degrees(np.array([pixel], float))[0].tolist()
+    return (round(lat, 2), round(lon, 2)) if np.isfinite(lat) else None
+
+
 @lru_cache(maxsize=64)
-def _transformer(crs: CRS, ballpark: bool) -> Transformer | None:
-    """From `crs` to WGS84, longitude first; None where PROJ knows no operation. Making one takes
-    up to half a second; threads may share it.
+def _transformer(
+    crs: CRS, ballpark: bool, around: tuple[float, float] | None
+) -> Transformer | None:
+    """From `crs` to WGS84, longitude first, by operations that are valid `around` a position; None
+    where PROJ knows none. Making one takes up to half a second; threads may share it.
     """
     try:
-        return Transformer.from_crs(crs, WGS84, always_xy=True, allow_ballpark=ballpark)
+        return Transformer.from_crs(
+            crs, WGS84, always_xy=True, allow_ballpark=ballpark, area_of_interest=_area(around)
+        )
     except ProjError:
         return None
+
+
+def _area(around: tuple[float, float] | None) -> AreaOfInterest | None:
+    return None if around is None else AreaOfInterest(around[1], around[0], around[1], around[0])
 
 
 def _to_wgs84(transformer: Transformer | None, xs: Doubles, ys: Doubles) -> tuple[Doubles, Doubles]:

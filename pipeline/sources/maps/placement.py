@@ -12,7 +12,7 @@ import rasterio
 from pyproj import CRS
 
 from pipeline.core import storage
-from pipeline.sources.maps.georeference import Georeference, parse_crs
+from pipeline.sources.maps.georeference import Georeference, locate_roughly, parse_crs
 from pipeline.sources.maps.mosaic import open_mosaic, transform_by
 
 MIN_PIXEL_M = 1e-6
@@ -56,8 +56,13 @@ def place_mosaic(path: str, crs_name: str | None, assume_wgs84: bool) -> Placeme
     dataset = open_mosaic(path)
     crs = _crs_of(dataset, crs_name)
     affine = _one_transform(path, dataset)
-    georeference = Georeference(crs=crs, affine=affine, assume_wgs84=assume_wgs84)
     centre = (dataset.width / 2, dataset.height / 2)
+    georeference = Georeference(
+        crs=crs,
+        affine=affine,
+        assume_wgs84=assume_wgs84,
+        around=locate_roughly(crs, affine, centre),
+    )
     datum = _check_datum(georeference, centre)
     pixel_m = georeference.ground_pixel(centre)
     name = georeference.name
