@@ -55,7 +55,7 @@ def scanned(root: Path) -> tuple[dict[str, ImageRecord], list[Rejection]]:
     return records, [f for f in found if isinstance(f, Rejection)]
 
 
-def test_every_image_has_its_split_view_and_location_and_a_key_of_its_own(tmp_path: Path) -> None:
+def test_denseuav_gives_split_view_location_and_key(tmp_path: Path) -> None:
     records, refused = scanned(miniature(tmp_path))
     assert not refused
     assert len(records) == 27
@@ -67,7 +67,7 @@ def test_every_image_has_its_split_view_and_location_and_a_key_of_its_own(tmp_pa
     assert records["train/drone/000001/H90.JPG"].split == "train"
 
 
-def test_an_image_has_its_own_lines_position_else_its_locations(tmp_path: Path) -> None:
+def test_denseuav_position_of_own_line_else_of_location(tmp_path: Path) -> None:
     records, _ = scanned(miniature(tmp_path))
     assert records["train/drone/000001/H90.JPG"].geotag == GeoTag(
         lat=30.33, lon=120.388, altitude_m=104.5
@@ -82,7 +82,7 @@ def test_an_image_has_its_own_lines_position_else_its_locations(tmp_path: Path) 
     )
 
 
-def test_without_tables_there_are_no_geotags(tmp_path: Path) -> None:
+def test_denseuav_without_tables_has_no_geotags(tmp_path: Path) -> None:
     for table in miniature(tmp_path).glob("*.txt"):
         table.unlink()
     records, refused = scanned(tmp_path)
@@ -104,9 +104,7 @@ def test_without_tables_there_are_no_geotags(tmp_path: Path) -> None:
         "\x00\x01 no line at all",
     ],
 )
-def test_a_damaged_line_is_told_and_its_images_come_without_a_tag(
-    tmp_path: Path, line: str
-) -> None:
+def test_denseuav_damaged_line_costs_only_its_tag(tmp_path: Path, line: str) -> None:
     root = miniature(tmp_path)
     (root / "Dense_GPS_test.txt").write_text(f"test/x/009999/H80.tif 1 2 3\n\n{line}\n")
     records, refused = scanned(root)
@@ -118,13 +116,13 @@ def test_a_damaged_line_is_told_and_its_images_come_without_a_tag(
     assert refused[0].found.startswith("line 3: ")
 
 
-def test_a_table_without_one_readable_line_is_refused_whole(tmp_path: Path) -> None:
+def test_denseuav_table_without_readable_line_is_refused(tmp_path: Path) -> None:
     (miniature(tmp_path) / "Dense_GPS_ALL.txt").write_bytes(bytes(range(256)))
     with pytest.raises(InputError, match=r"Dense_GPS_ALL\.txt has no line that can be read"):
         scanned(tmp_path)
 
 
-def test_odd_files_are_refused_and_the_rest_comes(tmp_path: Path) -> None:
+def test_denseuav_misplaced_files_are_refused(tmp_path: Path) -> None:
     root = miniature(tmp_path)
     touch(root / "train/drone/000001/Thumbs.db")
     touch(root / "train/drone/000001/inner/H80.JPG")
@@ -135,15 +133,13 @@ def test_odd_files_are_refused_and_the_rest_comes(tmp_path: Path) -> None:
     assert sorted(r.reason for r in refused) == ["wrong folder"]
 
 
-def test_a_missing_root_is_refused_in_a_sentence(tmp_path: Path) -> None:
+def test_denseuav_missing_root_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no folder .*expected DenseUAV's root"):
         scanned(tmp_path / "nowhere")
 
 
 @given(st.floats(-90, 90), st.floats(-180, 180), st.booleans())
-def test_a_line_with_letters_means_the_same_in_either_order(
-    lat: float, lon: float, swapped: bool
-) -> None:
+def test_parse_line_with_letters_in_either_order(lat: float, lon: float, swapped: bool) -> None:
     words = [f"{'S' if lat < 0 else 'N'}{abs(lat)!r}", f"{'W' if lon < 0 else 'E'}{abs(lon)!r}"]
     path, tag = parse_line(
         " ".join(["a b/000001/H80.tif", *(reversed(words) if swapped else words), "94.6"])
@@ -151,6 +147,6 @@ def test_a_line_with_letters_means_the_same_in_either_order(
     assert (path, tag) == ("a b/000001/H80.tif", GeoTag(lat=lat, lon=lon, altitude_m=94.6))
 
 
-def test_a_latitude_beyond_the_pole_is_unreadable() -> None:
+def test_parse_line_latitude_beyond_pole_is_unreadable() -> None:
     with pytest.raises(Unreadable, match="latitude 95 is not between"):
         parse_line("a/1/H80.tif 95 12 3")

@@ -74,7 +74,7 @@ def scanned(root: Path, source: GtaUav | None = None) -> tuple[list[ImageRecord]
     ]
 
 
-def test_a_drone_images_location_is_the_tile_of_the_greatest_weight(tmp_path: Path) -> None:
+def test_gta_uav_location_is_the_tile_of_greatest_weight(tmp_path: Path) -> None:
     records, refused = scanned(miniature(tmp_path))
     assert not refused
     assert [(record.key, record.location) for record in records] == [
@@ -91,14 +91,14 @@ def test_a_drone_images_location_is_the_tile_of_the_greatest_weight(tmp_path: Pa
     assert all(record.geotag is None for record in records)
 
 
-def test_an_image_that_no_tile_shows_well_comes_when_asked_for(tmp_path: Path) -> None:
+def test_gta_uav_pos_semipos_adds_partly_overlapping_images(tmp_path: Path) -> None:
     records, refused = scanned(miniature(tmp_path), GtaUav(pairs="pos_semipos"))
     assert not refused
     queries = {Path(r.path).stem[-1]: r.location for r in records if r.split == "query"}
     assert queries == {"3": "5_0_13_27", "4": "6_0_0_0"}
 
 
-def test_the_other_division_has_lists_of_its_own(tmp_path: Path) -> None:
+def test_gta_uav_division_has_its_own_lists(tmp_path: Path) -> None:
     root = miniature(tmp_path)
     with pytest.raises(
         InputError,
@@ -122,7 +122,7 @@ def test_the_other_division_has_lists_of_its_own(tmp_path: Path) -> None:
         {"drone_img_dir": 3},
     ],
 )
-def test_a_damaged_pair_is_told_and_the_others_come(tmp_path: Path, damage: dict[str, Any]) -> None:
+def test_gta_uav_damaged_pair_is_refused_alone(tmp_path: Path, damage: dict[str, Any]) -> None:
     root = miniature(tmp_path)
     entries = json.loads((root / TRAIN).read_text())
     entries[1] |= damage
@@ -136,7 +136,7 @@ def test_a_damaged_pair_is_told_and_the_others_come(tmp_path: Path, damage: dict
     assert [r.location for r in records if r.split == "train"] == ["4_0_6_13", "4_0_6_13"]
 
 
-def test_a_pair_whose_files_are_not_there_is_refused(tmp_path: Path) -> None:
+def test_gta_uav_pair_with_missing_files_is_refused(tmp_path: Path) -> None:
     root = miniature(tmp_path)
     (root / "satellite/5_0_13_27.png").unlink()
     (root / "drone/images/500_0001_0000000001.png").unlink()
@@ -152,7 +152,7 @@ def test_a_pair_whose_files_are_not_there_is_refused(tmp_path: Path) -> None:
     assert not [r for r in records if r.split == "query"]
 
 
-def test_odd_files_are_refused_and_hidden_ones_left_out(tmp_path: Path) -> None:
+def test_gta_uav_misplaced_files_are_refused(tmp_path: Path) -> None:
     root = miniature(tmp_path)
     touch(root / "satellite/Thumbs.db")
     touch(root / "satellite/.DS_Store")
@@ -168,12 +168,12 @@ def test_odd_files_are_refused_and_hidden_ones_left_out(tmp_path: Path) -> None:
     ("text", "said"),
     [("{", "cannot be read as JSON"), ('{"a": 1}', "holds a dict, expected a list")],
 )
-def test_a_damaged_list_is_refused_whole(tmp_path: Path, text: str, said: str) -> None:
+def test_gta_uav_damaged_list_is_refused(tmp_path: Path, text: str, said: str) -> None:
     (miniature(tmp_path) / TEST).write_text(text)
     with pytest.raises(InputError, match=said):
         scanned(tmp_path)
 
 
-def test_a_missing_root_is_refused_in_a_sentence(tmp_path: Path) -> None:
+def test_gta_uav_missing_root_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no folder .*expected GTA-UAV's root"):
         scanned(tmp_path / "nowhere")

@@ -1,59 +1,24 @@
-"""Photos off a card: what becomes a record, where it is said to lie, and what is refused."""
+"""Photos off a card: records, positions, and files that are refused or skipped."""
 
-import math
 import os
 from pathlib import Path
-from typing import Any
 
 import fsspec
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image, TiffImagePlugin
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.core.records import ImageRecord, Rejection, Scanned, SkippedFile, Split, View
+from pipeline.core.records import ImageRecord, Rejection, SkippedFile, Split, View
 from pipeline.images.decode import decode
 from pipeline.sources import name_of, source_class
 from pipeline.sources.base import scan_images
-from pipeline.sources.maps.georeference import ELLIPSOID
-from pipeline.sources.photos import HEAD_BYTES, Photos, aim_point
-
-HERE = {1: "S", 2: (33.0, 30.0, 0.0), 3: "W", 4: (70.0, 45.0, 0.0)}
-"33.5 south, 70.75 west"
-FLOWN = (
-    b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
-    b'<rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" drone-dji:RelativeAltitude="+100.00" '
-    b'drone-dji:GimbalYawDegree="+90.00" drone-dji:GimbalPitchDegree="-45.00"/></rdf:RDF></x:xmpmeta>'
-)
+from pipeline.sources.photos import HEAD_BYTES, Photos
+from tests.sources.photo_files import FLOWN, HERE, photo, records, scan
 
 
-def photo(path: Path, gps: dict[int, Any] | None = None, **options: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    exif = Image.Exif()
-    exif.get_ifd(0x8825).update(gps or {})
-    exif.get_ifd(0x8769).update({0x9003: "2024:05:01 12:34:56"})
-    kind = {".png": "PNG", ".webp": "WEBP", ".tif": "TIFF"}.get(path.suffix.lower(), "JPEG")
-    Image.new("RGB", (16, 12), "green").save(path, kind, exif=exif, **options)
-
-
-def scan(root: Path, **changes: Any) -> dict[str, Scanned]:
-    found = {
-        found.path.removeprefix(f"{root}/"): found for found in Photos(**changes).scan(str(root))
-    }
-    assert list(found) == sorted(found), "an order of names alone"
-    return found
-
-
-def records(root: Path, **changes: Any) -> dict[str, ImageRecord]:
-    found = scan(root, **changes)
-    assert all(isinstance(record, ImageRecord) for record in found.values()), found
-    return found  # type: ignore[return-value]
-
-
-def test_a_photo_becomes_a_query_from_a_drone_with_the_cameras_geotag(tmp_path: Path) -> None:
+def test_photo_becomes_a_drone_query_with_geotag(tmp_path: Path) -> None:
     photo(tmp_path / "flight 1/DJI_0001.JPG", HERE, xmp=FLOWN)
     [record] = records(tmp_path).values()
     assert (record.view, record.split, record.location) == (View.DRONE, Split.QUERY, "flight 1")
@@ -102,13 +67,13 @@ def test_photos_are_found_at_any_depth_with_any_name(tmp_path: Path) -> None:
     assert len({record.location for record in single.values()}) == len(single)
 
 
-def test_settings_say_what_the_photos_are(tmp_path: Path) -> None:
+def test_photos_view_and_split_come_from_settings(tmp_path: Path) -> None:
     photo(tmp_path / "tile.jpg")
     [record] = records(tmp_path, view=View.SATELLITE, split=Split.GALLERY).values()
     assert record.key.startswith("gallery-satellite-")
 
 
-def test_companions_are_skipped_and_undecoded_images_refused(tmp_path: Path) -> None:
+def test_photos_companions_skipped_and_undecoded_refused(tmp_path: Path) -> None:
     photo(tmp_path / "DJI_0001.JPG")
     companions = {
         "DJI_0001.DNG": "raw copy of a photo",
@@ -136,7 +101,7 @@ def test_companions_are_skipped_and_undecoded_images_refused(tmp_path: Path) -> 
     assert heic.found == "IMG_0001.HEIC: HEIC is not decoded; convert it to JPEG, PNG or TIFF"
 
 
-def test_the_summary_counts_positions_and_reasons(
+def test_scan_images_summary_counts_positions_and_reasons(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     photo(tmp_path / "1.jpg", HERE)
@@ -152,7 +117,7 @@ def test_the_summary_counts_positions_and_reasons(
     )
 
 
-def test_a_position_that_cannot_be_right_is_refused_and_a_missing_one_is_not(
+def test_photo_impossible_position_is_refused_missing_one_not(
     tmp_path: Path,
 ) -> None:
     photo(tmp_path / "good.jpg", HERE)
@@ -181,14 +146,14 @@ def test_a_position_that_cannot_be_right_is_refused_and_a_missing_one_is_not(
     assert all(record.geotag is None for record in records(tmp_path, geotags="ignored").values())
 
 
-def test_an_altitude_above_the_sea_is_no_height_above_the_ground(tmp_path: Path) -> None:
+def test_photo_altitude_above_sea_is_no_height(tmp_path: Path) -> None:
     photo(tmp_path / "phone.jpg", HERE | {6: 812.0})
     tag = records(tmp_path)["phone.jpg"].geotag
     assert tag is not None
     assert tag.altitude_m is None
 
 
-def test_links_are_followed_and_those_into_nothing_are_refused(tmp_path: Path) -> None:
+def test_photos_links_are_followed(tmp_path: Path) -> None:
     photo(tmp_path / "card/1.jpg", HERE)
     root = tmp_path / "root"
     root.mkdir()
@@ -205,7 +170,7 @@ def test_links_are_followed_and_those_into_nothing_are_refused(tmp_path: Path) -
     assert refused.reason == "unreadable file"
 
 
-def test_a_file_that_cannot_be_read_is_refused(
+def test_photo_that_cannot_be_read_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photo(tmp_path / "1.jpg", HERE)
@@ -220,7 +185,7 @@ def test_a_file_that_cannot_be_read_is_refused(
     )
 
 
-def test_a_missing_and_an_empty_folder_say_what_was_expected(tmp_path: Path) -> None:
+def test_photos_missing_and_empty_folder_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no folder .*nowhere; expected a folder of photos"):
         list(Photos().scan(str(tmp_path / "nowhere")))
     with pytest.raises(InputError, match=r"no images below .*, but nothing at all"):
@@ -230,7 +195,7 @@ def test_a_missing_and_an_empty_folder_say_what_was_expected(tmp_path: Path) -> 
         list(Photos().scan(str(tmp_path)))
 
 
-def test_only_the_beginning_of_a_photo_is_read_unless_its_tags_lie_further_on(
+def test_read_photo_reads_the_head_unless_tags_lie_beyond(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[str] = []
@@ -261,7 +226,7 @@ def test_only_the_beginning_of_a_photo_is_read_unless_its_tags_lie_further_on(
     )
 
 
-def test_photos_on_an_object_store_are_read_like_those_on_a_disk(tmp_path: Path) -> None:
+def test_photos_are_read_from_an_object_store(tmp_path: Path) -> None:
     fsspec.filesystem("memory").rm("/", recursive=True)
     photo(tmp_path / "1.jpg", HERE)
     storage.write_bytes("memory://bucket/flight/1.jpg", (tmp_path / "1.jpg").read_bytes())
@@ -272,7 +237,7 @@ def test_photos_on_an_object_store_are_read_like_those_on_a_disk(tmp_path: Path)
     assert storage.read_head("memory://bucket/flight/1.jpg", 2) == b"\xff\xd8"
 
 
-def test_a_camera_held_upright_is_turned_by_decoding(tmp_path: Path) -> None:
+def test_photo_orientation_is_applied_by_decoding(tmp_path: Path) -> None:
     """Orientation 6: the top of the scene is the right side of the file, so that decoding turns it
     clockwise.
     """
@@ -288,69 +253,3 @@ def test_a_camera_held_upright_is_turned_by_decoding(tmp_path: Path) -> None:
     assert upright.shape == (32, 16, 3)
     assert upright[4, 8, 0] > 200, "red on top"
     assert upright[28, 8, 2] > 200, "blue below"
-
-
-def test_the_axis_of_a_camera_at_45_degrees_arrives_one_height_ahead(tmp_path: Path) -> None:
-    """100 m east on the parallel of 33.5 south: 100 / (6 384 650 cos 33.5) radians = 0.0010762
-    degrees, with the radius of curvature a / sqrt(1 - e^2 sin^2 33.5) [WGS84].
-    """
-    photo(tmp_path / "1.jpg", HERE, xmp=FLOWN)
-    [record] = records(tmp_path, project=True).values()
-    tag = record.geotag
-    assert tag is not None
-    assert tag.lat == pytest.approx(-33.5, abs=1e-7)
-    assert tag.lon == pytest.approx(-70.75 + 0.0010762, abs=1e-7)
-    assert (tag.altitude_m, tag.heading_deg, tag.pitch_deg) == (100, 90, -45)
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [(b'"-45.00"', b'"-19.00"'), (b'"+100.00"', b'"-3.00"'), (b"GimbalYaw", b"WindYaw")],
-)
-def test_what_is_not_known_or_too_shallow_is_not_projected(
-    tmp_path: Path, old: bytes, new: bytes
-) -> None:
-    photo(tmp_path / "1.jpg", HERE, xmp=FLOWN.replace(old, new))
-    [record] = records(tmp_path, project=True).values()
-    assert record.geotag is not None
-    assert (record.geotag.lat, record.geotag.lon) == (-33.5, -70.75)
-
-
-MERIDIAN_M, EQUATOR_M = 110_574.276, 111_319.491
-"""Metres of a degree of latitude and of longitude at the equator: pi / 180 times a (1 - e^2) and
-times a, with a = 6 378 137 m and e^2 = 0.00669438 [WGS84]."""
-
-
-@pytest.mark.parametrize(
-    ("heading", "pitch", "north_m", "east_m"),
-    [
-        (0, -45, 100, 0),
-        (90, -45, 0, 100),
-        (180, -45, -100, 0),
-        (270, -26.565051177, 0, -200),
-        (77, -90, 0, 0),
-    ],
-)
-def test_the_axis_meets_the_ground_at_height_over_tangent(
-    heading: float, pitch: float, north_m: float, east_m: float
-) -> None:
-    lat, lon = aim_point(0.0, 10.0, 100.0, heading, pitch)
-    expected = (north_m / MERIDIAN_M, 10 + east_m / EQUATOR_M)
-    assert (lat, lon) == pytest.approx(expected, abs=1e-9)
-
-
-@given(
-    st.floats(-90, 90),
-    st.floats(-180, 180),
-    st.floats(0.1, 1e4),
-    st.floats(0, 360),
-    st.floats(-90, -20),
-)
-def test_the_axis_meets_the_ground_at_the_right_distance(
-    lat: float, lon: float, height: float, heading: float, pitch: float
-) -> None:
-    aim_lat, aim_lon = aim_point(lat, lon, height, heading, pitch)
-    assert abs(aim_lat) <= 90
-    assert -180 <= aim_lon <= 180
-    metres = ELLIPSOID.inv(lon, lat, aim_lon, aim_lat)[2]
-    assert metres == pytest.approx(height / math.tan(math.radians(-pitch)), abs=1e-3)

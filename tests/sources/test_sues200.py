@@ -1,4 +1,4 @@
-"""SUES-200: both forms give the same records, and images of one name from four heights stay apart."""
+"""SUES-200: both forms give the same records; images of one name from four heights stay apart."""
 
 from collections import Counter
 from pathlib import Path
@@ -51,7 +51,7 @@ def scanned(
     ]
 
 
-def test_both_forms_give_the_same_images_under_the_same_keys(tmp_path: Path) -> None:
+def test_sues200_both_forms_give_the_same_keys(tmp_path: Path) -> None:
     one, refused = scanned(prepared(tmp_path / "prepared"))
     other, refused_too = scanned(downloaded(tmp_path / "downloaded"))
     assert refused == refused_too == []
@@ -65,7 +65,7 @@ def test_both_forms_give_the_same_images_under_the_same_keys(tmp_path: Path) -> 
     }  # fmt: skip
 
 
-def test_the_height_is_in_the_key_of_a_drone_image_and_in_no_other(tmp_path: Path) -> None:
+def test_sues200_height_is_only_in_drone_keys(tmp_path: Path) -> None:
     records, _ = scanned(downloaded(tmp_path))
     keys = {record.key for record in records}
     assert len(keys) == len(records)
@@ -75,9 +75,7 @@ def test_the_height_is_in_the_key_of_a_drone_image_and_in_no_other(tmp_path: Pat
 
 
 @pytest.mark.parametrize("make", [prepared, downloaded])
-def test_one_height_alone_has_its_drone_images_and_all_satellite_images(
-    tmp_path: Path, make: object
-) -> None:
+def test_sues200_one_height_keeps_all_satellite_images(tmp_path: Path, make: object) -> None:
     assert callable(make)
     records, refused = scanned(make(tmp_path), Sues200(heights=(200,)))
     assert not refused
@@ -85,7 +83,7 @@ def test_one_height_alone_has_its_drone_images_and_all_satellite_images(
     assert sum(record.view == View.SATELLITE for record in records) == 4
 
 
-def test_an_unknown_height_is_refused() -> None:
+def test_sues200_unknown_height_is_refused() -> None:
     with pytest.raises(
         InputError, match="--heights is 175, expected one or more of 150 200 250 300"
     ):
@@ -94,13 +92,13 @@ def test_an_unknown_height_is_refused() -> None:
         Sues200(heights=())
 
 
-def test_the_benchmarks_list_has_120_of_200_locations() -> None:
+def test_sues200_train_list_has_120_of_200_locations() -> None:
     assert len(TRAIN_LOCATIONS) == 120
     assert {f"{number:04d}" for number in range(1, 201)} >= TRAIN_LOCATIONS
     assert "0008" not in TRAIN_LOCATIONS
 
 
-def test_what_lies_in_the_wrong_place_is_refused_with_its_path(tmp_path: Path) -> None:
+def test_sues200_misplaced_images_are_refused(tmp_path: Path) -> None:
     root = downloaded(tmp_path)
     touch(root / "drone_view_512/0001/175/0.jpg")
     touch(root / "drone_view_512/0001/150/deeper/0.jpg")
@@ -117,7 +115,7 @@ def test_what_lies_in_the_wrong_place_is_refused_with_its_path(tmp_path: Path) -
     }
 
 
-def test_names_with_blanks_and_other_scripts_55_images_and_links_are_fine(tmp_path: Path) -> None:
+def test_sues200_odd_names_and_links_are_read(tmp_path: Path) -> None:
     root = tmp_path / "root"
     for number in range(55):
         touch(tmp_path / "elsewhere" / f"大学 {number}.jpeg")
@@ -129,7 +127,7 @@ def test_names_with_blanks_and_other_scripts_55_images_and_links_are_fine(tmp_pa
     assert {record.split for record in records} == {Split.TRAIN}
 
 
-def test_the_layout_is_read_from_other_storage_too() -> None:
+def test_sues200_is_read_from_other_storage() -> None:
     fsspec.filesystem("memory").pipe("/sues/satellite-view/0001/0.png", b"x")
     records, _ = scanned("memory://sues")
     assert [record.key for record in records] == [
@@ -139,7 +137,7 @@ def test_the_layout_is_read_from_other_storage_too() -> None:
     assert storage.read_bytes(records[0].path) == b"x"
 
 
-def test_a_missing_and_an_empty_root_are_told_apart(tmp_path: Path) -> None:
+def test_sues200_missing_and_empty_root_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no folder .*expected SUES-200's root"):
         scanned(tmp_path / "nowhere")
     with pytest.raises(InputError, match="no images below"):

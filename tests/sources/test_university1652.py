@@ -53,7 +53,7 @@ def with_kml(
     return scanned(miniature(tmp_path / "root"), University1652(kml=str(tmp_path / "kml")))
 
 
-def test_a_building_and_all_its_images_lie_where_its_kml_says(tmp_path: Path) -> None:
+def test_kml_places_all_images_of_a_building(tmp_path: Path) -> None:
     records, refused = with_kml(tmp_path, {"first-key/0839.kml": KML})
     assert not refused
     for key in ("train-satellite-0839-0839", "train-drone-0839-image-01"):
@@ -61,7 +61,7 @@ def test_a_building_and_all_its_images_lie_where_its_kml_says(tmp_path: Path) ->
     assert records["train-drone-0840-image-01"].geotag is None
 
 
-def test_without_a_point_the_look_counts_and_without_that_the_first_coordinate() -> None:
+def test_parse_kml_without_point_uses_look_then_coordinate() -> None:
     look = KML[: KML.index("<Point>")] + "</Placemark></Document></kml>"
     assert parse_kml(look.encode()) == (53.5, -1.5)
     line = "<kml><LineString><coordinates>2.5,48.5,10 3,49,10</coordinates></LineString></kml>"
@@ -87,9 +87,7 @@ def test_without_a_point_the_look_counts_and_without_that_the_first_coordinate()
         (f"<kml>{' ' * MAX_KML_BYTES}</kml>", "expected at most 1048576"),
     ],
 )
-def test_a_kml_that_tells_no_place_is_told_and_its_images_come_without_a_tag(
-    tmp_path: Path, text: str, said: str
-) -> None:
+def test_kml_without_position_costs_only_its_tag(tmp_path: Path, text: str, said: str) -> None:
     records, refused = with_kml(tmp_path, {"0839.kml": text, "0840.KML": KML})
     assert [(Path(r.path).name, r.reason) for r in refused] == [("0839.kml", "unreadable tag")]
     assert said in refused[0].found
@@ -97,17 +95,17 @@ def test_a_kml_that_tells_no_place_is_told_and_its_images_come_without_a_tag(
     assert records["train-drone-0840-image-01"].geotag == GeoTag(lat=53.75, lon=-1.25)
 
 
-def test_a_document_type_is_refused_in_other_encodings_too() -> None:
+def test_parse_kml_document_type_is_refused_in_any_encoding() -> None:
     with pytest.raises(Unreadable, match="declares a document type"):
         parse_kml('<?xml version="1.0" encoding="UTF-16"?><!DOCTYPE kml><kml/>'.encode("utf-16"))
 
 
-def test_a_folder_without_kml_is_a_wrong_setting(tmp_path: Path) -> None:
+def test_kml_folder_without_kml_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no KML files below .*check --kml"):
         scanned(miniature(tmp_path), University1652(kml=str(tmp_path / "nowhere")))
 
 
-def test_the_simulators_tables_give_places_and_poses(tmp_path: Path) -> None:
+def test_pose_tables_give_positions_and_poses(tmp_path: Path) -> None:
     root = miniature(tmp_path)
     (root / "locations.csv").write_text("location,lat,lon\n0839,53.75,-1.25\n0840,1,2\n")
     (root / "poses.csv").write_text(
@@ -120,7 +118,7 @@ def test_the_simulators_tables_give_places_and_poses(tmp_path: Path) -> None:
     assert records["train-satellite-0839-0839"].geotag == GeoTag(lat=53.75, lon=-1.25)
 
 
-def test_a_damaged_line_costs_its_own_images_tag_and_no_more(tmp_path: Path) -> None:
+def test_pose_tables_damaged_line_costs_only_its_tag(tmp_path: Path) -> None:
     root = miniature(tmp_path)
     (root / "locations.csv").write_text("location,lat,lon\n0839,north,-1.25\n0840,1,2\n0841\n")
     (root / "poses.csv").write_text(
@@ -138,7 +136,7 @@ def test_a_damaged_line_costs_its_own_images_tag_and_no_more(tmp_path: Path) -> 
     assert records["train-drone-0840-image-01"].geotag == GeoTag(lat=1, lon=2)
 
 
-def test_a_table_of_something_else_is_refused_whole(tmp_path: Path) -> None:
+def test_pose_tables_with_other_columns_are_refused(tmp_path: Path) -> None:
     (miniature(tmp_path) / "locations.csv").write_text("id,x,y\n")
     with pytest.raises(
         InputError,
@@ -147,7 +145,7 @@ def test_a_table_of_something_else_is_refused_whole(tmp_path: Path) -> None:
         scanned(tmp_path)
 
 
-def test_odd_folders_and_names_are_told_or_taken(tmp_path: Path) -> None:
+def test_university1652_odd_folders_and_names(tmp_path: Path) -> None:
     root = miniature(tmp_path)
     touch(root / "train/drone/0839/too deep/image-02.jpeg")
     touch(root / "train/drone/0839/Thumbs.db")
@@ -170,7 +168,7 @@ def test_odd_folders_and_names_are_told_or_taken(tmp_path: Path) -> None:
     ]
 
 
-def test_images_and_kml_may_lie_on_other_storage() -> None:
+def test_university1652_is_read_from_other_storage() -> None:
     memory = fsspec.filesystem("memory")
     memory.pipe("/u1652/root/train/drone/0839/image-01.jpeg", b"x")
     memory.pipe("/u1652/kml/0839.kml", KML.encode())

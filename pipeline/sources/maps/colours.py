@@ -23,7 +23,6 @@ SAMPLE_PIXELS = 1024  # longer side of that sample
 PATCH_GRID, PATCH_PIXELS = 16, 64
 "Longer mosaics: patches of 64 pixels, 16 by 16 of them evenly spread, at full resolution."
 RGB = ("red", "green", "blue")
-INKS = {ColorInterp.cyan, ColorInterp.magenta, ColorInterp.yellow, ColorInterp.black}
 
 
 class UnknownColours(ValueError):
@@ -116,8 +115,6 @@ def _bands(dataset: Any, chosen: tuple[int, ...] | None) -> tuple[tuple[int, ...
                 f"{len(interpretations)} bands, expected band {max(chosen)} of --bands among them"
             )
         return chosen, " by --bands"
-    if set(interpretations) >= INKS:
-        raise UnknownColours("bands of cyan, magenta, yellow and black; expected red, green, blue")
     named = [_colour_word(text or "") for text in dataset.descriptions]
     if all(named.count(colour) == 1 for colour in RGB):
         bands = tuple(named.index(colour) + 1 for colour in RGB)

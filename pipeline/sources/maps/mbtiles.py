@@ -21,8 +21,9 @@ from pipeline.core.records import Rejection
 
 VECTOR_FORMATS = ("pbf", "mvt")
 MAGIC_BYTES = 12  # bytes from which `image_format` recognises an image
-FROM_TILE = "FROM tiles WHERE zoom_level IN (?, ?) AND tile_column IN (?, ?) AND tile_row IN (?, ?)"
-"Each number is bound as an integer, which a float equals too, and as text."
+ZOOM = "zoom_level IN (?, ?, ?)"
+FROM_TILE = f"FROM tiles WHERE {ZOOM} AND tile_column IN (?, ?, ?) AND tile_row IN (?, ?, ?)"
+"Each number is bound as an integer, which a float equals too, and as two texts."
 MAX_VALUE_BYTES = 1 << 26
 "Of any value: a view may compute `zeroblob(1e9)` as a tile."
 QUERY_TIMEOUT_S = 600.0
@@ -32,7 +33,7 @@ STEPS_PER_CHECK = 1_000_000
 ALLOWED_ACTIONS = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION)
 """Actions of our queries, and of the views behind them. Recursion is not allowed: it may never
 end."""
-WHOLE_NUMBER = re.compile(r"\s*(-?\d{1,18})(\.0*)?\s*", re.ASCII)
+WHOLE_NUMBER = re.compile(r"(-?\d{1,18})(\.0)?", re.ASCII)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,8 +87,8 @@ def count_zooms(path: str) -> dict[Any, int]:
 
 def count_tiles_within(path: str, zoom: int, area: tuple[int, int, int, int] | None) -> int:
     """How many tiles of a zoom there are, or lie in columns and rows from first to last."""
-    query = "SELECT count(*) FROM tiles WHERE zoom_level IN (?, ?)"
-    values: list[Any] = [zoom, str(zoom)]
+    query = f"SELECT count(*) FROM tiles WHERE {ZOOM}"
+    values: list[Any] = [*_spellings(zoom)]
     if area is not None:
         for column in ("tile_column", "tile_row"):
             query += f" AND CAST({column} AS INTEGER) BETWEEN ? AND ?"
@@ -105,10 +106,10 @@ def list_tiles(path: str, zoom: int) -> Iterator[StoredTile | Rejection]:
     """
     query = (
         f"SELECT tile_column, tile_row, substr(tile_data, 1, {MAGIC_BYTES}) FROM tiles "
-        "WHERE zoom_level IN (?, ?) ORDER BY 1, 2"
+        f"WHERE {ZOOM} ORDER BY 1, 2"
     )
     with _connect(path) as database:
-        for x, row, start in database.execute(query, (zoom, str(zoom))):
+        for x, row, start in database.execute(query, _spellings(zoom)):
             database.waits_since = time.monotonic()
             column_number, row_number = whole_number(x), whole_number(row)
             if column_number is None or row_number is None:
@@ -154,10 +155,14 @@ def whole_number(value: Any) -> int | None:
     return None if match is None else int(match[1])
 
 
+def _spellings(number: int) -> tuple[int, str, str]:
+    return number, str(number), f"{number}.0"
+
+
 def _read_value(path: str, what: str, zoom: int, x: int, row: int) -> bytes:
     try:
         with _connect(path) as database:
-            numbers = (zoom, str(zoom), x, str(x), row, str(row))
+            numbers = (*_spellings(zoom), *_spellings(x), *_spellings(row))
             found = database.execute(f"SELECT {what} {FROM_TILE}", numbers).fetchone()
     except InputError as error:  # the file was readable when it was scanned
         raise OSError(str(error)) from None
