@@ -1,4 +1,14 @@
-"""Imagery as found -> ImageRecords; one file per layout."""
+"""Imagery of any layout, read as records: one file per layout, one line in SOURCES.
+
+In: a root on some storage - a public data set, a folder of photos, GeoTIFF mosaics, web map tiles,
+a table. Out: for each image an ImageRecord with split, view, location and, where known, its
+geotag; a Rejection with a reason for each image that cannot be used; a SkippedFile for each other
+file, so that the counts at the end of a scan add up. `Source.read` returns an image's bytes, which
+for a map are cut, turned and encoded at that moment.
+
+Begin with `base.py`, then the smallest layout, `university1652.py`. `maps/` holds what several
+layouts need of maps: tiles, coordinate systems, mosaics, MBTiles, GeoJSON shapes.
+"""
 
 from importlib import import_module
 from typing import cast
@@ -16,8 +26,8 @@ SOURCES: dict[str, str] = {
     "xyz": "pipeline.sources.xyz:Xyz",
     "table": "pipeline.sources.table:Table",
 }
-"""Module and class by the name that `--source` takes; a new source is one file and one line. Imported
-when it is named: some of them import rasterio, PROJ or Arrow."""
+"""Module and class by the name that `--source` takes; a new source is one file and one line. A module
+is imported when it is named: some of them import rasterio, PROJ or Arrow."""
 
 
 def source_class(name: str) -> type[Source]:

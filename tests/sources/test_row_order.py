@@ -20,7 +20,7 @@ CAPE = "18.40,-33.95,18.45,-33.90"
 
 
 def town(path: Path, row: int, **metadata: str) -> str:
-    return mbtiles(path, {(17, X, row): tile(1)}, **metadata)
+    return mbtiles(path, {(17, X, row): tile(1)}, True, **metadata)
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,8 @@ import numpy as np
 import pyproj
 import rasterio
 from pyproj import CRS, Transformer
-from pyproj.aoi import AreaOfInterest
 from pyproj.exceptions import CRSError, ProjError
+from pyproj.transformer import AreaOfInterest
 
 from pipeline.core.arrays import Doubles
 from pipeline.core.records import GeoTag
