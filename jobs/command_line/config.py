@@ -91,18 +91,18 @@ def read_config(
             f"{path} has no entries with names, expected one per flag; see --print-config"
         )
     positional = _positional_names(job)
-    word, places, words = None, list[str](), list[str]()
+    word, arguments, words = None, list[str](), list[str]()
     for name, value in entries.items():
         field = name.replace("-", "_")
         if choice is not None and field == choice.name:
             word = str(value)
         elif field in positional:
-            places += _strings(value)
+            arguments += _strings(value)
         elif isinstance(value, bool):
             words.append(f"--{name}" if value else f"--no-{name}")
         else:
             words += [f"--{name}", *_strings(value)]
-    return word, places + words
+    return word, arguments + words
 
 
 def _strings(value: Any) -> list[str]:

@@ -1,8 +1,8 @@
-"""The whole road on one machine: `demo.py [--out DIR]`. Simulate, pack, train, embed, index,
-evaluate, report, locate.
+"""The demo: every stage on one machine, from simulated flights to located photos.
 
-Every stage is the one that the other jobs run, on a data set small enough for minutes on two cores.
-Run again, it goes on where it was.
+In: a folder and sizes. Out: data set, shards, run, tables, evaluations, index and answers in that
+folder. The stages are those of the other jobs, on a data set small enough for minutes on two cores.
+Run again, it resumes.
 """
 
 import csv
@@ -48,7 +48,7 @@ from pipeline.sources.university1652 import University1652
 
 
 def demo(settings: DemoSettings) -> list[dict[str, Any]]:
-    """Go the whole road; returns the trained network's metric rows."""
+    """Run every stage; returns the trained network's metric rows."""
     out = storage.absolute(settings.out)
     flights, shards, trained = (storage.join(out, name) for name in ("flights", "shards", "run"))
     seconds: dict[str, float] = {}
@@ -110,13 +110,13 @@ def demo(settings: DemoSettings) -> list[dict[str, Any]]:
                     title=f"PVDA on simulated flights, {name}",
                 )
             )
-    with step(seconds, "8 index", "satellite gallery into FAISS, asked with the UAV's images"):
+    with step(seconds, "8 index", "satellite gallery into FAISS, searched with the UAV's images"):
         index = storage.join(out, "index")
         build_index(IndexSettings(table=table, out=index, split=Split.GALLERY, view=View.SATELLITE))
-        console.print(ask(index, table))
+        console.print(search_index(index, table))
     with step(seconds, "9 locate", "a few unseen photos: where were they taken?"):
-        page = locate_some(
-            Demo(
+        page = locate_samples(
+            DemoPaths(
                 flights=flights,
                 shards=shards,
                 checkpoint=checkpoint,
@@ -128,33 +128,31 @@ def demo(settings: DemoSettings) -> list[dict[str, Any]]:
     console.print("seconds: " + ", ".join(f"{name} {spent:.0f}" for name, spent in seconds.items()))
     chance = 1 / rows["trained"][0]["gallery"]
     console.print(
-        f"places never seen in training, UAV -> satellite R@1: chance {chance:.2%}, untrained "
+        f"locations never seen in training, UAV -> satellite R@1: chance {chance:.2%}, untrained "
         f"{rows['untrained'][0]['r1']:.2%}, trained {rows['trained'][0]['r1']:.2%}"
     )
     print_table(rows["trained"])
     print(
-        f"report: {storage.join(out, 'evaluation-trained', 'report.html')}\nphotos on the map: "
-        f"{page}"
+        f"report: {storage.join(out, 'evaluation-trained', 'report.html')}\n"
+        f"photos on the map: {page}"
     )
     return rows["trained"]
 
 
-def ask(index: str, table: str) -> str:
-    """How many UAV images of places never seen find their place first, asked of the index as a user
-    would.
-    """
+def search_index(index: str, table: str) -> str:
+    """The share of UAV images whose first hit is their location, by a search of the index."""
     photos = open_table(table).select(Split.QUERY, View.DRONE)
     answers = Index(index).search(photos.embeddings(), k=1)
     right = sum(
-        hits[0].location == place
-        for hits, place in zip(answers, photos.labels().locations, strict=True)
+        hits[0].location == location
+        for hits, location in zip(answers, photos.labels().locations, strict=True)
     )
-    return f"{right} of {len(answers)} UAV images find their place at the first attempt"
+    return f"{right} of {len(answers)} UAV images have their location as the first hit"
 
 
 @contextmanager
 def step(seconds: dict[str, float], name: str, what: str) -> Iterator[None]:
-    """Say what begins, and keep how long it took."""
+    """Print the stage's name, and record its seconds."""
     console.rule(Text.assemble((name, "bold"), " ", what), align="left")
     start = time.monotonic()
     yield
@@ -162,12 +160,12 @@ def step(seconds: dict[str, float], name: str, what: str) -> Iterator[None]:
 
 
 PHOTOS = 10
-"Places that are asked for, each by its first photo and by all of its photos together."
+"Locations to find, each by its first photo and by all of its photos together."
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demo:
-    """Where the demo has put what it made."""
+class DemoPaths:
+    """The demo's outputs."""
 
     flights: str
     shards: str
@@ -177,24 +175,26 @@ class Demo:
     "Folder for the answers."
 
 
-def locate_some(demo: Demo) -> str:
-    """Calibrate the index, locate photos, print how far off they are; the page's path."""
+def locate_samples(demo: DemoPaths) -> str:
+    """Calibrate the index, locate photos, print the errors; returns the page's path."""
     try:
         calibrate_index(
             CalibrateSettings(checkpoint=demo.checkpoint, shards=demo.shards, index=demo.index)
         )
-    except InputError as error:  # a demo made smaller than it is may hold out too few places
+    except InputError as error:  # a smaller demo may hold out too few locations
         console.print(f"not calibrated: {error}")
-    places = positions(storage.join(demo.flights, "locations.csv"))
+    true_positions = read_positions(storage.join(demo.flights, "locations.csv"))
     root = storage.join(demo.flights, "test", "query_drone")
-    names = sorted(name for name in places if storage.is_folder(storage.join(root, name)))[:PHOTOS]
-    folders = {storage.join(root, name): places[name] for name in names}
+    names = sorted(name for name in true_positions if storage.is_folder(storage.join(root, name)))[
+        :PHOTOS
+    ]
+    folders = {storage.join(root, name): true_positions[name] for name in names}
     firsts = {
-        storage.join(folder, storage.list_names(folder)[0]): place
-        for folder, place in folders.items()
+        storage.join(folder, storage.list_names(folder)[0]): position
+        for folder, position in folders.items()
     }
     page = storage.join(demo.out, "photos.html")
-    asked = LocateSettings(
+    single = LocateSettings(
         photos=tuple(firsts),
         checkpoint=demo.checkpoint,
         index=demo.index,
@@ -202,31 +202,33 @@ def locate_some(demo: Demo) -> str:
         page=page,
         out=storage.join(demo.out, "photos.geojson"),
     )
-    alone = locate_photos(asked, firsts)
-    of_places = storage.join(demo.out, "places.geojson")
+    alone = locate_photos(single, firsts)
+    by_location = storage.join(demo.out, "locations.geojson")
     together = locate_photos(
-        replace(asked, photos=tuple(folders), together=True, out=of_places, page=None)
+        replace(single, photos=tuple(folders), together=True, out=by_location, page=None)
     )
     table = Table(title="unseen UAV photos: how far off", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for heading in ("place", "one photo", "sure", "all together", "sure"):
-        table.add_column(heading, justify="left" if heading == "place" else "right", no_wrap=True)
+    for heading in ("location", "one photo", "probability", "all photos", "probability"):
+        table.add_column(
+            heading, justify="left" if heading == "location" else "right", no_wrap=True
+        )
     for name, one, all_ in zip(names, alone, together, strict=True):
-        table.add_row(name, *_cells(one, places[name]), *_cells(all_, places[name]))
+        table.add_row(name, *_cells(one, true_positions[name]), *_cells(all_, true_positions[name]))
     results.print(table)
     return page
 
 
-def positions(path: str) -> dict[str, LatLon]:
+def read_positions(path: str) -> dict[str, LatLon]:
     """Latitude and longitude by location, as the simulator wrote them."""
     rows = csv.DictReader(io.StringIO(storage.read_bytes(path).decode()))
     return {row["location"]: (float(row["lat"]), float(row["lon"])) for row in rows}
 
 
-def _cells(one: LocatedPhoto, place: LatLon) -> tuple[str, str]:
-    """How far off an answer is, and how sure it was."""
+def _cells(one: LocatedPhoto, position: LatLon) -> tuple[str, str]:
+    """Distance of an answer from the true position, and its probability."""
     answer = one.answer
     if answer is None:
         return "not decoded", ""
-    off = format_distance(distance_to_m(answer, place))
-    sure = "" if answer.probability is None else f"{answer.probability:.0%}"
-    return off if answer.known else f"unknown ({off})", sure
+    error = format_distance(distance_to_m(answer, position))
+    probability = "" if answer.probability is None else f"{answer.probability:.0%}"
+    return error if answer.known else f"unknown ({error})", probability

@@ -1,8 +1,8 @@
-"""Foreign weights -> a checkpoint of ours: `import_weights.py (--torchvision FILE | --lpn FILE)
---out FILE`.
+"""Public weights as a checkpoint.
 
-Takes a torchvision ResNet's state dict, or that of a three_view_net of the public LPN code. Depth,
-width, rings and numbers per ring are read off the file. jobs/embed_gallery.py takes what comes out.
+In: a torchvision ResNet's state dict, or that of a three_view_net of the public LPN code. Out: a
+checkpoint that jobs/embed_gallery.py takes. The backbone, its width, the rings and the numbers per
+ring are read off the file.
 """
 
 import hashlib
@@ -25,8 +25,7 @@ from pipeline.core.progress import console
 
 
 def import_weights(settings: ImportWeightsSettings) -> str:
-    """Write the checkpoint and return its path; one that was made of the same file is left as it
-    is.
+    """Write the checkpoint and return its path; an existing one of the same file is kept.
 
     Raises InputError or CheckpointError on unusable input.
     """
@@ -59,14 +58,13 @@ def import_weights(settings: ImportWeightsSettings) -> str:
         checkpoint = convert(parse_state_dict(data, settings.source), settings, made_of)
     except CheckpointError:
         raise
-    except ValueError as error:  # PVDAConfig's, over a size that the network cannot have
+    except ValueError as error:  # a size that the network cannot have
         raise InputError(f"{settings.source}: {error}") from error
     storage.write_bytes(out, dumps(checkpoint))
     network = checkpoint.network
     console.print(
         f"{out}: {network.backbone}, {network.parts} rings of {network.part_dim} numbers, "
-        f"{network.image_size} px, "
-        f"{len(checkpoint.locations)} locations"
+        f"{network.image_size} px, {len(checkpoint.locations)} locations"
     )
     return out
 
@@ -74,10 +72,10 @@ def import_weights(settings: ImportWeightsSettings) -> str:
 def require_same_origin(out: str, made_of: dict[str, Any]) -> None:
     """Raise InputError where `out` is anything but a checkpoint made of the same."""
     try:
-        held = loads(storage.read_bytes(out), out).recipe.get("made_of")
+        origin = loads(storage.read_bytes(out), out).recipe.get("made_of")
     except (CheckpointError, OSError):
-        held = None
-    if held != made_of:
+        origin = None
+    if origin != made_of:
         raise InputError(
             f"{out} is there and was not made of this file and image size; choose another --out"
         )

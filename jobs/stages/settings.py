@@ -184,7 +184,7 @@ class ServeSettings(ServiceSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class ImportWeightsSettings:
-    """Whose weights are imported, and where to."""
+    """Which public weights are imported, and where to."""
 
     out: str
     "File or URI of the checkpoint."
@@ -193,7 +193,7 @@ class ImportWeightsSettings:
     lpn: str | None = None
     "State dict of LPN's three_view_net (its net_119.pth), trained with --share and --stride=1."
     image_size: int = 256
-    "Side in pixels of the images that the network is to see: `h` in LPN's opts.yaml."
+    "Side of the network's input images in pixels: `h` in LPN's opts.yaml."
 
     def __post_init__(self) -> None:
         if (self.torchvision is None) == (self.lpn is None):
@@ -213,20 +213,20 @@ class ImportWeightsSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class DemoSettings:
-    """Where the demo works, and how much it does."""
+    """The demo's folder and sizes."""
 
     out: str = "runs/demo"
-    "Folder for everything that it makes."
+    "Folder for all of its outputs."
     train_locations: int = 230
-    "Places to learn from, with those held out."
+    "Locations for training, including those held out."
     hold_out: float = 0.13
-    "Share of these that is not learnt from: how sure answers are is calibrated by them."
+    "Share of these held out of training: the answers' probabilities are calibrated by them."
     test_locations: int = 100
-    "Places to find; none of them is seen in training."
+    "Locations to find; none of them is seen in training."
     distractors: int = 50
-    "Places in the gallery only."
+    "Locations in the gallery only."
     views: int = 12
-    "UAV images per place."
+    "UAV images per location."
     size: int = 128
     "Side of the images in pixels."
     epochs: int = 80

@@ -74,8 +74,7 @@ def count_damaged(state: TrainingState, epoch: int, first: str | None) -> int:
         state.report(
             {
                 "note": f"epoch {epoch + 1}: {total} images could not be decoded, and others of "
-                f"their batches took their places{named}; pack {state.run.shards} again to be rid "
-                "of them"
+                f"their batches replaced them{named}; pack {state.run.shards} again to remove them"
             }
         )
     return total
