@@ -58,8 +58,8 @@ def usable_pixels(shards: ShardSet, sample: Sample, image: Pixels | DecodeError)
     """
     if isinstance(image, DecodeError) and image.reason == CHANGED:
         raise InputError(
-            f"image {sample.key} of {shards.path} is not the one that was packed, expected it to check "
-            f"the encoder by; {shards.repair_hint}"
+            f"image {sample.key} of {shards.path} is not the one that was packed, expected it to "
+            f"check the encoder by; {shards.repair_hint}"
         )
     return None if isinstance(image, DecodeError) else image
 

@@ -1,4 +1,9 @@
-"""Photos on any storage -> their embeddings, alone or as one query for all photos of a place."""
+"""Reads photos from any storage and encodes them: one query per photo, or one per folder.
+
+In: paths or URIs of photos, and an encoder. Out: queries with embeddings, or with the reasons why
+photos were rejected.
+Shapes: Q photos, D dimensions.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,20 +20,20 @@ from pipeline.core.records import Rejection
 from pipeline.locate.photo_files import parent_folder, read_taken_at
 
 READ_BATCH = 128
-"Photos that are held and encoded at a time."
+"Photos in memory, and encoded, at a time."
 READ_THREADS = 4
-"Files that are read at once: enough for a network's waiting."
+"Files that are read at once: enough to hide a network's latency."
 
 
 @dataclass(frozen=True, kw_only=True)
 class Query:
-    """What is asked of the index: one photo, or several of one place."""
+    """A query of an index: one photo, or several of one location."""
 
     name: str
-    "The photo's path; the folder's, of several."
+    "The photo's path, or the folder's where it has several photos."
     photos: tuple[str, ...]
     embedding_D: Floats | None
-    "None where no photo of it could be decoded."
+    "None where none of its photos could be decoded."
     rejected: tuple[Rejection, ...]
     taken_at: str | None
 
@@ -40,22 +45,22 @@ def encode_photos(photos: Sequence[str], encoder: PhotoEncoder) -> list[Query]:
         for begin in range(0, len(photos), READ_BATCH):
             names = photos[begin : begin + READ_BATCH]
             read = list(prefetch_map(_read, names, READ_THREADS, 2 * READ_THREADS))
-            held = [b"" if isinstance(data, Rejection) else data for data in read]
-            embeddings_QD, refusals = encoder.encode(held, names)
+            contents = [b"" if isinstance(data, Rejection) else data for data in read]
+            embeddings_QD, undecodable = encoder.encode(contents, names)
             rejected = [
                 one if isinstance(one, Rejection) else two
-                for one, two in zip(read, refusals, strict=True)
+                for one, two in zip(read, undecodable, strict=True)
             ]
             rows = iter(embeddings_QD)
             queries += [
                 Query(
                     name=name,
                     photos=(name,),
-                    embedding_D=None if refused else next(rows),
-                    rejected=(refused,) if refused else (),
-                    taken_at=None if refused else read_taken_at(data),
+                    embedding_D=None if rejection else next(rows),
+                    rejected=(rejection,) if rejection else (),
+                    taken_at=None if rejection else read_taken_at(data),
                 )
-                for name, data, refused in zip(names, held, rejected, strict=True)
+                for name, data, rejection in zip(names, contents, rejected, strict=True)
             ]
             meter.advance(len(names))
     return queries
@@ -69,7 +74,7 @@ def _read(photo: str) -> bytes | Rejection:
 
 
 def merge_by_folder(queries: Sequence[Query]) -> list[Query]:
-    """One query per folder: the mean of its photos' embeddings at unit length, as the paper's
+    """One query per folder: the mean of its photos' embeddings, at unit length, as in the paper's
     multi-query.
     """
     ordered = sorted(queries, key=lambda query: parent_folder(query.name))
@@ -83,8 +88,9 @@ def _merged(folder: str, group: Sequence[Query]) -> Query:
     rows = [query.embedding_D for query in group if query.embedding_D is not None]
     total_D = np.sum(rows, axis=0) if rows else None
     return Query(
-        name=folder, photos=tuple(query.name for query in group),
+        name=folder,
+        photos=tuple(query.name for query in group),
         embedding_D=None if total_D is None else total_D / np.linalg.norm(total_D),
-        rejected=tuple(refused for query in group for refused in query.rejected),
+        rejected=tuple(rejection for query in group for rejection in query.rejected),
         taken_at=next((query.taken_at for query in group if query.taken_at), None),
-    )  # fmt: skip
+    )

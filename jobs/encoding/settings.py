@@ -1,5 +1,7 @@
-"""How images become embeddings: flags of jobs/embed_gallery.py. Imports nothing heavy, so that the
-command line is parsed at once."""
+"""The settings of encoding: flags of jobs/embed_gallery.py.
+
+Imports nothing heavy, so that the command line is parsed at once.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
