@@ -244,7 +244,7 @@ def _check_unit_length(embeddings_BD: Floats, samples: list[Sample]) -> None:
         worst = int(np.argmin(unit_B))
         raise InputError(
             f"the network gives {samples[worst].key} an embedding of length {length_B[worst]:.4g}, "
-            "expected 1; look at that image, and at the checkpoint"
+            "expected 1; check that image and the checkpoint"
         )
 
 

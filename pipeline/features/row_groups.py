@@ -1,4 +1,4 @@
-"""Row groups of a part that a filter cannot match, told from Parquet's statistics and not read.
+"""Row groups of a part that a filter cannot match, found by Parquet's statistics and skipped.
 
 In: a filter and an open part. Out: the numbers of the row groups that may hold a matching row.
 """

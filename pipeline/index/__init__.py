@@ -6,5 +6,6 @@ it over a cluster, `update` extends, reduces and verifies it.
 
 Begin with `plan.py`, which chooses the kind of index; then `build.py`, the stage, which trains
 (`train.py`), builds work units (`units.py`, `workspace.py`) and measures recall (`recall.py`,
-`finish.py`); then `searcher.py` and `part.py`, one search. `metadata.py` is what `index.json` holds.
+`finish.py`); then `searcher.py` and `part.py`, one search. `metadata.py` has the fields of
+`index.json`.
 """

@@ -31,7 +31,7 @@ def read_faiss(path: str, on_disk: bool) -> Any:
 
 
 def faiss_reason(error: RuntimeError) -> str:
-    """The sentence in an error of FAISS, whose messages begin with a place in its source."""
+    """The sentence in an error of FAISS, whose messages begin with a position in its source."""
     return str(error).rsplit("Error: ", 1)[-1].splitlines()[0]
 
 

@@ -49,8 +49,8 @@ class IndexSettings:
         require(self.workers >= 0, "workers", self.workers, "0 or more")
         if self.refine and not self.factory:
             raise InputError(
-                "found --refine without --factory, where the planner decides it; leave it out or name "
-                "a --factory"
+                "found --refine without --factory, where the planner decides it; leave it out or "
+                "name a --factory"
             )
         parse_bytes(self.memory_budget)
 

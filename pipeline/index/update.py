@@ -127,8 +127,8 @@ def _mark_removed(
     check_files(out, part.files)
     ids = RowIds(local_copy(storage.join(out, part.ids), scratch))
     row_R = np.flatnonzero(ids.mask(Filter(locations=locations)))
-    held = set(ids.take(row_R, ["location"])["location"].to_pylist())
-    removed = tuple(sorted({*part.removed, *held}))
+    present = set(ids.take(row_R, ["location"])["location"].to_pylist())
+    removed = tuple(sorted({*part.removed, *present}))
     gone = int(np.count_nonzero(ids.mask(Filter(locations=frozenset(removed)))))
     return replace(part, removed=removed), part.rows - gone
 
