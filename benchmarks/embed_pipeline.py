@@ -126,7 +126,9 @@ def start_worker(folder: str, spec: EncoderSpec, batch: int, threads: int, decod
     job = EmbedJob(
         shards=ShardSet(
             path=folder,
-            manifest=Manifest(shards=(), classes=(), packing=EXTERNAL, rejected=0),
+            manifest=Manifest(
+                shards=(), classes=(), packing={"source": EXTERNAL, "scattered": []}, rejected=0
+            ),
         ),
         out=f"{folder}/table",
         batch_size=batch,

@@ -3,7 +3,6 @@
 In: the path of a tar. Out: samples in their order.
 """
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import IO, Any, cast
@@ -12,9 +11,15 @@ from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.integrity import HashingStream
 from pipeline.core.records import KEY_PATTERN, Split, View, excerpt, is_position, is_utf8
-from pipeline.shards.external import external_metadata
+from pipeline.shards.external import (
+    external_metadata,
+    find_metadata,
+    find_suffixes,
+    parse_json,
+)
 from pipeline.shards.manifest import repair_hint
 from pipeline.shards.tar_reader import (
+    ALL_SUFFIXES,
     IMAGE_SUFFIXES,
     METADATA_SUFFIXES,
     read_members,
@@ -37,20 +42,28 @@ class Sample:
 
 
 def read_samples(
-    tar: str, external: tuple[Split, View] | None = None, sha256: str | None = None
+    tar: str,
+    external: tuple[Split, View] | None = None,
+    sha256: str | None = None,
+    scattered: bool = False,
 ) -> Iterator[Sample]:
     """The samples of one tar in their order; members without an image are skipped.
 
-    `external`: split and view of a tar that others made, whose samples do not state them. Raises
+    `external`: split and view of a tar that others made, whose samples do not state them.
+    `scattered`: its metadata does not stand beside the images, and is read before them. Raises
     InputError where the tar is cut off or hostile, or where a sample is not one of ours and
     `external` is not given; after the last sample, where the tar's hash is not `sha256`.
     """
     folder = tar.rpartition("/")[0]
-    for key, members in read_tar(tar) if sha256 is None else _read_hashed(tar, sha256):
-        data = next((members[suffix] for suffix in IMAGE_SUFFIXES if suffix in members), None)
-        if data is None:
+    apart: dict[str, dict[str, bytes]] = {}
+    if scattered:
+        for key, members in read_tar(tar, METADATA_SUFFIXES, external=True):
+            apart.setdefault(key, {}).update(members)
+    for key, members in _read_hashed(tar, external is not None, sha256):
+        if not (images := find_suffixes(members, IMAGE_SUFFIXES)):
             continue
-        stated = _parse_json(members.get("json"))
+        data = members[images[0]]
+        stated, label = find_metadata(apart.get(key, {}) | members)
         if stated.keys() >= REQUIRED_FIELDS:
             if wrong := next(_faults(key, stated), None):
                 raise InputError(
@@ -64,15 +77,20 @@ def read_samples(
                 f"{', '.join(sorted(REQUIRED_FIELDS))}; give its --split and --view, or pack its "
                 "images with jobs/make_shards.py"
             )
-        metadata = external_metadata(key, stated, members.get("cls"), *external)
+        metadata = external_metadata(key, stated, label, *external)
         yield Sample(key=metadata["key"], data=data, metadata=metadata)
 
 
-def _read_hashed(tar: str, sha256: str) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """`read_tar`, which compares the hash after the tar's end."""
+def _read_hashed(
+    tar: str, external: bool, sha256: str | None
+) -> Iterator[tuple[str, dict[str, bytes]]]:
+    """`read_tar`, which compares the hash after the tar's end, if one is given."""
+    if sha256 is None:
+        yield from read_tar(tar, external=external)
+        return
     with storage.open_read(tar) as stream:
         hashed = HashingStream(stream)
-        yield from read_members(cast(IO[bytes], hashed), tar, IMAGE_SUFFIXES + METADATA_SUFFIXES)
+        yield from read_members(cast(IO[bytes], hashed), tar, ALL_SUFFIXES, external)
         hashed.drain()
     if hashed.checksum.sha256 != sha256:
         raise InputError(
@@ -87,7 +105,7 @@ def read_locations(tar: str) -> Iterator[str]:
     Raises InputError where a sample does not state it, and as `read_tar` does.
     """
     for key, members in read_tar(tar, ("json",)):
-        location = _parse_json(members.get("json")).get("location")
+        location = parse_json(members.get("json")).get("location")
         if not isinstance(location, str):
             raise InputError(
                 f"{tar}: the JSON of {key!r} says no location, expected what was packed; "
@@ -109,12 +127,3 @@ def _faults(key: str, stated: dict[str, Any]) -> Iterator[str]:
     valid = isinstance(tag, dict) and is_position(tag.get("lat"), tag.get("lon"))
     if tag is not None and not valid:
         yield f"the geotag {excerpt(tag)}, expected null or a latitude and a longitude in degrees"
-
-
-def _parse_json(data: bytes | None) -> dict[str, Any]:
-    """A JSON object; empty where the bytes are none."""
-    try:
-        stated = json.loads(data or b"{}")
-    except (ValueError, RecursionError):
-        return {}
-    return stated if isinstance(stated, dict) else {}

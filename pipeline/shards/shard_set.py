@@ -13,7 +13,7 @@ from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.shards import record_table
-from pipeline.shards.external import EXTERNAL, scan_tars
+from pipeline.shards.external import EXTERNAL, TAR_ENDINGS, scan_tars
 from pipeline.shards.manifest import MANIFEST, Manifest, Shard, read_manifest, repair_hint
 from pipeline.shards.samples import Sample, read_locations, read_samples
 from pipeline.shards.tar_reader import IMAGE_SUFFIXES, read_tar
@@ -32,7 +32,7 @@ class ShardSet:
         """Whether others made these shards, so that there is neither a manifest on disk nor a
         record table.
         """
-        return self.manifest.packing == EXTERNAL
+        return self.manifest.packing.get("source") == EXTERNAL
 
     @property
     def repair_hint(self) -> str:
@@ -41,7 +41,7 @@ class ShardSet:
 
     def tar(self, shard: Shard) -> str:
         """Path of a shard's tar."""
-        return storage.join(self.path, f"{shard.name}.tar")
+        return storage.join(self.path, self._file(shard))
 
     def samples(self, shard: Shard, verify: bool = False) -> Iterator[Sample]:
         """The samples of one shard in their order; members without an image are skipped.
@@ -53,6 +53,7 @@ class ShardSet:
             self.tar(shard),
             external=(shard.split, shard.view) if self.external else None,
             sha256=shard.sha256 if verify else None,
+            scattered=self.external and shard.name in self.manifest.packing["scattered"],
         )
 
     def locations(self, shard: Shard) -> Iterator[str]:
@@ -106,7 +107,7 @@ class ShardSet:
         """
         sizes, wrong = storage.walk(self.path), dict[str, str]()
         for shard in shards:
-            path, size = self.tar(shard), sizes.get(f"{shard.name}.tar")
+            path, size = self.tar(shard), sizes.get(self._file(shard))
             if size is None:
                 wrong[shard.name] = f"{path} is missing"
             elif size != shard.bytes:
@@ -126,6 +127,10 @@ class ShardSet:
         shard at a time.
         """
         return replace(self, manifest=replace(self.manifest, shards=(), classes=()))
+
+    def _file(self, shard: Shard) -> str:
+        files: dict[str, str] = self.manifest.packing.get("files", {}) if self.external else {}
+        return files.get(shard.name, f"{shard.name}.tar")
 
     def _holding(self, keys: Collection[str]) -> Iterator[Shard]:
         """The shards that may hold some keys, by the split and view that begin a key."""
@@ -152,7 +157,7 @@ def open_or_scan(path: str, split: Split | None = None, view: View | None = None
     """
     if storage.exists(storage.join(path, MANIFEST)):
         return open_shards(path)
-    tars = [name.removesuffix(".tar") for name in storage.list_names(path) if name.endswith(".tar")]
+    tars = [name for name in storage.list_names(path) if name.endswith(TAR_ENDINGS)]
     if not tars:
         return open_shards(path)  # raises, and says what is missing
     if split is None or view is None:

@@ -6,18 +6,24 @@ header, a zeroed header, and the end of the file for the end of the tar, fills t
 file with as many zeros as its header states, and reads a member name of any length.
 """
 
+import gzip
 import re
 import tarfile
-from typing import IO
+import zlib
+from typing import IO, cast
 
 BLOCK = tarfile.BLOCKSIZE
 ZEROS = bytes(BLOCK)
+GZIP_MAGIC = b"\x1f\x8b\x08"
+GZIP_ERRORS = (gzip.BadGzipFile, zlib.error)
+MAX_COMPRESSED_BYTES = 1 << 28
+"Bytes of a file in a tar that may be compressed: a small tar could hold files of any size."
 MAX_HEADER_BYTES = 1 << 16
 "Bytes of a long name, or of a pax header; a path has four thousand at most."
 PAX_HEADERS = (tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE)
 EXTENDED_HEADERS = (tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, *PAX_HEADERS)
 "Kinds of headers that only describe the header behind them."
-COMPRESSED = (b"\x1f\x8b\x08", b"BZh", b"\x5d\x00\x00\x80", b"\xfd7zXZ")
+COMPRESSED = (GZIP_MAGIC, b"BZh", b"\x5d\x00\x00\x80", b"\xfd7zXZ")
 "First bytes of compressed files: `tarfile` would unpack them itself, after this check."
 PAX_RECORD = re.compile(rb"(\d+) ([^=]+)=")
 "How `tarfile` finds the records of a pax header."
@@ -26,8 +32,9 @@ PAX_RECORD = re.compile(rb"(\d+) ([^=]+)=")
 class GuardedTar:
     """A stream of a tar's bytes that raises tarfile.ReadError where the tar is not intact."""
 
-    def __init__(self, stream: IO[bytes]) -> None:
+    def __init__(self, stream: IO[bytes], compressed: bool = False) -> None:
         self._stream = stream
+        self._limit = MAX_COMPRESSED_BYTES if compressed else None
         self._partial = b""
         "The beginning of a block whose end has not been read."
         self._skip = 0
@@ -97,7 +104,30 @@ class GuardedTar:
                 return 0
             if not (extended or header.isreg() or header.type not in tarfile.SUPPORTED_TYPES):
                 return 0
+        if self._limit is not None and size > self._limit:
+            raise tarfile.ReadError(f"it holds a file of {size} bytes, more than any image has")
         return -(-size // BLOCK) * BLOCK
+
+
+def gunzipped(stream: IO[bytes]) -> IO[bytes]:
+    """The stream, or its content where it is compressed by gzip."""
+    head = stream.read(len(GZIP_MAGIC))
+    replayed = cast(IO[bytes], _Replayed(head, stream))
+    return cast(IO[bytes], gzip.GzipFile(fileobj=replayed)) if head == GZIP_MAGIC else replayed
+
+
+class _Replayed:
+    """A stream whose first bytes have been read already and come again, by themselves."""
+
+    def __init__(self, head: bytes, stream: IO[bytes]) -> None:
+        self._head, self._stream = head, stream
+
+    def read(self, size: int = -1) -> bytes:
+        if not self._head:
+            return self._stream.read(size)
+        end = len(self._head) if size < 0 else size
+        head, self._head = self._head[:end], self._head[end:]
+        return head
 
 
 def _plain_size(block: bytes) -> int | None:

@@ -115,6 +115,11 @@ def test_external_samples_have_keys_labels_and_positions(foreign: str) -> None:
         ("a/b/0", {"label": [1, 2]}, b"4\n", "4"),
         ("a/b/0", {}, None, "b"),
         ("0", {}, None, "0"),
+        ("0", {"location": 12.0}, None, "12"),
+        ("0", {"location": "12.0"}, None, "12"),
+        ("0", {"location": 12.5}, None, "12.5"),
+        ("0", {"location": {"lat": 1}, "id": 7}, None, "7"),
+        ("0", {}, b"12.0\n", "12"),
     ],
 )
 def test_external_location_prefers_the_most_reliable_field(
@@ -128,7 +133,15 @@ def test_external_location_prefers_the_most_reliable_field(
     [
         ({"latitude": 1, "lng": -2.5}, {"lat": 1.0, "lon": -2.5}),
         ({"geotag": {"lat": 3, "lon": 4}}, {"lat": 3.0, "lon": 4.0}),
-        ({"lat": "3", "lon": "4"}, None),
+        ({"lat": "3", "lon": "4"}, {"lat": 3.0, "lon": 4.0}),
+        ({"Latitude": " 47,5 ", "Longitude": "8"}, {"lat": 47.5, "lon": 8.0}),
+        ({"gps": {"lat": 3, "lng": "4"}}, {"lat": 3.0, "lon": 4.0}),
+        ({"location": {"coordinates": {"lat": 3, "lon": 4}}}, {"lat": 3.0, "lon": 4.0}),
+        ({"geometry": {"type": "Point", "coordinates": [8, 47]}}, {"lat": 47.0, "lon": 8.0}),
+        ({"coordinates": [47, 8]}, None),
+        ({"lat": "nan", "lon": "4"}, None),
+        ({"lat": "", "lon": None}, None),
+        ({"lat": True, "lon": 4}, None),
         ({"lat": 300.0, "lon": 4.0}, None),
         ({"lat": float("nan"), "lon": 4.0}, None),
         ({"lat": 3.0}, None),
