@@ -18,6 +18,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -35,6 +36,7 @@ MAX_PHOTOS = 200
 TIMEOUT_S = 180
 "Longest start of a service."
 
+LISTENS = re.compile(r"(http://127\.0\.0\.1:\d+) listens")
 Measurement = tuple[list[float], float, Counter[int]]
 "Latencies in seconds, duration, and number of requests by status."
 
@@ -45,16 +47,21 @@ def service(args: argparse.Namespace, *flags: str) -> Iterator[str]:
     command = [sys.executable, str(ROOT / "jobs" / "serve.py"), "--port", "0", *flags]
     command += ["--checkpoint", args.checkpoint, "--index", args.index]
     environment = os.environ | {"RAY_ADDRESS": "local"}
-    with subprocess.Popen(
-        command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
-    ) as process:
+    with (
+        tempfile.NamedTemporaryFile() as log,
+        subprocess.Popen(command, env=environment, stderr=log, start_new_session=True) as process,
+    ):
         try:
-            assert process.stderr is not None
-            line = process.stderr.readline()
-            address = re.match(r"(http://127\.0\.0\.1:\d+) listens", line)
+            address = None
+            while address is None and process.poll() is None:
+                time.sleep(0.05)
+                address = LISTENS.search(Path(log.name).read_text())
             if address is None:
-                raise SystemExit(line + process.stderr.read())
+                raise RuntimeError("the service has ended")
             yield address[1]
+        except Exception:
+            print(Path(log.name).read_text()[-2000:], file=sys.stderr)
+            raise
         finally:
             process.send_signal(signal.SIGTERM)
             process.wait(30)
