@@ -1,6 +1,4 @@
-"""Fixtures that several tests share: one Ray for all, a tiny data set made by the simulator, a
-small encoder.
-"""
+"""Fixtures of several tests: one Ray for all, a tiny simulated data set, a small encoder."""
 
 import os
 from collections.abc import Iterator
@@ -15,16 +13,15 @@ from tests.launcher import Launcher
 if TYPE_CHECKING:
     from model.pvda import FeatureEncoder
 
-os.environ.setdefault(
-    "RAY_AUTH_MODE", "disabled"
-)  # the same for every Ray process that the tests start
+# The same for every Ray process that the tests start.
+os.environ.setdefault("RAY_AUTH_MODE", "disabled")
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-# Threads that wait for each other give their core away: spinning, they take it from whoever they
-# wait for on a busy machine.
+# Waiting threads yield their core: on a busy machine, a spinning thread takes it from the thread
+# that it waits for.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-# The same examples each time, and no clock: a pause of the machine is no defect. PVDA_FUZZ_EXAMPLES
-# tries others.
+# The same examples each time, and no deadline: a pause of the machine is no defect.
+# PVDA_FUZZ_EXAMPLES tries others.
 hypothesis.settings.register_profile(
     "house",
     deadline=None,
@@ -33,7 +30,7 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("house")
 
-SLOW_FIXTURES = {"ray_cluster", "prepared", "browser"}
+SLOW_FIXTURES = {"ray_cluster", "prepared", "browser", "workspace"}
 "Tests that use one of them start Ray, jobs or Chromium: `make test-fast` leaves them out."
 
 
@@ -59,9 +56,7 @@ def ray_cluster() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def tiny_world(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) -> Path:
-    """A data set in University-1652's layout: 6 training locations, 3 test locations, 2
-    distractors, 3 views of 64 px.
-    """
+    """A data set in University-1652's layout: 6 training, 3 test locations, 2 distractors, 3 views."""
     from pipeline.simulation.settings import SimulationSettings
     from pipeline.simulation.simulate import simulate
 
@@ -87,7 +82,7 @@ def tiny_shards(tmp_path_factory: pytest.TempPathFactory, tiny_world: Path) -> s
 
 @pytest.fixture(scope="session")
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Launcher]:
-    """Starts jobs whose libraries are imported already: most of a short call is that."""
+    """Starts jobs in processes whose libraries are imported already: most of a short job's time."""
     launcher = Launcher(tmp_path_factory.mktemp("launcher"), {})
     yield launcher
     launcher.close()
@@ -95,7 +90,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Launcher]:
 
 @pytest.fixture
 def ray_address(ray_cluster: None, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The session's Ray as jobs in processes of their own find it: through the environment."""
+    """The session's Ray, for jobs in separate processes: in their environment."""
     import ray
 
     address: str = ray.get_runtime_context().gcs_address
@@ -105,9 +100,7 @@ def ray_address(ray_cluster: None, monkeypatch: pytest.MonkeyPatch) -> str:
 
 @pytest.fixture
 def lively_encoder() -> "FeatureEncoder":
-    """A ResNet-18 of a quarter's width at 64 px whose BatchNorms have been somewhere, so that
-    leaving one out shows.
-    """
+    """A ResNet-18 of a quarter's width at 64 px with BatchNorms that change its output."""
     import torch
     from torch import nn
 

@@ -1,7 +1,7 @@
-"""What a reader may do with hostile input: answer, or say no in a sentence, within bounded time and
-memory.
+"""Bounds of readers on hostile input: an answer or one sentence, in bounded time and memory.
 
-`PVDA_FUZZ_EXAMPLES=1000` tries that many examples per test, others each time; without it there are few, always the same.
+`PVDA_FUZZ_EXAMPLES=1000` tries that many examples per test, different ones each time; without it
+the examples are few and always the same.
 """
 
 import os
@@ -17,54 +17,49 @@ from pipeline.core.errors import InputError
 
 EXAMPLES = int(os.environ.get("PVDA_FUZZ_EXAMPLES", "0"))
 SECONDS, MEGABYTES = 10, 400
-"That one example may take; a reader's bound times what a busy machine adds."
-LONGEST_SENTENCE = 6_000
-"Characters: a sentence that names a path or two."
+"Bounds of one example: a reader's own bound times the delay of a busy machine."
+MAX_MESSAGE = 6_000
+"Longest message in characters: a sentence that names a path or two."
 ADDRESSES = 6 << 30
-"""Bytes of address space that an example may ask for: what asks for more meets a MemoryError, and
-is found out."""
+"""Bytes of address space per example: a larger request meets a MemoryError, and fails the test."""
 
 
 def examples(quick: int, share: float = 1.0) -> settings:
-    """Few fixed examples in a normal run; in a long one `share` of PVDA_FUZZ_EXAMPLES, for tests
-    that are slow.
-    """
+    """Few fixed examples in a normal run, `share` of PVDA_FUZZ_EXAMPLES in a long one."""
     return settings(
         max_examples=max(1, round(EXAMPLES * share)) if EXAMPLES else quick,
         derandomize=not EXAMPLES,
         database=None,
-        deadline=None,  # `bounded` stops what takes too long while it runs
+        deadline=None,  # `bounded` stops an example that takes too long
         suppress_health_check=list(HealthCheck),
         print_blob=True,
     )
 
 
 class TooLong(BaseException):
-    """Of no kind that a reader may catch."""
+    """Raised by the alarm; no reader catches BaseException."""
 
 
 @contextmanager
 def bounded(
     *refusals: type[Exception], seconds: float = SECONDS, megabytes: float = MEGABYTES
 ) -> Iterator[None]:
-    """Run the block: it may raise `refusals` with a sentence; anything else, and whatever takes too
-    much, fails the test.
-    """
-    held, peak = resource.getrlimit(resource.RLIMIT_AS), _peak()
+    """Run the block within the bounds: it may raise `refusals` with a sentence, nothing else."""
+    limits, peak = resource.getrlimit(resource.RLIMIT_AS), _peak()
     with open("/proc/self/statm") as stream:
         mapped = int(stream.read().split()[0]) * resource.getpagesize()
     before = signal.signal(signal.SIGALRM, _stop)
     signal.setitimer(signal.ITIMER_REAL, seconds)
-    resource.setrlimit(resource.RLIMIT_AS, (mapped + ADDRESSES, held[1]))
+    resource.setrlimit(resource.RLIMIT_AS, (mapped + ADDRESSES, limits[1]))
     try:
         yield
     except refusals as error:
-        told = str(error).strip()
-        assert told, "an error without a word"  # any of several exceptions
-        if isinstance(error, InputError):  # others become a Rejection, which cuts them
-            assert len(told) <= LONGEST_SENTENCE, f"a sentence of {len(told)} characters"
+        message = str(error).strip()
+        assert message, "an error without a message"  # any of several exceptions
+        if isinstance(error, InputError):  # others become a Rejection, which shortens them
+            assert len(message) <= MAX_MESSAGE, f"a sentence of {len(message)} characters"
     finally:
-        resource.setrlimit(resource.RLIMIT_AS, held)
+        resource.setrlimit(resource.RLIMIT_AS, limits)
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
     assert _peak() - peak <= megabytes, f"{_peak() - peak:.0f} MB, expected at most {megabytes:.0f}"
@@ -75,5 +70,5 @@ def _stop(number: int, frame: FrameType | None) -> None:
 
 
 def _peak() -> float:
-    """Most memory that this process has had so far, megabytes."""
+    """Peak memory of this process so far, megabytes."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

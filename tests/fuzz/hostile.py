@@ -1,6 +1,4 @@
-"""Strategies that begin with something valid and damage it: bytes, JSON values, names, numbers as
-text.
-"""
+"""Strategies that damage valid input: bytes, JSON values, names, numbers as text."""
 
 import struct
 from typing import Any

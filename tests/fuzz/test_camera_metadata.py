@@ -17,15 +17,22 @@ from tests.fuzz.bounds import bounded, examples
 from tests.fuzz.hostile import damaged, numbers
 
 XMP = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">
-<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/"
- drone-dji:GpsLatitude="{0}" drone-dji:GpsLongitude="{1}" drone-dji:RelativeAltitude="{2}" drone-dji:GimbalYawDegree="{3}"
+<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/"
+ drone-dji:GpsLatitude="{0}" drone-dji:GpsLongitude="{1}"
+ drone-dji:RelativeAltitude="{2}" drone-dji:GimbalYawDegree="{3}"
  drone-dji:GimbalPitchDegree="{4}"><a><b>{0}</b></a></rdf:Description></rdf:RDF></x:xmpmeta>"""
 LAUGHS = "<!DOCTYPE k [<!ENTITY a 'ha'>" + "".join(
     f"<!ENTITY {chr(98 + n)} '{f'&{chr(97 + n)};' * 10}'>" for n in range(12)
 ) + "]>"  # fmt: skip
-OUTSIDE = "<!DOCTYPE k [<!ENTITY a SYSTEM 'file:///etc/passwd'><!ENTITY % p SYSTEM 'http://127.0.0.1/x'>%p;]>"
-KML = """{head}<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><{kind}><coordinates> {0},{1},{2} {3}
-</coordinates></{kind}><LookAt><latitude>{1}</latitude><longitude>{0}</longitude></LookAt></Placemark></Document></kml>"""
+OUTSIDE = (
+    "<!DOCTYPE k [<!ENTITY a SYSTEM 'file:///etc/passwd'>"
+    "<!ENTITY % p SYSTEM 'http://127.0.0.1/x'>%p;]>"
+)
+KML = """{head}<kml xmlns="http://www.opengis.net/kml/2.2"><Document>
+<Placemark><{kind}><coordinates> {0},{1},{2} {3}
+</coordinates></{kind}><LookAt><latitude>{1}</latitude><longitude>{0}</longitude></LookAt>
+</Placemark></Document></kml>"""
 HEADS = [
     "",
     "\ufeff",
@@ -80,16 +87,18 @@ def photo(form: str) -> bytes:
 
 @given(st.data(), st.sampled_from(["JPEG", "PNG", "WEBP", "TIFF"]), st.booleans())
 @examples(60)
-def test_a_photos_tags(data: st.DataObject, form: str, whole: bool) -> None:
-    told = data.draw(damaged(photo(form)))
+def test_photo_with_damaged_tags_is_read_or_rejected(
+    data: st.DataObject, form: str, is_intact: bool
+) -> None:
+    content = data.draw(damaged(photo(form)))
     with bounded(UnreadableTag):
-        read_tags(find_metadata(told, whole))
+        read_tags(find_metadata(content, is_intact))
 
 
 @given(st.data(), st.sampled_from(["<", ">"]))
 @examples(60)
-def test_directories_that_point_anywhere(data: st.DataObject, order: str) -> None:
-    """EXIF written entry by entry: types, counts and offsets of any value, pointers to themselves."""
+def test_exif_directories_with_any_pointers_are_bounded(data: st.DataObject, order: str) -> None:
+    """EXIF entries of any type, count and offset, among them pointers to themselves."""
     word = st.sampled_from([0, 1, 2, 4, 8, 14, 26, 0xFFFFFFFF, 1 << 20]) | st.integers(0, 2**32 - 1)
     tag = st.sampled_from([1, 2, 3, 4, 5, 6, 16, 17, 0x02BC, 0x8769, 0x8825, 0x9003, 0x9011])
     entries = data.draw(st.lists(st.tuples(tag, st.integers(0, 13), word, word), max_size=12))
@@ -108,7 +117,9 @@ def test_directories_that_point_anywhere(data: st.DataObject, order: str) -> Non
     st.data(),
 )
 @examples(60)
-def test_an_xmp_packet(cells: list[str], head: str, encoding: str, data: st.DataObject) -> None:
+def test_xmp_packet_is_read_or_rejected(
+    cells: list[str], head: str, encoding: str, data: st.DataObject
+) -> None:
     packet = (head + XMP.format(*cells)).encode(encoding, "replace")
     with bounded(UnreadableTag):
         read_tags(MetadataBlocks(xmp=packet))
@@ -121,20 +132,22 @@ def test_an_xmp_packet(cells: list[str], head: str, encoding: str, data: st.Data
     st.sampled_from(["Point", "LineString", "Polygon"]), st.data(),
 )  # fmt: skip
 @examples(60)
-def test_a_kml(cells: list[str], head: str, encoding: str, kind: str, data: st.DataObject) -> None:
-    told = KML.format(*cells, head=head, kind=kind).encode(encoding, "replace")
+def test_kml_is_read_or_rejected(
+    cells: list[str], head: str, encoding: str, kind: str, data: st.DataObject
+) -> None:
+    content = KML.format(*cells, head=head, kind=kind).encode(encoding, "replace")
     with bounded(Unreadable):
-        parse_kml(told)
+        parse_kml(content)
     with bounded(Unreadable):
-        parse_kml(data.draw(damaged(told)))
+        parse_kml(data.draw(damaged(content)))
 
 
-def test_points_within_points_are_read_in_time() -> None:
+def test_deeply_nested_kml_points_are_read_in_time() -> None:
     with bounded(Unreadable):
         parse_kml(b"<Point>" * 60_000 + b"</Point>" * 60_000)
 
 
-def test_a_number_that_goes_on_and_on_is_read_in_time() -> None:
+def test_number_of_many_digits_is_read_in_time() -> None:
     long = "1" * 500_000 + "x"
     with bounded(UnreadableTag):
         read_tags(MetadataBlocks(xmp=XMP.format(long, long, long, long, long).encode()[: 1 << 20]))

@@ -1,6 +1,4 @@
-"""GeoTIFFs from anybody: tiles, or a reason why there are none, whatever the header says of sizes,
-places and directories.
-"""
+"""GeoTIFFs from anywhere: tiles, or a rejection, whatever sizes and georeference a header has."""
 
 import io
 import struct
@@ -33,7 +31,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "complex": {"count": 1, "dtype": "complex64"},
     "double": {"count": 3, "dtype": "float64"},
     "int8": {"count": 1, "dtype": "int8"},
-    "complex of whole numbers": {"count": 1, "dtype": "complex_int16"},
+    "complex of integers": {"count": 1, "dtype": "complex_int16"},
     "tiled": {
         "count": 3,
         "dtype": "uint8",
@@ -103,13 +101,13 @@ SOURCES = [
 
 @given(st.data(), st.sampled_from(list(KINDS)), st.sampled_from(SOURCES))
 @examples(120)
-def test_a_damaged_mosaic(
+def test_damaged_mosaic_is_read_or_rejected(
     folder: Path, data: st.DataObject, kind: str, source: dict[str, Any]
 ) -> None:
-    told = data.draw(damaged(valid(kind, folder), head=400))
+    content = data.draw(damaged(valid(kind, folder), head=400))
     for path in (folder / "damaged.tif", folder / "damaged.tif.aux.xml"):
         path.unlink(missing_ok=True)
-    (folder / "damaged.tif").write_bytes(told)
+    (folder / "damaged.tif").write_bytes(content)
     tiles(folder / "damaged.tif", GeoTiff(**source))
 
 
@@ -155,7 +153,7 @@ word = st.sampled_from(
     st.data(),
 )
 @examples(120)
-def test_a_header_written_entry_by_entry(
+def test_tiff_header_of_any_entries_is_bounded(
     folder: Path, entries: dict[int, tuple[int, int, int]], data: st.DataObject
 ) -> None:
     """Tags of a mosaic with any type, count and value: gigantic sides, strips beyond the file,
@@ -171,11 +169,11 @@ def test_a_header_written_entry_by_entry(
         278: (4, 1, 64),
         279: (4, 1, 4096),
     }
-    told = base | entries
+    content = base | entries
     scale = {33550: (12, 3, 1000), 33922: (12, 6, 1024)}
-    told = scale | told if data.draw(st.booleans()) else told
-    directory = struct.pack("<H", len(told)) + b"".join(
-        struct.pack("<HHII", tag, *value) for tag, value in sorted(told.items())
+    content = scale | content if data.draw(st.booleans()) else content
+    directory = struct.pack("<H", len(content)) + b"".join(
+        struct.pack("<HHII", tag, *value) for tag, value in sorted(content.items())
     )
     following = data.draw(st.sampled_from([0, 8, 9, 1 << 31, 8 + len(directory)]))
     block = (b"II*\0" + struct.pack("<I", 8) + directory + struct.pack("<I", following)).ljust(
@@ -206,7 +204,7 @@ NUMBERS = [0.0, 1e-300, -1e-300, 1e-9, 1.0, -1.0, 1e9, 1e300, float("inf"), floa
     st.sampled_from(SOURCES),
 )
 @examples(80)
-def test_a_mosaic_that_lies_anywhere(
+def test_mosaic_of_any_georeference_is_read_or_rejected(
     folder: Path, six: list[float], crs: str | None, source: dict[str, Any]
 ) -> None:
     path = folder / "anywhere.tif"
@@ -247,7 +245,7 @@ def sparse(path: Path, side: int) -> None:
     (400_000, {"tile_pixels": 60_000}, "absurd dimensions"),
     (400_000, {"tile_pixels": 512, "overlap": 0.9999}, "too many tiles"),
 ])  # fmt: skip
-def test_an_empty_mosaic_of_a_continent_is_refused_at_once(
+def test_huge_sparse_mosaic_is_rejected_at_once(
     folder: Path, side: int, source: dict[str, Any], reason: str
 ) -> None:
     sparse(folder / "sparse.tif", side)
@@ -274,13 +272,13 @@ def test_an_empty_mosaic_of_a_continent_is_refused_at_once(
         {"crs": "http://127.0.0.1:1/x"},
     ],
 )
-def test_a_setting_that_makes_no_sense(folder: Path, flags: dict[str, Any]) -> None:
+def test_invalid_tiling_setting_is_rejected(folder: Path, flags: dict[str, Any]) -> None:
     (folder / "made.tif").write_bytes(valid("rgb", folder))
     with bounded(InputError):
         tiles(folder / "made.tif", GeoTiff(**flags))
 
 
-def test_a_palette_of_sixteen_bits_and_other_rarities(folder: Path) -> None:
+def test_rare_photometric_is_read_or_rejected(folder: Path) -> None:
     stream = io.BytesIO(valid("grey", folder))
     data = bytearray(stream.getvalue())
     for photometric in (3, 4, 5, 6, 8, 9, 32803, 34892):

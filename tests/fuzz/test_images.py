@@ -78,12 +78,12 @@ def judge(data: bytes) -> None:
     st.booleans(),
 )
 @examples(250)
-def test_an_image_of_any_kind_and_damage(
-    data: st.DataObject, form: str, mode: str, frames: int, whole: bool
+def test_image_of_any_format_and_damage_is_bounded(
+    data: st.DataObject, form: str, mode: str, frames: int, is_intact: bool
 ) -> None:
-    told = picture(form, mode, frames)
-    if told:
-        judge(told if whole else data.draw(damaged(told, head=64)))
+    content = picture(form, mode, frames)
+    if content:
+        judge(content if is_intact else data.draw(damaged(content, head=64)))
 
 
 def png(
@@ -149,16 +149,16 @@ def bombs() -> dict[str, bytes]:
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", list(bombs()))
-def test_a_bomb_is_refused_or_small(name: str) -> None:
+def test_decompression_bomb_is_rejected_or_small(name: str) -> None:
     judge(bombs()[name])
 
 
 @pytest.mark.parametrize(
     "form", ["EPS", "ICNS", "ICO", "PCX", "SGI", "DDS", "TGA", "JPEG2000", "PDF"]
 )
-def test_only_kinds_of_images_that_a_source_names_are_opened(form: str) -> None:
+def test_only_known_image_formats_are_opened(form: str) -> None:
     """Others have decoders that nobody here needs: that of EPS is a program, Ghostscript."""
-    told = picture(form, "RGB")
-    assert told
+    content = picture(form, "RGB")
+    assert content
     with pytest.raises(DecodeError, match="not an image"):
-        decode(told)
+        decode(content)

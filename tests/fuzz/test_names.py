@@ -1,6 +1,4 @@
-"""Files called anything: what is said of them reaches a terminal as text, and what is packed of
-them is packed or refused.
-"""
+"""Files of any name: a terminal shows their names as text, and no file is packed elsewhere."""
 
 import io
 import os
@@ -12,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from jobs.command_line import cli
-from pipeline.core import progress as told
+from pipeline.core import progress as progress_module
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.progress import CONTROL_CHARACTERS, console, escape_controls, progress, results
 from pipeline.core.rejections import REJECTED_FILE
@@ -30,7 +28,7 @@ text = st.text(max_size=30) | st.sampled_from(NAMES)
 
 @given(text)
 @examples(100)
-def test_a_terminal_is_given_text(name: str) -> None:
+def test_console_prints_names_as_text(name: str) -> None:
     assert not CONTROL_CHARACTERS.search(escape_controls(name))
     for each in (console, results):
         with each.capture() as captured:
@@ -44,11 +42,13 @@ def test_a_terminal_is_given_text(name: str) -> None:
 
 @given(text)
 @examples(30)
-def test_a_bar_shows_names_as_they_are(name: str) -> None:
+def test_progress_bar_shows_names_unchanged(name: str) -> None:
     stream = io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            told, "console", told._PlainConsole(file=stream, force_terminal=True, width=200)
+            progress_module,
+            "console",
+            progress_module._PlainConsole(file=stream, force_terminal=True, width=200),
         )
         with progress(2, name) as meter:
             meter.advance(1, fact=name)
@@ -57,7 +57,7 @@ def test_a_bar_shows_names_as_they_are(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name.isprintable()])
-def test_an_error_is_one_line(
+def test_error_is_one_line_for_any_name(
     name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def job() -> None:
@@ -67,9 +67,9 @@ def test_an_error_is_one_line(
     with pytest.raises(SystemExit) as ended:
         cli.run(job)
     assert ended.value.code == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert escape_controls(name) in said
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert escape_controls(name) in message
 
 
 def raw(name: str) -> bytes:
@@ -103,7 +103,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("source", [Photos(), University1652()])
-def test_files_of_any_name_are_packed_or_refused(
+def test_files_of_any_name_are_packed_or_rejected(
     source: Photos | University1652, world: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "shards"

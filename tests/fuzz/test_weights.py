@@ -1,6 +1,4 @@
-"""Checkpoints, weights and features from anybody: what they hold, or a sentence. Nothing in them is
-run, nothing inflated.
-"""
+"""Checkpoints, weights and features from anywhere: content, or a sentence; no code is executed."""
 
 import io
 import pickle
@@ -62,24 +60,24 @@ def saved(value: Any) -> bytes:
 
 def open_all(data: bytes) -> None:
     with bounded(CheckpointError):
-        held = loads(data)
-        build_encoder(held)
-        fingerprint(held, "bicubic")
+        checkpoint_ = loads(data)
+        build_encoder(checkpoint_)
+        fingerprint(checkpoint_, "bicubic")
 
 
 @given(st.data())
 @examples(25)
-def test_a_damaged_checkpoint(data: st.DataObject) -> None:
-    whole = checkpoint()
-    head = whole.find(
+def test_damaged_checkpoint_is_read_or_rejected(data: st.DataObject) -> None:
+    intact = checkpoint()
+    head = intact.find(
         b"PK\1\2"
     )  # flips in a weight are no damage that one could see; the pickle and the directory are
-    told = (
-        data.draw(damaged(whole, most=3, head=2000))
+    content = (
+        data.draw(damaged(intact, most=3, head=2000))
         if data.draw(st.booleans())
-        else whole[:head] + data.draw(damaged(whole[head:]))
+        else intact[:head] + data.draw(damaged(intact[head:]))
     )
-    open_all(told)
+    open_all(content)
 
 
 @given(
@@ -101,7 +99,7 @@ def test_a_damaged_checkpoint(data: st.DataObject) -> None:
     st.data(),
 )
 @examples(40)
-def test_a_checkpoint_with_something_else_in_a_field(
+def test_checkpoint_field_of_any_value_is_bounded(
     field: str, value: Any, data: st.DataObject
 ) -> None:
     if data.draw(st.booleans()) and field in plain():
@@ -110,17 +108,20 @@ def test_a_checkpoint_with_something_else_in_a_field(
 
 
 @pytest.mark.parametrize("network", [
-    '{"width": 1e6, "backbone": "resnet18"}', '{"width": 1e300}', '{"image_size": 1000000000000, "parts": 10000000}',
+    '{"width": 1e6, "backbone": "resnet18"}', '{"width": 1e300}',
+    '{"image_size": 1000000000000, "parts": 10000000}',
     '{"part_dim": 1000000000000}',
-    '{"backbone": "18"}', '{"backbone": true}', '{"backbone": []}', '{"image_size": 64.5}', '{"parts": -1}', '{"parts": 0}', '{"width": NaN}',
+    '{"backbone": "18"}', '{"backbone": true}', '{"backbone": []}', '{"image_size": 64.5}',
+    '{"parts": -1}', '{"parts": 0}', '{"width": NaN}',
     '{"width": -1}', "[]", "null", "[" * 100_000,
-    '{"discriminator_channels": 1e9}', '{"ring_divisor": "x"}', '{"dropout": "x"}', '{"dropout": 7}',
+    '{"discriminator_channels": 1e9}', '{"ring_divisor": "x"}', '{"dropout": "x"}',
+    '{"dropout": 7}',
 ])  # fmt: skip
-def test_a_network_that_nobody_can_build(network: str) -> None:
+def test_network_config_of_any_value_is_bounded(network: str) -> None:
     open_all(saved(plain() | {"network": network}))
     with bounded(CheckpointError):
-        held = loads(saved(plain() | {"network": network}))
-        assert held.network.ring_divisor in ("box", "ring")
+        checkpoint_ = loads(saved(plain() | {"network": network}))
+        assert checkpoint_.network.ring_divisor in ("box", "ring")
 
 
 def strided(shape: tuple[int, ...]) -> torch.Tensor:
@@ -138,7 +139,7 @@ def strided(shape: tuple[int, ...]) -> torch.Tensor:
     ],
     ids=range(5),
 )
-def test_a_tensor_that_is_not_there(tensor: torch.Tensor) -> None:
+def test_tensor_beyond_its_storage_is_rejected(tensor: torch.Tensor) -> None:
     state = plain()["state"]["modules"]["encoder"]
     name = next(iter(state))
     open_all(saved(plain() | {"state": {"modules": {"encoder": state | {name: tensor}}}}))
@@ -152,7 +153,7 @@ def test_a_tensor_that_is_not_there(tensor: torch.Tensor) -> None:
         )
 
 
-def test_a_zip_bomb_is_not_inflated() -> None:
+def test_zip_bomb_is_not_inflated() -> None:
     stream = io.BytesIO()
     with (
         zipfile.ZipFile(io.BytesIO(checkpoint())) as old,
@@ -176,7 +177,7 @@ class Trap:
 
 
 @pytest.mark.parametrize("protocol", range(6))
-def test_code_in_any_file_is_not_run(protocol: int, tmp_path: Path) -> None:
+def test_pickled_code_is_not_executed(protocol: int, tmp_path: Path) -> None:
     sprung = tmp_path / "sprung"
     for trap in (
         Trap(Path.touch, sprung),
@@ -208,7 +209,7 @@ def laughs() -> bytes:
     return saved(plain() | {"state": {"modules": {"encoder": {}}, "x": value}})
 
 
-def test_lists_of_lists_of_one_list() -> None:
+def test_exponential_nested_lists_are_rejected() -> None:
     open_all(laughs())
     with bounded(CheckpointError):
         parse_state_dict(laughs(), "x.pth")
@@ -225,7 +226,7 @@ def tensors(form: str) -> bytes:
 
 @given(st.data(), st.sampled_from(["safetensors", "pth"]))
 @examples(40)
-def test_a_damaged_file_of_weights(
+def test_damaged_weights_file_is_read_or_rejected(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, form: str
 ) -> None:
     folder = tmp_path_factory.mktemp("weights")
@@ -273,8 +274,8 @@ cells = st.sampled_from(
     st.data(),
 )
 @examples(8, share=0.1)
-def test_features_of_another_program(
-    tmp_path_factory: pytest.TempPathFactory, said: dict[str, Any], data: st.DataObject
+def test_foreign_features_are_read_or_rejected(
+    tmp_path_factory: pytest.TempPathFactory, arrays: dict[str, Any], data: st.DataObject
 ) -> None:
     folder = tmp_path_factory.mktemp("mat")
     good = {
@@ -283,8 +284,8 @@ def test_features_of_another_program(
         "gallery_label": np.array([[1, 2]]),
         "query_label": np.array([[1, 2]]),
     }
-    strange = data.draw(st.sets(st.sampled_from(sorted(said))))
-    scipy.io.savemat(folder / "x.mat", good | {name: said[name] for name in strange})
+    strange = data.draw(st.sets(st.sampled_from(sorted(arrays))))
+    scipy.io.savemat(folder / "x.mat", good | {name: arrays[name] for name in strange})
     if data.draw(st.booleans()):
         (folder / "x.mat").write_bytes(
             data.draw(damaged((folder / "x.mat").read_bytes(), head=200))
@@ -294,5 +295,5 @@ def test_features_of_another_program(
     assert {each.name for each in folder.iterdir()} <= {"x.mat", "out"}
 
 
-def test_values_are_what_json_can_say() -> None:
+def test_values_can_be_written_as_json() -> None:
     assert len(VALUES) > 20

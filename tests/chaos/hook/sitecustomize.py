@@ -1,9 +1,8 @@
-"""Faults of the storage, in every Python process that has this folder on its path and CHAOS in its
-environment.
+"""Storage faults in every Python process with this folder on its path and CHAOS in its environment.
 
-CHAOS names a file, as JSON `kind, operation, at, under, counter`: of the operations ("read" or
-"write") on files below the folder `under`, counted over all processes in files beside `counter`,
-the one with number `at` meets the fault `kind`. Where no such file is, nothing happens.
+CHAOS names a JSON file `kind, operation, at, under, counter`. Operations ("read" or "write") on files
+below the folder `under` are counted over all processes, in files beside `counter`; the operation of
+number `at` meets the fault `kind`. Without the JSON file, nothing happens.
 """
 
 import errno
@@ -18,21 +17,21 @@ from contextlib import contextmanager
 from typing import Any
 
 
-def met(operation: str, path: str) -> str | None:
-    """The fault that this operation meets, or None."""
+def fault_of(operation: str, path: str) -> str | None:
+    """The fault of this operation, or None."""
     try:
         with open(os.environ["CHAOS"]) as stream:
-            said = json.load(stream)
+            fault = json.load(stream)
     except (OSError, ValueError):
         return None
-    if not os.path.abspath(path).startswith(said["under"]):
+    if not os.path.abspath(path).startswith(fault["under"]):
         return None
-    with open(f"{said['counter']}.{operation}", "a+") as counter:
+    with open(f"{fault['counter']}.{operation}", "a+") as counter:
         fcntl.flock(counter, fcntl.LOCK_EX)
         counter.write(".")
         counter.flush()
         number = counter.tell() - 1
-    return str(said["kind"]) if (operation, number) == (said["operation"], said["at"]) else None
+    return str(fault["kind"]) if (operation, number) == (fault["operation"], fault["at"]) else None
 
 
 class Stream:
@@ -47,8 +46,8 @@ class Stream:
 
     def read(self, size: int | None = -1) -> bytes:
         self._check()
-        room = max(0, self._end - self._stream.tell())
-        data: bytes = self._stream.read(room if size is None or size < 0 else min(size, room))
+        left = max(0, self._end - self._stream.tell())
+        data: bytes = self._stream.read(left if size is None or size < 0 else min(size, left))
         return data
 
     read1 = read
@@ -76,27 +75,27 @@ class Stream:
         return getattr(self._stream, name)
 
 
-def spoil(storage: Any) -> None:
-    """Put the faults into the project's module of that name."""
+def inject_faults(storage: Any) -> None:
+    """Wrap the functions of pipeline.core.storage so that they meet the faults."""
     open_read, read_bytes, read_head, atomic_file = (
         getattr(storage, name) for name in ("open_read", "read_bytes", "read_head", "atomic_file")
     )
 
-    def bad_bytes(path: str, whole: Callable[[], bytes]) -> bytes:
-        kind = met("read", path)
+    def bad_bytes(path: str, read: Callable[[], bytes]) -> bytes:
+        kind = fault_of("read", path)
         if kind == "read fails":
             raise OSError(errno.EIO, os.strerror(errno.EIO), path)
-        data = whole()
+        data = read()
         return data[: len(data) // 2] if kind == "read ends early" else data
 
     def bad_open(path: str) -> Any:
-        kind = met("read", path)
+        kind = fault_of("read", path)
         stream = open_read(path)
         return stream if kind is None else Stream(stream, kind, storage.size(path))
 
     @contextmanager
     def bad_atomic_file(path: str) -> Iterator[str]:
-        kind = met("write", path)
+        kind = fault_of("write", path)
         with atomic_file(path) as local:
             yield local
             if kind == "disk full":
@@ -109,7 +108,7 @@ def spoil(storage: Any) -> None:
 
 
 class Finder(importlib.abc.MetaPathFinder):
-    """Finds pipeline.core.storage as it is, and spoils it when it has been loaded."""
+    """Imports pipeline.core.storage and wraps it."""
 
     def find_spec(self, name: str, path: object = None, target: object = None) -> Any:
         if name != "pipeline.core.storage":
@@ -120,7 +119,7 @@ class Finder(importlib.abc.MetaPathFinder):
 
         def exec_module(module: Any) -> None:
             load(module)
-            spoil(module)
+            inject_faults(module)
 
         spec.loader.exec_module = exec_module
         return spec
