@@ -56,7 +56,7 @@ def ray_cluster() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def tiny_world(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) -> Path:
-    """A data set in University-1652's layout: 6 training, 3 test locations, 2 distractors, 3 views."""
+    """University-1652's layout: 6 training and 3 test locations, 2 distractors, 3 views each."""
     from pipeline.simulation.settings import SimulationSettings
     from pipeline.simulation.simulate import simulate
 

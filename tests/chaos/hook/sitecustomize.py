@@ -1,8 +1,8 @@
-"""Storage faults in every Python process with this folder on its path and CHAOS in its environment.
+"""Storage faults in every Python process with this folder on its path and CHAOS set.
 
-CHAOS names a JSON file `kind, operation, at, under, counter`. Operations ("read" or "write") on files
-below the folder `under` are counted over all processes, in files beside `counter`; the operation of
-number `at` meets the fault `kind`. Without the JSON file, nothing happens.
+CHAOS names a JSON file `kind, operation, at, under, counter`. Operations ("read" or "write") on
+files below the folder `under` are counted over all processes, in files beside `counter`; the
+operation of number `at` meets the fault `kind`. Without the JSON file, nothing happens.
 """
 
 import errno
