@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -56,7 +57,8 @@ class Files(Dataset[Tensor]):
 
 def plain_script(weights: bytes, paths: list[Path], size: int, batch: int) -> tuple[float, Floats]:
     """Images per second of the plain script, and its embeddings."""
-    encoder = build_encoder(loads(weights)).to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+    encoder = build_encoder(loads(weights))
+    encoder.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     loader: DataLoader[Tensor] = DataLoader(Files(paths, size), batch_size=batch, num_workers=2)
     found = []
     begin = time.perf_counter()
@@ -69,10 +71,10 @@ def plain_script(weights: bytes, paths: list[Path], size: int, batch: int) -> tu
 
 
 def pipeline_runner(
-    weights: bytes, images: list[bytes], folder: str, args: argparse.Namespace, precision: str
+    weights: bytes, images: list[bytes], folder: str, args: argparse.Namespace, precision: Any
 ) -> Callable[[], tuple[float, Floats]]:
     """Start a worker; each call of the result embeds all images from tars to parts."""
-    settings = EncoderSettings(precision=precision, compiling=args.compiling)  # type: ignore[arg-type]
+    settings = EncoderSettings(precision=precision, compiling=args.compiling)
     spec = encoder_spec(weights, args.batch, folder, images, settings)
     actor = start_worker(folder, spec, args.batch, args.threads, 1)
     half = args.images // 2
@@ -94,7 +96,7 @@ def pipeline_runner(
 
 
 def compare(
-    precision: str,
+    precision: Any,
     weights: bytes,
     images: list[bytes],
     paths: list[Path],

@@ -133,7 +133,7 @@ def measure(
     with tempfile.TemporaryDirectory() as folder:
         shards = write_shards(folder, side, images)
         run = RunConfig(shards=shards, out=folder, recipe=recipe, compile=compiled)
-        worker = TrainingState(run, WorkerContext(device=device), lambda told: print(told["note"]))
+        worker = TrainingState(run, WorkerContext(device=device), lambda row: print(row["note"]))
         batch = next(iter(load_batches(worker, 0)))
         resident(worker, batch, 3)  # warm
         seconds = [
@@ -152,7 +152,7 @@ def measure(
         f"{100 * waited / fed:.1f} % of the step"
     )
     total = sum(spent.values())
-    shares = [f"{part} {100 * taken / total:.0f} %" for part, taken in spent.items()]
+    shares = [f"{part} {100 * seconds_ / total:.0f} %" for part, seconds_ in spent.items()]
     print(f"{name}: " + ", ".join(shares))
 
 

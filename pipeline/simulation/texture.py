@@ -76,22 +76,22 @@ def textured_world(path: str, *, metres_per_pixel: float, frame_pixels: int = 25
     `metres_per_pixel` is the image's own. Raises InputError for an unreadable image or height map.
     """
     try:
-        with Image.open(path, formats=PILLOW_FORMATS) as image:
-            picture = image.convert("RGB")
+        with Image.open(path, formats=PILLOW_FORMATS) as opened:
+            image = opened.convert("RGB")
     except DECODE_ERRORS as error:
         raise InputError(
             f"{path} cannot be decoded ({error}); expected an image; take it out of --textures"
         ) from None
-    square = min(picture.size)
-    left, top = (picture.width - square) // 2, (picture.height - square) // 2
+    square = min(image.size)
+    left, top = (image.width - square) // 2, (image.height - square) // 2
     extent_m = square * metres_per_pixel
     side = round(TEXELS_PER_RADIUS / RADIUS_FRACTION * frame_pixels / 256)
     box = (left, top, left + square, top + square)
-    texture_HW3 = np.asarray(picture.resize((side, side), Image.Resampling.BICUBIC, box=box))
+    texture_HW3 = np.asarray(image.resize((side, side), Image.Resampling.BICUBIC, box=box))
     grass_HW, trees_HW = _vegetation(texture_HW3.astype(np.float32))
     return World(
         texture_HW3=texture_HW3,
-        height_HW=_read_heights(path, picture.size, box, side),
+        height_HW=_read_heights(path, image.size, box, side),
         metres_per_pixel=extent_m / side,
         target_radius_m=RADIUS_FRACTION * extent_m,
         grass_HW=(grass_HW * 255).astype(np.uint8),
@@ -123,8 +123,10 @@ def _read_heights(
         )
     across, down = heights.shape[1] / size[0], heights.shape[0] / size[1]
     cut = (box[0] * across, box[1] * down, box[2] * across, box[3] * down)
-    whole = Image.fromarray(np.maximum(heights, 0).astype(np.float32))
-    return np.asarray(whole.resize((side, side), Image.Resampling.NEAREST, box=cut), np.float32)
+    heights_image = Image.fromarray(np.maximum(heights, 0).astype(np.float32))
+    return np.asarray(
+        heights_image.resize((side, side), Image.Resampling.NEAREST, box=cut), np.float32
+    )
 
 
 def _vegetation(colour_HW3: FloatMap) -> tuple[FloatMap, FloatMap]:

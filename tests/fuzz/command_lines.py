@@ -81,8 +81,7 @@ INSIDE = [
     "x" * 300,
     "loop",
 ]
-"""Where output may go: never to a place that would survive the test, nor to the storage of another
-process."""
+"""Valid outputs: none that would survive the test, none in another process's storage."""
 
 # inputs, outputs, numbers, texts
 JOBS: dict[str, tuple[list[str], list[str], list[str], list[str]]] = {

@@ -113,7 +113,7 @@ VALUES: list[Any] = [
     "1",
     *NAMES,
 ]
-"Whatever JSON can say in place of something else."
+"JSON values to put in another's position."
 
 numbers = st.sampled_from(TEXTS) | st.floats().map(str) | st.integers().map(str)
 names = st.sampled_from(NAMES) | st.text(max_size=12)
@@ -156,7 +156,7 @@ def damaged(draw: st.DrawFn, data: bytes, most: int = 6, head: int = 0) -> bytes
 
 @st.composite
 def twisted(draw: st.DrawFn, value: Any, most: int = 3) -> Any:
-    """A JSON value of which one to `most` nodes are replaced, taken away, doubled or renamed."""
+    """A JSON value with one to `most` nodes replaced, removed, duplicated or renamed."""
     for _ in range(draw(st.integers(1, most))):
         value = _twist(draw, value)
     return value

@@ -1,4 +1,4 @@
-"""EXIF, XMP and KML from anybody: tags, or a sentence why not."""
+"""EXIF, XMP and KML from anywhere: tags, or a sentence why there are none."""
 
 import io
 import struct

@@ -1,5 +1,6 @@
-"""Images from anybody: a size or pixels, or a reason that can be counted. Nothing is started, and
-no size is believed.
+"""Images from anywhere: a size or pixels, or a reason that can be counted.
+
+No other program is started, and no size is trusted.
 """
 
 import io
@@ -40,7 +41,7 @@ MODES = ["RGB", "L", "RGBA", "P", "CMYK", "I;16", "I", "F", "1", "LA", "YCbCr", 
 
 
 @cache
-def picture(form: str, mode: str, frames: int = 1) -> bytes:
+def encoded_image(form: str, mode: str, frames: int = 1) -> bytes:
     """A small image; empty where that format has no such mode."""
     stream = io.BytesIO()
     image = Image.effect_noise((24, 16), 40).convert("RGB")
@@ -81,7 +82,7 @@ def judge(data: bytes) -> None:
 def test_image_of_any_format_and_damage_is_bounded(
     data: st.DataObject, form: str, mode: str, frames: int, is_intact: bool
 ) -> None:
-    content = picture(form, mode, frames)
+    content = encoded_image(form, mode, frames)
     if content:
         judge(content if is_intact else data.draw(damaged(content, head=64)))
 
@@ -122,12 +123,12 @@ def bombs() -> dict[str, bytes]:
     chunk = struct.pack(">I", len(text) + 23) + chunk[4:] + struct.pack(">I", zlib.crc32(chunk[4:]))
     itxt = b"iTXtXML:com.adobe.xmp\0\1\0\0\0" + text
     itxt = struct.pack(">I", len(itxt) - 4) + itxt + struct.pack(">I", zlib.crc32(itxt))
-    jpeg = bytearray(picture("JPEG", "RGB"))
+    jpeg = bytearray(encoded_image("JPEG", "RGB"))
     at = jpeg.find(b"\xff\xc0")
     jpeg[at + 5 : at + 9] = b"\xff\xff\xff\xff"
-    gif = bytearray(picture("GIF", "P"))
+    gif = bytearray(encoded_image("GIF", "P"))
     gif[6:10] = b"\xff\xff\xff\xff"
-    bmp = bytearray(picture("BMP", "RGB"))
+    bmp = bytearray(encoded_image("BMP", "RGB"))
     bmp[18:26] = struct.pack("<ii", 2**31 - 1, -(2**31))
     return {
         "png of pixels": png(30_000, 30_000, data=zeros),
@@ -140,8 +141,8 @@ def bombs() -> dict[str, bytes]:
         "bmp": bytes(bmp),
         "ppm": b"P6 99999 99999 255\n",
         "ppm of digits": b"P3 " + b"9" * 100_000 + b" 1 255\n",
-        "jpeg behind a png": picture("PNG", "RGB") + picture("JPEG", "RGB"),
-        "zip behind a jpeg": picture("JPEG", "RGB") + b"PK\3\4" + bytes(99),
+        "jpeg behind a png": encoded_image("PNG", "RGB") + encoded_image("JPEG", "RGB"),
+        "zip behind a jpeg": encoded_image("JPEG", "RGB") + b"PK\3\4" + bytes(99),
         "script behind a gif": b"GIF89a=1;alert(1)//" + bytes(30),
         "svg": b"<svg xmlns='http://www.w3.org/2000/svg'><image href='file:///etc/passwd'/></svg>",
     }
@@ -157,8 +158,8 @@ def test_decompression_bomb_is_rejected_or_small(name: str) -> None:
     "form", ["EPS", "ICNS", "ICO", "PCX", "SGI", "DDS", "TGA", "JPEG2000", "PDF"]
 )
 def test_only_known_image_formats_are_opened(form: str) -> None:
-    """Others have decoders that nobody here needs: that of EPS is a program, Ghostscript."""
-    content = picture(form, "RGB")
+    """Other formats have decoders that the project does not need: EPS starts Ghostscript."""
+    content = encoded_image(form, "RGB")
     assert content
     with pytest.raises(DecodeError, match="not an image"):
         decode(content)

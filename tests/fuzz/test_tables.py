@@ -155,8 +155,7 @@ ARROW = [
 def test_parquet_of_any_types_is_read_or_rejected(
     folder: Path, columns: dict[str, tuple[Any, bytes]], data: st.DataObject
 ) -> None:
-    """Columns of types that nobody would choose, with whatever these bytes mean as one: dates of
-    the year 30,000, text in no encoding."""
+    """Columns of unusual types with arbitrary bytes: dates of the year 30,000, invalid UTF-8."""
     arrays: dict[str, Any] = {"path": pa.array(["a.jpg", "b.jpg"])}
     for name, (kind, raw) in columns.items():
         buffer = pa.py_buffer(raw)

@@ -200,9 +200,7 @@ def test_pickled_code_is_not_executed(protocol: int, tmp_path: Path) -> None:
 
 
 def laughs() -> bytes:
-    """Lists of ten times the same list, forty deep: small as a pickle, and without end for whoever
-    walks it.
-    """
+    """Lists of ten times the same list, forty deep: small as a pickle, endless for a reader."""
     value: Any = ["ha"]
     for _ in range(40):
         value = [value] * 10

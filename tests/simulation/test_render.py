@@ -139,7 +139,7 @@ def test_shaded_ground_and_shaded_walls_are_darker() -> None:
     lit = light_world(world(tower=(0, 15, 3)), day).colour_HW3.mean(axis=2)
     assert lit[SIDE // 2 - 16, SIDE // 2] < 0.7 * lit[SIDE // 2 + 16, SIDE // 2]
     made = world(tower=(0, 15, 3))
-    made.facing_HW[:] = np.pi  # both walls are said to face south
+    made.facing_HW[:] = np.pi  # both walls face south
     sunny = prepare_scene(made, day)
     made.facing_HW[:] = 0
     shady = prepare_scene(made, day)

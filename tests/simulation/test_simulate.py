@@ -91,8 +91,8 @@ def test_simulate_writes_university1652_same_bytes_on_ray(
         ]
     one = (root / f"test/query_drone/{query[0]}/image-02.jpeg").read_bytes()
     assert one == (root / f"test/gallery_drone/{query[0]}/image-02.jpeg").read_bytes()
-    with Image.open(root / f"train/satellite/{train[0]}/{train[0]}.jpg") as picture:
-        assert (picture.size, picture.format) == ((32, 32), "JPEG")
+    with Image.open(root / f"train/satellite/{train[0]}/{train[0]}.jpg") as image:
+        assert (image.size, image.format) == ((32, 32), "JPEG")
     assert not (root / ".parts").exists()
 
 
