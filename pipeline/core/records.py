@@ -64,6 +64,8 @@ class ImageRecord:
     "When, ISO 8601; without an offset it is the camera's own clock."
     bytes: int | None = None
     "Size of the file; None if the image is a part of one."
+    unreadable_tags: str = ""
+    "Tags of the file that could not be read, as sentences; the record does without them."
 
     @property
     def key(self) -> str:

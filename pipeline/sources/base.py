@@ -47,9 +47,11 @@ class Source(ABC):
 
 def scan_images(source: Source, root: str) -> Iterator[ImageRecord | Rejection]:
     """The images that a source finds. At the end the terminal shows how many there were, how many
-    of them with a position, and what was passed over and refused, by reason.
+    of them with a position and with tags that could not be read, and what was passed over and
+    refused, by reason.
     """
-    images = positions = 0
+    images = positions = unreadable = 0
+    example = ""
     refused: Counter[str] = Counter()
     skipped: Counter[str] = Counter()
     for found in source.scan(root):
@@ -61,8 +63,13 @@ def scan_images(source: Source, root: str) -> Iterator[ImageRecord | Rejection]:
         else:
             images += 1
             positions += found.geotag is not None
+            if found.unreadable_tags:
+                unreadable += 1
+                example = example or f"{found.name}: {found.unreadable_tags}"
         yield found
     line = f"{root}: {images:,} images found, {positions:,} with a position"
+    if unreadable:
+        line += f"; {unreadable:,} with tags that could not be read (such as {example})"
     for name, counts in (("passed over", skipped), ("refused", refused)):
         if counts:
             line += f"; {counts.total():,} {name} ({by_reason(counts)})"

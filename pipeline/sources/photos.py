@@ -104,6 +104,7 @@ class Photos(Source):
             geotag=geotag_of_photo(tags, self.project),
             taken_at=tags.taken_at,
             bytes=size,
+            unreadable_tags="; ".join(tags.ignored),
         )
 
 

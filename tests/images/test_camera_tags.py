@@ -187,7 +187,8 @@ def test_metadata_is_found_in_every_format_that_carries_it() -> None:
         if kind == "TIFF":
             image.save(stream, kind, **options)  # type: ignore[arg-type]
         else:
-            image.save(stream, kind, exif=EXIF_HEADER + exif(PARIS), **options)  # type: ignore[arg-type]
+            block = EXIF_HEADER + exif(PARIS)
+            image.save(stream, kind, exif=block, **options)  # type: ignore[arg-type]
         tags = read_tags(find_metadata(stream.getvalue(), complete=True))
         assert tags.height_m == 50.1, kind
         assert kind == "TIFF" or tags.position == pytest.approx((48.8582222, 2.2945)), kind

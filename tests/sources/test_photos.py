@@ -253,3 +253,19 @@ def test_photo_orientation_is_applied_by_decoding(tmp_path: Path) -> None:
     assert upright.shape == (32, 16, 3)
     assert upright[4, 8, 0] > 200, "red on top"
     assert upright[28, 8, 2] > 200, "blue below"
+
+
+def test_unreadable_tags_are_counted_with_an_example(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photo(tmp_path / "a.jpg", HERE, xmp=FLOWN[:-30])
+    photo(tmp_path / "b.jpg", HERE, xmp=FLOWN)
+    [first, second] = scan_images(Photos(), str(tmp_path))
+    assert isinstance(first, ImageRecord)
+    assert isinstance(second, ImageRecord)
+    assert first.geotag is not None
+    assert (first.geotag.lat, first.geotag.altitude_m) == (-33.5, None)
+    assert not second.unreadable_tags
+    summary = capsys.readouterr().err
+    assert "; 1 with tags that could not be read (such as " in summary
+    assert f"{tmp_path}/a.jpg: XMP that is not XML" in summary
