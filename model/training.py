@@ -281,7 +281,9 @@ def gradient_norm(module: nn.Module) -> Tensor:
 def _to_device(module: Module, device: torch.device, sync_bn: bool) -> Module:
     if sync_bn:
         module = nn.SyncBatchNorm.convert_sync_batchnorm(module)  # type: ignore[no-untyped-call]
-    placed: Module = module.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    placed: Module = module.to(  # type: ignore[call-overload]
+        device, memory_format=torch.channels_last
+    )
     return placed
 
 

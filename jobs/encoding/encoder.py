@@ -7,6 +7,7 @@ EncoderSpec, with the fingerprint and the encoding that the feature table record
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 import torch
 
@@ -28,6 +29,9 @@ from pipeline.features.encoding import EncodingConfig
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.images.transforms import preprocessing_name
 from pipeline.shards.shard_set import open_or_scan
+
+COMPILED: dict[Compiling, bool | Literal["auto"]] = {"auto": "auto", "always": True, "never": False}
+"`compiled` of `optimise_encoder` by the setting."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +67,7 @@ class WorkerEncoder:
             batch_size=recipe.batch_size,
             precision=recipe.encoding.precision,
             mirror=recipe.encoding.mirror,
-            compiled={"auto": "auto", "always": True, "never": False}[recipe.compiling],  # type: ignore[arg-type]
+            compiled=COMPILED[recipe.compiling],
             images=recipe.images,
             calibration_B3HW=None if calibration is None else torch.from_numpy(calibration),
             log=self.remarks.append,

@@ -77,7 +77,9 @@ class PhotoEncoder:
         "What the check of the encoder found."
         device = "cuda" if torch.cuda.is_available() else "cpu"
         probe_B3HW, calibration_B3HW = _check_images(encoding, self.image_size, shards, device)
-        encoder = build_encoder(opened).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        encoder = build_encoder(opened).to(  # type: ignore[call-overload]
+            device, memory_format=torch.channels_last
+        )
         self._encode = optimise_encoder(
             encoder,
             probe_B3HW=torch.from_numpy(probe_B3HW),

@@ -39,7 +39,8 @@ def checkpoint(tiny_shards: str) -> bytes:
 
 
 def settings_of(shards: str, **changes: object) -> EmbeddingSettings:
-    return EmbeddingSettings(**({"shards": shards, "out": "none"} | changes))  # type: ignore[arg-type]
+    given = {"shards": shards, "out": "none"} | changes
+    return EmbeddingSettings(**given)  # type: ignore[arg-type]
 
 
 def images_of(embedding: EmbeddingSettings, size: int, resizer: Resizer, count: int) -> ImageBytes:
@@ -70,7 +71,8 @@ def test_worker_encoder_agrees_with_the_plain_encoder(tiny_shards: str, checkpoi
     images = images_of(settings_of(tiny_shards), 64, "torch", 5)
     plain = embed(build_encoder(loads(checkpoint)), torch.from_numpy(images)).numpy()
     assert np.abs(encoder(images) - plain).max() < 1e-4
-    assert "folded encoder in float32: cosine with the plain one 1.0" in encoder.remarks[-1]  # type: ignore[attr-defined]
+    last = encoder.remarks[-1]  # type: ignore[attr-defined]
+    assert "folded encoder in float32: cosine with the plain one 1.0" in last
 
 
 def test_fingerprint_covers_the_encoding(tiny_shards: str, checkpoint: bytes) -> None:

@@ -87,7 +87,7 @@ def test_import_lpn_records_its_source(tmp_path: Path, capsys: pytest.CaptureFix
     said = capsys.readouterr().err
     assert "model_2 is left out" in said
     assert "stride 1 and average pooling" in said
-    assert "ours.pt: ResNet-18, 4 rings of 24 numbers, 128 px, 5 locations" in said
+    assert "ours.pt: resnet18, 4 rings of 24 numbers, 128 px, 5 locations" in said
 
 
 def test_import_lpn_variants_of_backbones_are_equal(
@@ -150,7 +150,7 @@ REFUSED: dict[str, tuple[Callable[[State], State], str]] = {
     ),
     "no backbone": (
         lambda state: without(state, "model"),
-        r"is of no ResNet that we build: conv1\.weight is missing",
+        r"is of no backbone that we build: conv1\.weight is missing",
     ),
     "no refinement": (
         lambda state: without(state, "classifier0.add_block"),
