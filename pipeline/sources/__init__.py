@@ -26,8 +26,8 @@ SOURCES: dict[str, str] = {
     "xyz": "pipeline.sources.xyz:Xyz",
     "table": "pipeline.sources.table:Table",
 }
-"""Module and class by the name that `--source` takes; a new source is one file and one line. A module
-is imported when it is named: some of them import rasterio, PROJ or Arrow."""
+"""Module and class by the name that `--source` takes; a new source is one file and one line. A
+module is imported when it is named: some of them import rasterio, PROJ or Arrow."""
 
 
 def source_class(name: str) -> type[Source]:

@@ -150,3 +150,17 @@ def test_parse_line_with_letters_in_either_order(lat: float, lon: float, swapped
 def test_parse_line_latitude_beyond_pole_is_unreadable() -> None:
     with pytest.raises(Unreadable, match="latitude 95 is not between"):
         parse_line("a/1/H80.tif 95 12 3")
+
+
+def test_denseuav_lines_that_contradict_each_other_give_none(tmp_path: Path) -> None:
+    root = miniature(tmp_path)
+    (root / "Dense_GPS_ALL.txt").write_text(
+        "train/drone/000001/H90.JPG E120.388 N30.43 104.5\n"
+        "train/satellite/000001/H80.tif E120.387 N30.32 94.6\n"
+    )
+    records, refused = scanned(root)
+    assert [(Path(r.path).name, r.found[:8]) for r in refused] == [
+        ("Dense_GPS_ALL.txt", "line 1: ")
+    ]
+    assert records["train/drone/000001/H90.JPG"].geotag is None
+    assert records["train/satellite/000001/H80.tif"].geotag is not None

@@ -95,3 +95,123 @@ def test_geojson_malformed_features_miss_a_path(tmp_path: Path) -> None:
         isinstance(found, Rejection) and found.reason == "missing path" for found in (first, second)
     )
     assert isinstance(third, ImageRecord)
+
+
+FIJI = [[179.999, -16.801], [-179.999, -16.801], [-179.999, -16.799], [179.999, -16.799]]
+BEYOND = [[179.999, -16.801], [180.001, -16.801], [180.001, -16.799], [179.999, -16.799]]
+BEFORE = [[-180.001, -16.801], [-179.999, -16.801], [-179.999, -16.799], [-180.001, -16.799]]
+
+
+def closed(ring: list[list[float]]) -> list[list[float]]:
+    return [*ring, ring[0]]
+
+
+def halves(west: float, east: float) -> list[Any]:
+    """FIJI cut at the date line, as RFC 7946 asks."""
+    return [
+        [closed([[179.999, -16.801], [west, -16.801], [west, -16.799], [179.999, -16.799]])],
+        [closed([[east, -16.801], [-179.999, -16.801], [-179.999, -16.799], [east, -16.799]])],
+    ]
+
+
+@pytest.mark.parametrize(
+    "geometry",
+    [
+        {"type": "Polygon", "coordinates": [closed(FIJI)]},
+        {"type": "Polygon", "coordinates": [closed(FIJI)[::-1]]},
+        {"type": "Polygon", "coordinates": [closed(BEYOND)]},
+        {"type": "Polygon", "coordinates": [closed(BEFORE)]},
+        {"type": "MultiPolygon", "coordinates": [[closed(FIJI)]]},
+        {"type": "MultiPolygon", "coordinates": halves(180.0, -180.0)},
+        {"type": "MultiPolygon", "coordinates": halves(180.0, -180.0)[::-1]},
+    ],
+)
+def test_geojson_polygon_over_the_date_line_keeps_its_position(
+    tmp_path: Path, geometry: Any
+) -> None:
+    images(tmp_path, "1.jpg")
+    tag = only(scan(geojson(tmp_path / "t.geojson", (geometry, {"path": "1.jpg"})))).geotag
+    assert tag is not None
+    assert tag.lat == pytest.approx(-16.8, abs=1e-6)
+    assert abs(tag.lon) == pytest.approx(180, abs=1e-6)
+    expected = ((-16.799, 179.999), (-16.799, -179.999), (-16.801, -179.999), (-16.801, 179.999))
+    assert tag.footprint is not None
+    for corner, other in zip(tag.footprint, expected, strict=True):
+        assert corner == pytest.approx(other, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("geometry", "found"),
+    [
+        (
+            {"type": "MultiPolygon", "coordinates": [[SQUARE], [closed(FIJI)]]},
+            "MultiPolygon of 2 separate parts, expected one",
+        ),
+        ({"type": "MultiPolygon", "coordinates": []}, "MultiPolygon without a part"),
+        ({"type": "MultiPoint", "coordinates": [[8, 47], [9, 47]]}, "MultiPoint of 2 points"),
+        (
+            {"type": "Polygon", "coordinates": [[[-180, 80], [-60, 80], [60, 80], [-180, 80]]]},
+            "Polygon around a pole",
+        ),
+        (
+            {
+                "type": "Polygon",
+                "coordinates": [closed([[-180, -85], [180, -85], [180, 85], [-180, 85]])],
+            },
+            "Polygon around the whole Earth",
+        ),
+        ({"type": "Point", "coordinates": [500, 1]}, "Point with a longitude of 500"),
+    ],
+)
+def test_geojson_shapes_without_one_position_are_refused(
+    tmp_path: Path, geometry: Any, found: str
+) -> None:
+    images(tmp_path, "1.jpg")
+    [refused] = scan(geojson(tmp_path / "t.geojson", (geometry, {"path": "1.jpg"})))
+    assert isinstance(refused, Rejection)
+    assert refused.found.startswith(f"row 1: {found}")
+
+
+def test_geojson_corners_in_a_crossed_order_are_one_footprint(tmp_path: Path) -> None:
+    images(tmp_path, "1.jpg")
+    crossed = [SQUARE[0], SQUARE[2], SQUARE[1], SQUARE[3], SQUARE[0]]
+    tags = [
+        only(
+            scan(
+                geojson(
+                    tmp_path / "t.geojson",
+                    ({"type": "Polygon", "coordinates": [ring]}, {"path": "1.jpg"}),
+                )
+            )
+        ).geotag
+        for ring in (SQUARE, crossed)
+    ]
+    assert tags[0] is not None
+    assert tags[1] is not None
+    assert tags[0].footprint == tags[1].footprint
+    assert (tags[1].lat, tags[1].lon) == pytest.approx((tags[0].lat, tags[0].lon))
+
+
+@pytest.mark.parametrize(
+    ("geometry", "columns", "agree"),
+    [
+        ({"type": "Point", "coordinates": [8.25, 47.5]}, {"lat": 47.5003, "lon": 8.2502}, True),
+        ({"type": "Point", "coordinates": [8.25, 47.5]}, {"lat": 8.25, "lon": 47.5}, False),
+        ({"type": "Point", "coordinates": [8.25, 47.5]}, {"lat": -47.5, "lon": 8.25}, False),
+        ({"type": "Point", "coordinates": [8.25, 47.5]}, {"lat": "NA", "lon": "NA"}, True),
+        ({"type": "Point", "coordinates": [8.25, 47.5]}, {"lat": "north", "lon": 8.25}, True),
+        ({"type": "Polygon", "coordinates": [SQUARE]}, {"lat": 47.02, "lon": 8.12}, True),
+        ({"type": "Polygon", "coordinates": [SQUARE]}, {"lat": 47.05, "lon": -8.1}, False),
+    ],
+)
+def test_geojson_geometry_is_compared_with_lat_and_lon(
+    tmp_path: Path, geometry: Any, columns: dict[str, Any], agree: bool
+) -> None:
+    images(tmp_path, "1.jpg")
+    [found] = scan(geojson(tmp_path / "t.geojson", (geometry, {"path": "1.jpg"} | columns)))
+    if agree:
+        assert isinstance(found, ImageRecord)
+        assert found.geotag is not None
+    else:
+        assert isinstance(found, Rejection)
+        assert found.reason == "contradicting positions"

@@ -34,6 +34,7 @@ def town(path: Path, row: int, **metadata: str) -> str:
         (FROM_NORTH, {"tile_row_type": "osm"}),
         (FROM_NORTH, {"tile_row_type": "XYZ"}),
         (FROM_NORTH, {"scheme": "xyz", "bounds": "-180,-85,180,85"}),
+        (FROM_NORTH, {"bounds": "47.3737,8.5390,47.3779,8.5446"}),  # latitude first
         (FROM_SOUTH, {"bounds": "0,0,0,0"}),
         (FROM_SOUTH, {"bounds": "nowhere"}),
     ],

@@ -249,3 +249,48 @@ def test_table_missing_file_and_folder_are_refused(tmp_path: Path) -> None:
         scan(tmp_path / "t.csv")
     with pytest.raises(InputError, match="is a folder, expected a table of images"):
         scan(tmp_path)
+
+
+def test_csv_words_for_missing_values_are_empty_cells(tmp_path: Path) -> None:
+    images(tmp_path, *(f"{number}.jpg" for number in range(12)))
+    words = ["NA", "N/A", "null", "NULL", "None", "#N/A", "<NA>", "nil", "NaT", "-nan", "", " "]
+    rows = [f"{number}.jpg,{word},{word},{word},{word}" for number, word in enumerate(words)]
+    text = "\n".join(["path,location,lat,lon,altitude_m", *rows, ",,,,", " , ,,,", ""])
+    found = scan(tmp_path / "t.csv", text)
+    assert len(found) == 12
+    for number, record in enumerate(found):
+        assert isinstance(record, ImageRecord), record
+        assert (record.location, record.geotag) == (str(number), None)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "path,lat,lon,\n1.jpg,47.5,8.25,\n",
+        "path,lat,lon,,\n1.jpg,47.5,8.25\n",
+        "path,lat,lon\n1.jpg,47.5,8.25,,\n",
+        "sep=;\npath;lat;lon\n1.jpg;47,5;8,25\n",
+        '"sep=,"\r\npath,lat,lon\r\n1.jpg,47.5,8.25\r\n',
+        "sep=\t\npath\tlat\tlon\n1.jpg\t47.5\t8.25\n",
+    ],
+)
+def test_csv_as_spreadsheets_write_it(tmp_path: Path, text: str) -> None:
+    images(tmp_path, "1.jpg")
+    assert only(scan(tmp_path / "t.csv", text)).geotag == GeoTag(lat=47.5, lon=8.25)
+
+
+def test_csv_rows_with_other_separators_are_refused(tmp_path: Path) -> None:
+    images(tmp_path, "1.jpg", "2.jpg")
+    found = scan(tmp_path / "t.csv", "path,lat,lon\n1.jpg,47.5,8.25\n2.jpg,47.5,8.25,\n")
+    assert isinstance(found[1], Rejection)
+    assert found[1].reason == "wrong number of cells"
+
+
+def test_table_whole_numbers_that_became_floats_are_labels(tmp_path: Path) -> None:
+    images(tmp_path, "1.jpg", "2.jpg", "3.jpg")
+    frame = pd.DataFrame({"path": ["1.jpg", "2.jpg", "3.jpg"], "location": [12, None, 1.5]})
+    frame.to_csv(tmp_path / "t.csv", index=False)
+    frame.to_parquet(tmp_path / "t.parquet")
+    for name in ("t.csv", "t.parquet"):
+        found = scan(tmp_path / name)
+        assert [one.location for one in found if isinstance(one, ImageRecord)] == ["12", "2", "1.5"]

@@ -14,9 +14,9 @@ from pipeline.sources.text_tables import Unreadable
 from pipeline.sources.university1652 import University1652
 
 KML = """<?xml version="1.0" encoding="UTF-8"?>
-<kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2"><Document><Placemark>
-<name>0839</name>
-<LookAt><longitude>-1.5</longitude><latitude>53.5</latitude><altitude>0</altitude><range>500</range></LookAt>
+<kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2">
+<Document><Placemark><name>0839</name>
+<LookAt><longitude>-1.5</longitude><latitude>53.5</latitude><altitude>0</altitude></LookAt>
 <Point><coordinates>
   -1.25,53.75,0 </coordinates></Point></Placemark></Document></kml>"""
 
@@ -109,7 +109,8 @@ def test_pose_tables_give_positions_and_poses(tmp_path: Path) -> None:
     root = miniature(tmp_path)
     (root / "locations.csv").write_text("location,lat,lon\n0839,53.75,-1.25\n0840,1,2\n")
     (root / "poses.csv").write_text(
-        "path,location,altitude_m,heading_deg,pitch_deg\ntrain/drone/0839/image-01.jpeg,0839,120.5,90,-45\n"
+        "path,location,altitude_m,heading_deg,pitch_deg\n"
+        "train/drone/0839/image-01.jpeg,0839,120.5,90,-45\n"
     )
     records, refused = scanned(root)
     assert not refused
@@ -174,3 +175,45 @@ def test_university1652_is_read_from_other_storage() -> None:
     memory.pipe("/u1652/kml/0839.kml", KML.encode())
     found = list(University1652(kml="memory://u1652/kml").scan("memory://u1652/root"))
     assert [f.geotag for f in found if isinstance(f, ImageRecord)] == [GeoTag(lat=53.75, lon=-1.25)]
+
+
+@pytest.mark.parametrize(
+    ("shape", "position"),
+    [
+        ("<Point><coordinates>-1.25, 53.75, 0</coordinates></Point>", (53.75, -1.25)),
+        ("<Point><coordinates>\n-1.25 ,53.75 ,0\n</coordinates></Point>", (53.75, -1.25)),
+        (
+            "<Polygon><outerBoundaryIs><LinearRing><coordinates>8,47 8.2,47 8.2,47.1 8,47.1 8,47"
+            "</coordinates></LinearRing></outerBoundaryIs></Polygon>",
+            (47.05, 8.1),
+        ),
+        (
+            "<Polygon><coordinates>179.9,-17 -179.7,-17 -179.7,-16.9 179.9,-16.9 179.9,-17"
+            "</coordinates></Polygon>",
+            (-16.95, -179.9),
+        ),
+    ],
+)
+def test_parse_kml_shapes_have_their_middle(shape: str, position: tuple[float, float]) -> None:
+    found = parse_kml(f"<kml><Placemark>{shape}</Placemark></kml>".encode())
+    assert found == pytest.approx(position, abs=1e-9)
+
+
+def test_parse_kml_points_far_apart_are_refused() -> None:
+    two = (
+        "<Point><coordinates>8,47</coordinates></Point><Point><coordinates>{}</coordinates></Point>"
+    )
+    assert parse_kml(f"<kml>{two.format('8.001,47')}</kml>".encode()) == (47, 8)
+    with pytest.raises(Unreadable, match=r"2 points up to 111,\d+ m apart, expected one"):
+        parse_kml(f"<kml>{two.format('8,48')}</kml>".encode())
+
+
+def test_positions_that_contradict_each_other_give_none(tmp_path: Path) -> None:
+    (miniature(tmp_path / "root") / "locations.csv").write_text(
+        "location,lat,lon\n0839,-53.75,-1.25\n0840,53.75,-1.25\n"
+    )
+    records, refused = with_kml(tmp_path, {"0839.kml": KML, "0840.kml": KML})
+    assert [(Path(r.path).name, r.reason) for r in refused] == [("0839.kml", "unreadable tag")]
+    assert "m away, at -53.75, -1.25, elsewhere; it has no position now" in refused[0].found
+    assert records["train-drone-0839-image-01"].geotag is None
+    assert records["train-drone-0840-image-01"].geotag == GeoTag(lat=53.75, lon=-1.25)

@@ -56,8 +56,8 @@ def parse_metadata(source: str, values: Mapping[str, Any]) -> TileMetadata:
     rows: Rows = next((ROW_WORDS[word] for word in words if word in ROW_WORDS), "auto")
     found = values.get("bounds")
     parts = found.split(",") if isinstance(found, str) else found
-    bounds = _bounds(parts) if isinstance(parts, list) else None
-    return TileMetadata(source=source, rows=rows, bounds=() if bounds is None else (bounds,))
+    bounds = _readings(parts) if isinstance(parts, list) else ()
+    return TileMetadata(source=source, rows=rows, bounds=bounds)
 
 
 def check_grid(source: str, key: str, stated: str) -> None:
@@ -181,15 +181,21 @@ def _tile_map(path: str) -> TileMetadata:
         check_grid(path, "profile", element.get("profile", ""))
     for element in elements(root, "SRS"):
         check_grid(path, "SRS", (element.text or "").strip())
-    bounds: list[Bounds] = []
+    bounds: tuple[Bounds, ...] = ()
     for element in elements(root, "BoundingBox"):
-        values = [element.get(name) for name in ("minx", "miny", "maxx", "maxy")]
-        # Early gdal2tiles wrote latitudes as x.
-        for order in ((0, 1, 2, 3), (1, 0, 3, 2)):
-            box = _bounds([values[at] for at in order])
-            if box is not None:
-                bounds.append(box)
-    return TileMetadata(source=path, rows="south", bounds=tuple(bounds))
+        bounds += _readings([element.get(name) for name in ("minx", "miny", "maxx", "maxy")])
+    return TileMetadata(source=path, rows="south", bounds=bounds)
+
+
+def _readings(values: list[Any]) -> tuple[Bounds, ...]:
+    """Bounds by either order of coordinates: early gdal2tiles wrote latitudes as x, and users of
+    go-tilepacks give them so.
+    """
+    if len(values) != 4:
+        return ()
+    west, south, east, north = values
+    boxes = (_bounds([west, south, east, north]), _bounds([south, west, north, east]))
+    return tuple(box for box in boxes if box is not None)
 
 
 def _bounds(values: list[Any]) -> Bounds | None:
