@@ -122,7 +122,10 @@ def test_table_zero_zero_is_no_position(tmp_path: Path) -> None:
 
 def test_table_paths_may_be_absolute_or_uris(tmp_path: Path) -> None:
     images(tmp_path, "1.jpg")
-    text = f"path\n{tmp_path}/1.jpg\nfile://{tmp_path}/1.jpg\nmemory://bucket/2.jpg\nfile://{tmp_path}/3.jpg\nnul\0.jpg\n"
+    text = (
+        f"path\n{tmp_path}/1.jpg\nfile://{tmp_path}/1.jpg\nmemory://bucket/2.jpg\n"
+        f"file://{tmp_path}/3.jpg\nnul\0.jpg\n"
+    )
     (tmp_path / "sub").mkdir()
     found = scan(tmp_path / "sub/t.csv", text)
     assert [f.bytes if isinstance(f, ImageRecord) else f.reason for f in found] == [
