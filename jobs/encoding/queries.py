@@ -17,6 +17,8 @@ from pipeline.core.arrays import Floats
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.progress import progress
 from pipeline.core.records import Rejection
+from pipeline.images.inspect import undecoded_format
+from pipeline.images.optional_formats import convert_optional
 from pipeline.locate.photo_files import parent_folder, read_taken_at
 
 READ_BATCH = 128
@@ -48,7 +50,7 @@ def encode_photos(photos: Sequence[str], encoder: PhotoEncoder) -> list[Query]:
             contents = [b"" if isinstance(data, Rejection) else data for data in read]
             embeddings_QD, undecodable = encoder.encode(contents, names)
             rejected = [
-                one if isinstance(one, Rejection) else two
+                one if isinstance(one, Rejection) else _by_name(two)
                 for one, two in zip(read, undecodable, strict=True)
             ]
             rows = iter(embeddings_QD)
@@ -68,9 +70,17 @@ def encode_photos(photos: Sequence[str], encoder: PhotoEncoder) -> list[Query]:
 
 def _read(photo: str) -> bytes | Rejection:
     try:
-        return storage.read_bytes(photo)
+        data = storage.read_bytes(photo)
     except OSError as error:
         return Rejection(path=photo, reason="unreadable file", found=str(error))
+    return convert_optional(photo, data)
+
+
+def _by_name(rejection: Rejection | None) -> Rejection | None:
+    """The rejection; of bytes that are no known image, by the format that the name promises."""
+    if rejection is None or rejection.reason != "not an image":
+        return rejection
+    return undecoded_format(rejection.path) or rejection
 
 
 def merge_by_folder(queries: Sequence[Query]) -> list[Query]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import simplejpeg
 from PIL import Image
 
+from pipeline.core.records import Rejection
 from pipeline.images.decode import (
     PILLOW_FORMATS,
     DecodeError,
@@ -50,6 +51,19 @@ def is_image_name(name: str) -> bool:
 def is_undecoded_image_name(name: str) -> bool:
     """Whether a file is an image of a format that is not decoded here, by its name."""
     return name.lower().endswith(UNDECODED_SUFFIXES)
+
+
+def undecoded_format(path: str) -> Rejection | None:
+    """The rejection of an image whose format, by its name, is not decoded here; else None."""
+    if not is_undecoded_image_name(path):
+        return None
+    name = path.rsplit("/", 1)[-1]
+    ending = name.rpartition(".")[2]
+    return Rejection(
+        path=path,
+        reason=f"format not decoded (.{ending.lower()})",
+        found=f"{name}: {ending.upper()} is not decoded; convert it to JPEG, PNG or TIFF",
+    )
 
 
 def inspect(data: bytes, most_pixels: int = MAX_PIXELS) -> tuple[int, int]:

@@ -7,26 +7,31 @@ a table.
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
+from pipeline.core.progress import console
 from pipeline.images.camera_tags import read_tags
 from pipeline.images.image_blocks import UnreadableTag, find_metadata
-from pipeline.images.inspect import is_image_name
+from pipeline.images.inspect import RAW_SUFFIXES, is_image_name, is_undecoded_image_name
 
 
 def find_photos(paths: Sequence[str]) -> list[str]:
     """The photos named, and those below the folders named, each once, in that order; within a
-    folder by path.
+    folder by path. Photos in formats that may not be decodable (HEIC, DNG) are among them, so that
+    each gets an answer or a reason.
 
-    Raises InputError where a path does not exist, or a folder contains no image.
+    Other files below the folders, and raw copies of photos, are counted on the console. Raises
+    InputError where a path does not exist, or a folder contains no image.
     """
     photos: dict[str, None] = {}
+    skipped: Counter[str] = Counter()
     for path in paths:
         if storage.is_folder(path):
-            names = [name for name in storage.walk(path) if is_image_name(name)]
+            names = list(_images(storage.walk(path), skipped))
             if not names:
                 raise InputError(
                     f"no images below {path}; expected a folder of photos; name another"
@@ -41,7 +46,27 @@ def find_photos(paths: Sequence[str]) -> list[str]:
             "no photo was named, expected one or more photos or folders; name some at the end of "
             "the command"
         )
+    if skipped:
+        reasons = ", ".join(f"{reason}: {count:,}" for reason, count in skipped.most_common())
+        console.print(f"{skipped.total():,} files passed over ({reasons})", markup=False)
     return list(photos)
+
+
+def _images(names: Iterable[str], skipped: Counter[str]) -> Iterator[str]:
+    """The names of images; the others are counted by reason in `skipped`."""
+    names = list(names)
+    stems = {_stem(name) for name in names if is_image_name(name)}
+    for name in names:
+        if name.lower().endswith(RAW_SUFFIXES) and _stem(name) in stems:
+            skipped["raw copy of a photo"] += 1
+        elif is_image_name(name) or is_undecoded_image_name(name):
+            yield name
+        else:
+            skipped["not an image by its name"] += 1
+
+
+def _stem(name: str) -> str:
+    return name.rpartition(".")[0].lower()
 
 
 def parent_folder(photo: str) -> str:

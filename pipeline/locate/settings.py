@@ -1,5 +1,4 @@
-"""The settings of a calibration that belong to this room. Imports nothing heavy, so that the command
-line is parsed at once."""
+"""The criteria of a calibration. Imports nothing heavy: the command line is parsed at once."""
 
 from dataclasses import dataclass
 

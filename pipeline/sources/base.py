@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pipeline.core import storage
 from pipeline.core.progress import console
 from pipeline.core.records import ImageRecord, Rejection, Scanned, SkippedFile
-from pipeline.images.inspect import is_undecoded_image_name
+from pipeline.images.inspect import undecoded_format
 
 MAX_REASONS = 6
 "Reasons that the summary of a scan names, the most common first."
@@ -87,11 +87,10 @@ def not_an_image(path: str) -> Rejection | SkippedFile:
     """A file among images whose name is not one of an image that is read: refused where it is an
     image of another format, else passed over as a companion of images.
     """
+    if rejection := undecoded_format(path):
+        return rejection
     name = path.rsplit("/", 1)[-1]
     ending = f".{name.rpartition('.')[2].lower()}" if "." in name[1:] else ""
-    if is_undecoded_image_name(name):
-        found = f"{name}: {ending[1:].upper()} is not decoded; convert it to JPEG, PNG or TIFF"
-        return Rejection(path=path, reason=f"format not decoded ({ending})", found=found)
     # A long or odd ending is a name with a dot in it, and no kind of file.
     plain = len(ending) <= 6 and ending[1:].isalnum()
     kind = f"companion file {ending}" if plain else "file that is no image by its name"

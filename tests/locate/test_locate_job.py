@@ -13,8 +13,7 @@ from PIL import Image
 
 from jobs.encoding.encoder import encoder_fingerprint
 from jobs.encoding.photo_encoder import PhotoEncoder
-from jobs.stages.locate import locate as main
-from jobs.stages.locate import locate_photos
+from jobs.stages.locate import locate, locate_photos
 from jobs.stages.settings import LocateSettings
 from model.checkpoint import Checkpoint, dumps, loads
 from model.config import PVDAConfig
@@ -24,6 +23,7 @@ from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.geo import Circle
 from pipeline.features.encoding import EncodingConfig
 from pipeline.features.part import PartFooter, PartRows, write_part
+from pipeline.images import optional_formats
 from pipeline.images.transforms import resize
 from pipeline.index.build import build_index
 from pipeline.index.settings import IndexSettings
@@ -31,7 +31,7 @@ from pipeline.locate.calibration import Calibration, write_calibration
 from pipeline.locate.logistic import LogisticModel
 
 LOCATIONS = 12
-STEP = 1e-3  # degrees between places, about 111 m
+STEP = 1e-3  # degrees between locations, about 111 m
 ENCODING = EncodingConfig(mirror=True, resizer="torch", precision="float32")
 
 
@@ -67,7 +67,7 @@ def world(tmp_path: Path, lively_encoder: FeatureEncoder) -> dict[str, str]:
         lons=[8.0] * LOCATIONS,
         embeddings_BD=rows_ND,
     )
-    footer = PartFooter(fingerprint=mark, shard_sha256="s", rows=LOCATIONS)
+    footer = PartFooter(fingerprint=mark, shard_sha256="s", rows=LOCATIONS, encoding=ENCODING)
     write_part(str(tmp_path / "table" / "gallery-satellite-000000.parquet"), rows, footer)
     build_index(IndexSettings(table=str(tmp_path / "table"), out=str(tmp_path / "index")))
     (tmp_path / "photos").mkdir()
@@ -159,7 +159,7 @@ def test_locate_damaged_photo_is_listed_and_incomplete(
 ) -> None:
     (Path(world["photos"]) / "0a.jpg").write_bytes(b"\xff\xd8\xff no image")
     with pytest.raises(Incomplete, match=r"1 of 5 photos could not be decoded: .*out.geojson"):
-        main(settings(world))
+        locate(settings(world))
     features = json.loads(Path(world["out"]).read_text())["features"]
     assert [len(feature["properties"]["rejected"]) for feature in features] == [0, 1, 0, 0, 0]
     assert [feature["geometry"] is None for feature in features] == [
@@ -169,6 +169,20 @@ def test_locate_damaged_photo_is_listed_and_incomplete(
         False,
         False,
     ]
+
+
+def test_locate_undecoded_formats_are_named(
+    world: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(optional_formats, "find_spec", lambda module: None)
+    for name in ("4.HEIC", "5.DNG", "6.avif"):
+        container = b"II*\0" if name == "5.DNG" else b"\0\0\0\x20ftyp" + name[2:].lower().encode()
+        (Path(world["photos"]) / name).write_bytes(container + bytes(99))
+    with pytest.raises(Incomplete, match=r"3 of 7 photos could not be decoded"):
+        locate(settings(world))
+    features = json.loads(Path(world["out"]).read_text())["features"]
+    reasons = [one["reason"] for f in features for one in f["properties"]["rejected"]]
+    assert reasons == [f"format not decoded (.{ending})" for ending in ("heic", "dng", "avif")]
 
 
 def test_locate_unreadable_photo_is_rejected(world: dict[str, str], monkeypatch: Any) -> None:

@@ -26,6 +26,20 @@ def test_find_photos_below_folders_each_once(tmp_path: Path) -> None:
     assert parent_folder("a.jpg") == "."
 
 
+def test_find_photos_counts_files_passed_over(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Undecoded formats stay in the list; a raw file is passed over only beside its own photo."""
+    for name in ("a.jpg", "A.DNG", "b.HEIC", "c.DNG", "track.kml", "Thumbs.db"):
+        (tmp_path / name).write_bytes(b"x")
+    found = find_photos([str(tmp_path)])
+    assert [Path(path).name for path in found] == ["a.jpg", "b.HEIC", "c.DNG"]
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "3 files passed over (" in printed
+    assert "not an image by its name: 2" in printed
+    assert "raw copy of a photo: 1" in printed
+
+
 def test_find_photos_missing_path_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no photo or folder at .*gone.jpg"):
         find_photos([str(tmp_path / "gone.jpg")])

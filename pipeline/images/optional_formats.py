@@ -1,0 +1,77 @@
+"""Photos in formats that only an optional library decodes -> PNG: HEIF of phones, raw files.
+
+In: a file's name and bytes. Out: the bytes of a PNG with the photo's EXIF block, or the Rejection
+that names the format and what to install. Pixels are not changed: PNG is lossless.
+"""
+
+import io
+from importlib.util import find_spec
+from typing import Any
+
+from PIL import Image
+
+from pipeline.core.records import Rejection
+from pipeline.images.decode import DecodeError, decode_errors
+from pipeline.images.inspect import MAX_PIXELS, RAW_SUFFIXES, undecoded_format
+
+HEIF_SUFFIXES = (".heic", ".heif", ".hif")
+EXTRAS = {"heif": (HEIF_SUFFIXES, "pillow_heif"), "raw": (RAW_SUFFIXES, "rawpy")}
+"Extra of this project -> the suffixes of its formats, in lower case, and the module it installs."
+
+COMMON_SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n")
+"JPEG and PNG: phones and converters give such files the name of another format."
+
+
+def extra_for(path: str) -> str | None:
+    """The extra that decodes a file of this name; None where it needs none or there is none."""
+    name = path.lower()
+    return next((extra for extra, (suffixes, _) in EXTRAS.items() if name.endswith(suffixes)), None)
+
+
+def convert_optional(path: str, data: bytes) -> bytes | Rejection:
+    """The bytes of a file that `decode` reads: those given, or a PNG of its photo.
+
+    A raw file is not left to Pillow, which takes its small preview for the photo.
+    """
+    extra = extra_for(path)
+    if extra is None or data.startswith(COMMON_SIGNATURES):
+        return data
+    if find_spec(EXTRAS[extra][1]) is None:
+        rejection = undecoded_format(path)
+        assert rejection is not None
+        found = f"{rejection.found}, or install the extra `{extra}`: pip install pvda[{extra}]"
+        return Rejection(path=path, reason=rejection.reason, found=found)
+    try:
+        with decode_errors(data):
+            return _heif_to_png(data) if extra == "heif" else _raw_to_png(data)
+    except DecodeError as error:
+        return Rejection(path=path, reason=error.reason, found=error.found)
+
+
+def _heif_to_png(data: bytes) -> bytes:
+    import pillow_heif
+
+    opened = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True)
+    _check_size(*opened.size)
+    image = opened.to_pillow()  # upright: libheif applies the orientation
+    return _png(image.convert("RGB"), image.getexif().tobytes() if image.getexif() else None)
+
+
+def _raw_to_png(data: bytes) -> bytes:
+    import rawpy
+
+    with rawpy.imread(io.BytesIO(data)) as raw:
+        _check_size(raw.sizes.width, raw.sizes.height)
+        pixels_HW3 = raw.postprocess(use_camera_wb=True)  # upright
+    return _png(Image.fromarray(pixels_HW3), None)
+
+
+def _check_size(width: int, height: int) -> None:
+    if width * height > MAX_PIXELS:
+        raise DecodeError("too many pixels", f"{width} x {height} pixels, expected {MAX_PIXELS:,}")
+
+
+def _png(image: Any, exif: bytes | None) -> bytes:
+    stream = io.BytesIO()
+    image.save(stream, "PNG", compress_level=1, **({"exif": exif} if exif else {}))
+    return stream.getvalue()
