@@ -86,7 +86,7 @@ def test_schedule_warm_up_grows_by_steps() -> None:
         period=st.integers(1, 200),
         alpha=st.floats(0, 2),
         alpha_step=st.floats(0, 1),
-        shape=st.sampled_from(["step", "cosine"]),
+        lr_schedule=st.sampled_from(["step", "cosine"]),
         restart=st.booleans(),
         warmup_epochs=st.floats(0, 10),
     ),
