@@ -220,7 +220,8 @@ def full_disk() -> Callable[[], None]:
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
                 left[0] -= 1
 
-        setattr(storage, "atomic_file", limited)  # noqa: B010  # mypy will not have a module's function replaced
+        # By its name, for mypy accepts no other value for a module's function.
+        setattr(storage, "atomic_file", limited)  # noqa: B010
 
     return fill
 
