@@ -18,7 +18,7 @@ from tests.batches.conftest import PLAIN, epoch
 # Images that were damaged after packing.
 
 
-def with_damage(shards: str, out: Path, spoilt: Callable[[str], bool]) -> str:
+def with_damage(shards: str, out: Path, damaged: Callable[[str], bool]) -> str:
     """The same set; the images whose member's name says so have lost their pixels."""
     for path in filter(Path.is_file, Path(shards).iterdir()):
         if path.suffix != ".tar":
@@ -29,7 +29,7 @@ def with_damage(shards: str, out: Path, spoilt: Callable[[str], bool]) -> str:
                 stream = old.extractfile(member)
                 assert stream is not None
                 data = stream.read()
-                if member.name.endswith(".png") and spoilt(member.name):
+                if member.name.endswith(".png") and damaged(member.name):
                     data = data[:40] + bytes(len(data) - 40)
                 new.addfile(member, io.BytesIO(data))
     return str(out)
@@ -48,11 +48,11 @@ def test_batch_replaces_a_damaged_image(shards: str, tmp_path: Path) -> None:
         epoch(shards, 2, reading=lively), epoch(broken, 2, reading=lively), strict=True
     ):
         for batch, found in zip(pair, same, strict=True):
-            whole = [place for place, key in enumerate(batch.keys) if not odd(key)]
-            taken = [place if place in whole else whole[0] for place in range(4)]
-            assert found.keys == tuple(batch.keys[place] for place in taken)
+            intact = [position for position, key in enumerate(batch.keys) if not odd(key)]
+            taken = [position if position in intact else intact[0] for position in range(4)]
+            assert found.keys == tuple(batch.keys[position] for position in taken)
             assert found.damaged == tuple(key for key in batch.keys if odd(key))
-            assert found.location_B.tolist() == [batch.location_B[place] for place in taken]
+            assert found.location_B.tolist() == [batch.location_B[position] for position in taken]
             assert np.array_equal(found.images_B3HW, batch.images_B3HW[taken])
             assert batch.damaged == ()
             counted += len(found.damaged)

@@ -1,4 +1,4 @@
-"""Places held out of training: chosen by their names, never streamed, no class of their own."""
+"""Locations held out of training: chosen by name, never streamed, without a class."""
 
 from dataclasses import replace
 

@@ -27,8 +27,8 @@ def test_decode_samples_keeps_order_and_returns_errors(shards: str, tmp_path: Pa
                 member.size -= 30
             new.addfile(member, stream)
     found = list(decode_samples(read_samples(str(tmp_path / "x.tar")), 8, threads=2, depth=4))
-    assert [held.key for held, _ in found] == [
-        held.key for held in read_samples(f"{shards}/train-drone-000002.tar")
+    assert [sample.key for sample, _ in found] == [
+        sample.key for sample in read_samples(f"{shards}/train-drone-000002.tar")
     ]
     kinds = [type(image) for _, image in found]
     assert kinds == [np.ndarray, DecodeError, *[np.ndarray] * 8]
@@ -67,8 +67,8 @@ def test_plain_webdataset_opens_a_shard_of_images(shards: str) -> None:
     )
     found = list(dataset.decode("pil"))
     assert len(found) == 8
-    for held in found:
-        assert held["png"].size == (9, 8)
-        assert held["json"]["key"] == held["__key__"]
-        assert json.dumps(held["json"])
-        assert held["json"]["view"] == "satellite"
+    for sample in found:
+        assert sample["png"].size == (9, 8)
+        assert sample["json"]["key"] == sample["__key__"]
+        assert json.dumps(sample["json"])
+        assert sample["json"]["view"] == "satellite"

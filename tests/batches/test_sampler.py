@@ -103,12 +103,12 @@ def test_shuffle_keeps_every_sample_and_repeats(shards: str, buffer: int) -> Non
 
 def test_read_spans_of_a_packed_shard(shards: str) -> None:
     samples = list(read_samples(f"{shards}/train-satellite-000002.tar"))
-    assert [held.key for held in samples] == [held.metadata["key"] for held in samples]
-    assert [held.metadata["location"] for held in samples] == [
+    assert [sample.key for sample in samples] == [sample.metadata["key"] for sample in samples]
+    assert [sample.metadata["location"] for sample in samples] == [
         CLASSES[number % 4] for number in range(16, 21)
     ]
-    assert all(held.data.startswith(b"\x89PNG") for held in samples)
+    assert all(sample.data.startswith(b"\x89PNG") for sample in samples)
     opened = open_shards(shards)
     shard = next(one for one in opened.manifest.shards if one.name == "train-satellite-000002")
     part = list(read_spans(opened, frozenset(), [Span(shard=shard, start=1, stop=3)]))
-    assert [held.key for held in part] == [held.key for held in samples[1:3]]
+    assert [sample.key for sample in part] == [sample.key for sample in samples[1:3]]

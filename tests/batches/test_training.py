@@ -99,15 +99,15 @@ def test_epoch_does_not_depend_on_earlier_ones(shards: str) -> None:
 @pytest.mark.parametrize("skip", [0, 1, 4, 5])
 def test_epoch_resumes_at_any_step(shards: str, skip: int, monkeypatch: pytest.MonkeyPatch) -> None:
     lively = replace(PLAIN, augmentation=Augmentation(pad=2), shuffle_buffer=7)
-    whole = epoch(shards, 2, reading=lively)
+    complete = epoch(shards, 2, reading=lively)
     opened = count()
     monkeypatch.setattr(
         "pipeline.batches.training.decode", lambda data: (next(opened), decode(data))[1]
     )
     rest = list(TrainingStream(open_shards(shards), lively).epoch(2, skip))
-    assert len(rest) == len(whole) - skip
+    assert len(rest) == len(complete) - skip
     assert next(opened) == 2 * 4 * len(rest)  # what is skipped is not decoded
-    for pair, same in zip(whole[skip:], rest, strict=True):
+    for pair, same in zip(complete[skip:], rest, strict=True):
         for batch, other in zip(pair, same, strict=True):
             assert batch.keys == other.keys
             assert np.array_equal(batch.images_B3HW, other.images_B3HW)
@@ -142,13 +142,15 @@ def test_stream_refuses_a_set_below_one_step(shards: str, batch_size: int, world
 
 
 def test_epoch_repeats_uav_images_where_they_are_few(shards: str, tmp_path: Path) -> None:
-    said = json_files.read_checksummed(storage.join(shards, MANIFEST))
-    said["shards"] = [
-        shard for shard in said["shards"] if shard["view"] == "satellite" or shard["samples"] == 10
+    content = json_files.read_checksummed(storage.join(shards, MANIFEST))
+    content["shards"] = [
+        shard
+        for shard in content["shards"]
+        if shard["view"] == "satellite" or shard["samples"] == 10
     ]
     for tar in Path(shards).glob("*.tar"):
         (tmp_path / tar.name).symlink_to(tar)
-    json_files.write_checksummed(str(tmp_path / MANIFEST), said)
+    json_files.write_checksummed(str(tmp_path / MANIFEST), content)
     seen = Counter(keys(epoch(str(tmp_path)), View.DRONE))
     assert set(seen.values()) == {2}
     assert len(seen) == 10

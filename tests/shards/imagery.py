@@ -18,18 +18,19 @@ def jpeg(path: Path, seed: int, side: int = 16) -> None:
     Image.fromarray(pixels).save(path, "JPEG")
 
 
-def imagery(root: Path, places: range = range(3)) -> Path:
-    """Of each place a satellite image and four of the UAV."""
-    for place in places:
-        jpeg(root / f"train/satellite/{place:04d}/{place:04d}.jpg", 100 * place)
+def imagery(root: Path, locations: range = range(3)) -> Path:
+    """One satellite image and four UAV images per location."""
+    for location in locations:
+        jpeg(root / f"train/satellite/{location:04d}/{location:04d}.jpg", 100 * location)
         for number in range(4):
             jpeg(
-                root / f"train/drone/{place:04d}/image-{number:02d}.jpeg", 100 * place + 1 + number
+                root / f"train/drone/{location:04d}/image-{number:02d}.jpeg",
+                100 * location + 1 + number,
             )
     return root
 
 
-def said(root: Path | str, out: Path | str, **changes: object) -> PackingSettings:
+def packing(root: Path | str, out: Path | str, **changes: object) -> PackingSettings:
     given = {"root": str(root), "out": str(out), "samples_per_shard": 5, "workers": 0}
     return PackingSettings(**(given | changes))  # type: ignore[arg-type]
 

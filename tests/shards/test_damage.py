@@ -31,19 +31,19 @@ from tests.damaging import (
     error_message,
     raising_if_missing,
 )
-from tests.shards.imagery import SOURCE, content, imagery, said
+from tests.shards.imagery import SOURCE, content, imagery, packing
 
 
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     root, out = imagery(tmp_path_factory.mktemp("root"), range(4)), tmp_path_factory.mktemp("out")
-    pack(SOURCE, said(root, out))
+    pack(SOURCE, packing(root, out))
     return root, out
 
 
 @pytest.fixture
 def out(packed: tuple[Path, Path], tmp_path: Path) -> Path:
-    """A set of shards to be spoilt."""
+    """A set of shards to damage."""
     return Path(shutil.copytree(packed[1], tmp_path / "shards"))
 
 
@@ -76,17 +76,17 @@ def test_training_refuses_or_skips_damage(out: Path) -> None:
             continue
         tar.write_bytes(data)
         found: list[Any] = []
-        told = error_message(lambda found=found: found.extend(batches()))  # type: ignore[misc]
-        refused += told is not None
-        assert told is None or ("shards" in told and REMEDIES.search(told)), told
+        output = error_message(lambda found=found: found.extend(batches()))  # type: ignore[misc]
+        refused += output is not None
+        assert output is None or ("shards" in output and REMEDIES.search(output)), output
         for now, then in zip(
             (b for pair in found for b in pair),
             (b for pair in expected for b in pair),
             strict=False,
         ):
-            whole = [key not in now.damaged for key in then.keys]
-            assert np.array_equal(now.images_B3HW[whole], then.images_B3HW[whole])
-            assert np.array_equal(now.location_B[whole], then.location_B[whole])
+            intact = [key not in now.damaged for key in then.keys]
+            assert np.array_equal(now.images_B3HW[intact], then.images_B3HW[intact])
+            assert np.array_equal(now.location_B[intact], then.location_B[intact])
             left_out += len(now.damaged)
     assert refused > 5
     assert left_out > 5
@@ -139,7 +139,7 @@ SPOILT = [
 
 @pytest.mark.parametrize("what", SPOILT)
 def test_repair_by_the_packing_command(what: str, packed: tuple[Path, Path], out: Path) -> None:
-    (root, whole), (shard, _) = packed, a_shard(out)
+    (root, intact), (shard, _) = packed, a_shard(out)
     spoil(what, out, shard)
     wrong = verify(open_shards(str(out)), workers=0)
     assert wrong
@@ -147,11 +147,11 @@ def test_repair_by_the_packing_command(what: str, packed: tuple[Path, Path], out
     others = {
         name: (out / name).stat().st_mtime_ns for name in content(out) if "000001.tar" in name
     }
-    pack(SOURCE, said(root, out))
+    pack(SOURCE, packing(root, out))
     now = {name: (out / name).stat().st_mtime_ns for name in others}
     assert (now, verify(open_shards(str(out)), workers=0)) == (others, [])
     assert {name: data for name, data in content(out).items() if name.endswith(".tar")} == {
-        name: data for name, data in content(whole).items() if name.endswith(".tar")
+        name: data for name, data in content(intact).items() if name.endswith(".tar")
     }
     assert not (out / DAMAGED_FILE).exists()
 
@@ -163,19 +163,19 @@ def test_repair_of_an_extended_set(what: str, tmp_path: Path) -> None:
         imagery(tmp_path / "b", range(3, 6)),
         tmp_path / "out",
     )
-    pack(SOURCE, said(first, out))
-    manifest = pack(SOURCE, said(second, out, extend=True))
+    pack(SOURCE, packing(first, out))
+    manifest = pack(SOURCE, packing(second, out, extend=True))
     before = content(out)
-    spoilt = manifest.of(Split.TRAIN, View.DRONE)[1], manifest.shards[-1]
-    for shard in spoilt:
+    damaged = manifest.of(Split.TRAIN, View.DRONE)[1], manifest.shards[-1]
+    for shard in damaged:
         spoil(what, out, shard)
     assert verify(open_shards(str(out)), workers=0)
     with pytest.raises(
         InputError,
         match=rf"1 shards of \S+ are damaged, .*--root {first}, then .*--root {second} --extend",
     ):
-        pack(SOURCE, said(first, out))
-    assert pack(SOURCE, said(second, out, extend=True)) == manifest
+        pack(SOURCE, packing(first, out))
+    assert pack(SOURCE, packing(second, out, extend=True)) == manifest
     assert verify(open_shards(str(out)), workers=0) == []
     same = (".tar", ".json") if "part" in what else (".tar", ".json", ".parquet")
     after = content(out)
@@ -189,8 +189,8 @@ def test_repair_changed_imagery_leaves_the_set_alone(tmp_path: Path) -> None:
         imagery(tmp_path / "b", range(3, 6)),
         tmp_path / "out",
     )
-    pack(SOURCE, said(first, out))
-    manifest = pack(SOURCE, said(second, out, extend=True))
+    pack(SOURCE, packing(first, out))
+    manifest = pack(SOURCE, packing(second, out, extend=True))
     shard = manifest.shards[0]
     spoil("tar flipped", out, shard)
     verify(open_shards(str(out)), workers=0)
@@ -198,7 +198,7 @@ def test_repair_changed_imagery_leaves_the_set_alone(tmp_path: Path) -> None:
     for path in (tmp_path / "a").rglob("*.jpg"):
         path.write_bytes(path.read_bytes()[:-2] + b"\0\xff\xd9")
     with pytest.raises(InputError, match="this imagery does not hold what they were packed from"):
-        pack(SOURCE, said(first, out))
+        pack(SOURCE, packing(first, out))
     assert content(out) == before
 
 

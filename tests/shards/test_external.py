@@ -108,7 +108,7 @@ def test_external_samples_have_keys_labels_and_positions(foreign: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "said", "label", "location"),
+    ("key", "stated", "label", "location"),
     [
         ("a/b/0", {"location": "here", "id": 3}, b"4", "here"),
         ("a/b/0", {"class": 0}, b"4", "0"),
@@ -123,13 +123,13 @@ def test_external_samples_have_keys_labels_and_positions(foreign: str) -> None:
     ],
 )
 def test_external_location_prefers_the_most_reliable_field(
-    key: str, said: dict[str, object], label: bytes, location: str
+    key: str, stated: dict[str, object], label: bytes, location: str
 ) -> None:
-    assert external_metadata(key, said, label, *TWO)["location"] == location
+    assert external_metadata(key, stated, label, *TWO)["location"] == location
 
 
 @pytest.mark.parametrize(
-    ("said", "geotag"),
+    ("stated", "geotag"),
     [
         ({"latitude": 1, "lng": -2.5}, {"lat": 1.0, "lon": -2.5}),
         ({"geotag": {"lat": 3, "lon": 4}}, {"lat": 3.0, "lon": 4.0}),
@@ -148,9 +148,9 @@ def test_external_location_prefers_the_most_reliable_field(
     ],
 )
 def test_external_position_of_plain_numbers(
-    said: dict[str, object], geotag: dict[str, float] | None
+    stated: dict[str, object], geotag: dict[str, float] | None
 ) -> None:
-    assert external_metadata("0", said, None, *TWO)["geotag"] == geotag
+    assert external_metadata("0", stated, None, *TWO)["geotag"] == geotag
 
 
 def test_open_external_without_split_or_view_is_refused(foreign: str, tmp_path: Path) -> None:

@@ -95,7 +95,7 @@ def test_scan_tars_reports_losses(tmp_path: Path, capsys: pytest.CaptureFixture[
     tar_file(tmp_path / "0.tar", members)
     tar_file(tmp_path / "query-drone-0.tar", {"q.jpg": picture(3)})
     assert len(read_all(tmp_path)) == 1
-    told = " ".join(capsys.readouterr().err.split())
+    output = " ".join(capsys.readouterr().err.split())
     for sentence in (
         "1 of 1 images: no position found in their JSON (its fields are caption, label)",
         "1 further images of a sample were left out (a.nir.jpg)",
@@ -103,4 +103,4 @@ def test_scan_tars_reports_losses(tmp_path: Path, capsys: pytest.CaptureFixture[
         "1 tars whose names state another split or view were left out (query-drone-0.tar)",
         "2 members of other kinds were left out (1 .txt, 1 .heic)",
     ):
-        assert sentence in told
+        assert sentence in output

@@ -78,7 +78,8 @@ def test_pack_copies_every_image_once(tiny_world: Path, tiny_shards: str) -> Non
     packed = []
     for shard in read_manifest(tiny_shards).shards:
         with tarfile.open(Path(tiny_shards) / f"{shard.name}.tar") as tar:
-            packed += [tar.extractfile(m).read() for m in tar if not m.name.endswith(".json")]  # type: ignore[union-attr]
+            images = [member for member in tar if not member.name.endswith(".json")]
+            packed += [tar.extractfile(image).read() for image in images]  # type: ignore[union-attr]
     source = [
         path.read_bytes() for path in tiny_world.rglob("*.jp*g") if ".parts" not in path.parts
     ]
@@ -115,8 +116,8 @@ def test_pack_rejects_bad_files_with_reasons(tmp_path: Path, ray_cluster: None) 
     drone = root / "train/drone/0001"
     (drone / "empty.jpeg").write_bytes(b"")
     (drone / "text.jpeg").write_bytes(b"hello, I am no image")
-    whole = (drone / "image-00.jpeg").read_bytes()
-    (drone / "cut.jpeg").write_bytes(whole[: len(whole) // 2])
+    intact = (drone / "image-00.jpeg").read_bytes()
+    (drone / "cut.jpeg").write_bytes(intact[: len(intact) // 2])
     (drone / "Thumbs.db").write_bytes(b"x")
     jpeg(root / "train/drone/stray.jpeg")
     jpeg(drone / "image-00.jpg")  # the key of image-00.jpeg
@@ -159,9 +160,9 @@ def test_scan_street_images_on_request(tmp_path: Path) -> None:
 
 
 def test_read_manifest_refuses_damage_with_the_remedy(tmp_path: Path, tiny_shards: str) -> None:
-    said = json_files.read_checksummed(storage.join(tiny_shards, "manifest.json"))
+    content = json_files.read_checksummed(storage.join(tiny_shards, "manifest.json"))
     for damage in ({"schema_version": 9}, {"shards": [{"name": "x"}]}):
-        json_files.write_checksummed(str(tmp_path / "manifest.json"), said | damage)
+        json_files.write_checksummed(str(tmp_path / "manifest.json"), content | damage)
         with pytest.raises(InputError, match="again"):
             read_manifest(str(tmp_path))
     (tmp_path / "manifest.json").write_bytes(b"{")

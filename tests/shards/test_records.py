@@ -26,12 +26,12 @@ from pipeline.shards.shard_set import open_shards
 from pipeline.shards.verify import verify
 from pipeline.shards.writer import add_file, open_tar
 from pipeline.sources.university1652 import University1652
-from tests.shards.imagery import SOURCE, imagery, said
+from tests.shards.imagery import SOURCE, imagery, packing
 
 
 def test_verify_names_every_kind_of_damage(tmp_path: Path, ray_cluster: None) -> None:
     out = tmp_path / "out"
-    manifest = pack(SOURCE, said(imagery(tmp_path / "root"), out))
+    manifest = pack(SOURCE, packing(imagery(tmp_path / "root"), out))
     assert verify(open_shards(str(out))) == []
     names = [shard.name for shard in manifest.shards]
     flipped, cut, gone = (out / f"{name}.tar" for name in names[:3])
@@ -59,17 +59,17 @@ def test_verify_names_every_kind_of_damage(tmp_path: Path, ray_cluster: None) ->
 def test_export_as_parquet_and_geojson(tmp_path: Path) -> None:
     root, out = imagery(tmp_path / "root"), tmp_path / "out"
     (root / "locations.csv").write_text("location,lat,lon\n0001,52.5,13.4\n")
-    pack(SOURCE, said(root, out))
+    pack(SOURCE, packing(root, out))
     assert open_shards(str(out)).export(str(tmp_path / "all.parquet")) == (15, 0)
     rows = pq.read_table(tmp_path / "all.parquet").to_pylist()
     assert len({row["key"] for row in rows}) == 15
     assert open_shards(str(out)).export(str(tmp_path / "all.geojson")) == (5, 10)
-    places = json.loads((tmp_path / "all.geojson").read_text())
-    assert places["type"] == "FeatureCollection"
-    assert {tuple(feature["geometry"]["coordinates"]) for feature in places["features"]} == {
+    points = json.loads((tmp_path / "all.geojson").read_text())
+    assert points["type"] == "FeatureCollection"
+    assert {tuple(feature["geometry"]["coordinates"]) for feature in points["features"]} == {
         (13.4, 52.5)
     }
-    assert {feature["properties"]["location"] for feature in places["features"]} == {"0001"}
+    assert {feature["properties"]["location"] for feature in points["features"]} == {"0001"}
     with pytest.raises(InputError, match=r"ends in .parquet or .geojson"):
         open_shards(str(out)).export(str(tmp_path / "all.shp"))
 
@@ -153,7 +153,7 @@ def test_records_round_trip_through_shards(
         def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
             return iter(records)
 
-    manifest = pack(Given(), said(folder, folder / "out", samples_per_shard=size))
+    manifest = pack(Given(), packing(folder, folder / "out", samples_per_shard=size))
     back = []
     for shard in manifest.shards:
         rows = read_part(str(folder / "out"), shard.name).to_pylist()
@@ -184,15 +184,15 @@ def test_job_verifies_and_exports_a_finished_set(
     tmp_path: Path, ray_cluster: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    manifest = pack(SOURCE, said(imagery(tmp_path / "root"), out))
+    manifest = pack(SOURCE, packing(imagery(tmp_path / "root"), out))
     make_shards.main(MakeShardsSettings(out=str(out), verify=True))
     geojson = str(tmp_path / "all.geojson")
     make_shards.main(MakeShardsSettings(out=str(out), export=geojson))
-    told = capsys.readouterr().err
-    assert f"all {len(manifest.shards)} shards are what was packed" in told
-    assert "0 images, 15 without a position left out" in told
+    output = capsys.readouterr().err
+    assert f"all {len(manifest.shards)} shards are what was packed" in output
+    assert "0 images, 15 without a position left out" in output
     (out / f"{manifest.shards[0].name}.tar").unlink()
     with pytest.raises(
-        Incomplete, match="is damaged in 1 places; run the command that packed it again"
+        Incomplete, match="is damaged in 1 points; run the command that packed it again"
     ):
         make_shards.main(MakeShardsSettings(out=str(out), verify=True))

@@ -1,4 +1,4 @@
-"""Tars as they come: whole, cut off anywhere, and hostile."""
+"""Tars as others send them: complete, cut anywhere, and hostile."""
 
 import io
 import subprocess
