@@ -18,7 +18,7 @@ from rasterio.errors import RasterioError
 from pipeline.core import storage
 from pipeline.core.errors import InputError, require
 from pipeline.core.progress import console, progress
-from pipeline.core.records import ImageRecord, Rejection, Split, View
+from pipeline.core.records import ImageRecord, Rejection, Scanned, SkippedFile, Split, View
 from pipeline.images.decode import DecodeError
 from pipeline.images.inspect import MAX_PIXELS
 from pipeline.sources.base import Source
@@ -37,6 +37,7 @@ from pipeline.sources.maps.placement import MosaicRejected, Placement, place_mos
 from pipeline.sources.maps.tiles import Tile, count_tiles, parse_window, plan_tiles
 
 DEFAULT_TILE_PIXELS = 512
+MOSAIC_SUFFIXES = (".tif", ".tiff")
 MAX_TILES = 2_000_000
 """Of one mosaic: with their records they take a few gigabytes. A header alone may claim sides of
 four thousand million pixels."""
@@ -100,8 +101,9 @@ class GeoTiff(Source):
             expected = "one such as EPSG:32633; it names no coordinate system"
             require(parse_crs(self.crs) is not None, "crs", self.crs, expected)
 
-    def scan(self, root: str) -> Iterator[ImageRecord | Rejection]:
+    def scan(self, root: str) -> Iterator[Scanned]:
         names: dict[str, str] = {}
+        yield from _other_files(root)
         for path, name in find_mosaics(root):
             first = names.setdefault(name, path)
             if first != path:
@@ -226,6 +228,17 @@ def _place(
     return place_mosaic(path, crs_name, assume_wgs84)
 
 
+def _other_files(root: str) -> Iterator[SkippedFile]:
+    """Files of a folder that are no GeoTIFF by their names, counted by their endings."""
+    if not storage.is_folder(root):
+        return
+    for name in storage.walk(root):
+        if not name.lower().endswith(MOSAIC_SUFFIXES):
+            ending = name.rsplit("/", 1)[-1].rpartition(".")[2].lower()[:8]
+            path = storage.join(root, name)
+            yield SkippedFile(path=path, reason=f"file that is no GeoTIFF (.{ending})")
+
+
 def find_mosaics(root: str) -> Iterator[tuple[str, str]]:
     """(path, name) of the GeoTIFF at `root` or of all below it; a name is the path from there
     without its ending, joined by hyphens.
@@ -233,7 +246,7 @@ def find_mosaics(root: str) -> Iterator[tuple[str, str]]:
     Raises InputError where there is none.
     """
     if storage.is_folder(root):
-        found = [name for name in storage.walk(root) if name.lower().endswith((".tif", ".tiff"))]
+        found = [name for name in storage.walk(root) if name.lower().endswith(MOSAIC_SUFFIXES)]
         if not found:
             raise InputError(
                 f"no .tif or .tiff below {root}; expected GeoTIFF mosaics; check --root"

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rasterio.transform import Affine
 
 from pipeline.core.errors import InputError
-from pipeline.core.records import ImageRecord, Rejection
+from pipeline.core.records import ImageRecord, Rejection, Scanned
 from pipeline.images.decode import DecodeError
 from pipeline.sources.geotiff import GeoTiff
 from tests.fuzz.bounds import bounded, examples
@@ -78,9 +78,9 @@ def valid(kind: str, folder: Path) -> bytes:
     return data
 
 
-def tiles(path: Path, source: GeoTiff, most: int = 3) -> list[ImageRecord | Rejection]:
+def tiles(path: Path, source: GeoTiff, most: int = 3) -> list[Scanned]:
     """What is found; the first tiles are cut and encoded."""
-    found: list[ImageRecord | Rejection] = []
+    found: list[Scanned] = []
     with bounded(InputError):
         found += source.scan(str(path))
     for record in [one for one in found if isinstance(one, ImageRecord)][:most]:

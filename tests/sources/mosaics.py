@@ -62,7 +62,7 @@ def mosaic(
 
 def tiles(root: str, **settings: Any) -> list[ImageRecord]:
     found = list(GeoTiff(**settings).scan(root))
-    assert all(isinstance(record, ImageRecord) for record in found), found
+    assert not [one for one in found if isinstance(one, Rejection)], found
     return [record for record in found if isinstance(record, ImageRecord)]
 
 

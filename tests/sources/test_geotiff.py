@@ -11,7 +11,7 @@ import pytest
 from rasterio.control import GroundControlPoint
 
 from pipeline.core.errors import InputError
-from pipeline.core.records import Rejection
+from pipeline.core.records import Rejection, SkippedFile
 from pipeline.images.decode import DecodeError
 from pipeline.sources.geotiff import GeoTiff
 from tests.sources.mosaics import (
@@ -62,6 +62,9 @@ def test_geotiff_folder_is_searched_at_any_depth(tmp_path: Path) -> None:
     for name in ("b/ortho.TIF", "a/deep/ortho.tiff", "ortho #1!.tif"):
         mosaic(tmp_path / name, noise(1, 8, 8))
     (tmp_path / "readme.txt").write_text("not a mosaic")
+    (tmp_path / "map.jp2").write_text("not a mosaic that is read")
+    others = [one.reason for one in GeoTiff().scan(str(tmp_path)) if isinstance(one, SkippedFile)]
+    assert others == ["file that is no GeoTIFF (.jp2)", "file that is no GeoTIFF (.txt)"]
     locations = [record.location for record in tiles(str(tmp_path))]
     assert locations == ["a-deep-ortho-0-0", "b-ortho-0-0", "ortho #1!-0-0"]
     mosaic(tmp_path / "b-ortho.tif", noise(1, 8, 8))
