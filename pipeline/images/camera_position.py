@@ -163,17 +163,26 @@ def _to_wgs84(position: Position, datum: str) -> Position:
 def _xmp_position(xmp: Mapping[str, str], pair: tuple[str, str]) -> Position | None:
     if not all(xmp.get(name) for name in pair):
         return None
-    lat, lon = (_xmp_angle(xmp[name]) for name in pair)
+    lat, lon = (_xmp_angle(xmp[name], xmp.get(f"{name}Ref", "")) for name in pair)
     if lat is None or lon is None:
-        raise UnreadableTag(", ".join(f"{name} {xmp[name]}" for name in pair))
+        letters = (xmp.get(f"{name}Ref", "") for name in pair)
+        found = (f"{name} {xmp[name]}" for name in pair)
+        stated = zip(found, letters, strict=True)
+        raise UnreadableTag(", ".join(" ".join(both).strip() for both in stated))
     return validate_position(lat, lon, "GPS of the XMP")
 
 
-def _xmp_angle(text: str) -> float | None:
-    """Decimal degrees, or `DDD,MM,SSk` and `DDD,MM.mmk` with the hemisphere's letter k."""
+def _xmp_angle(text: str, letter: str) -> float | None:
+    """Decimal degrees, or `DDD,MM,SSk` and `DDD,MM.mmk` with the hemisphere's letter k.
+
+    `letter`: that of a property of its own, as some programs write it; empty if there is none.
+    """
     match = XMP_ANGLE.fullmatch(text.strip())
     if match is None:
-        return parse_number(text)
+        value, west = parse_number(text), letter[:1].upper() in ("S", "W")
+        if value is None or (value < 0 and letter and not west):
+            return None
+        return -abs(value) if west else value
     degrees, minutes, seconds = (float(part or 0) for part in match.groups()[:3])
     if max(minutes, seconds) > 60:
         return None

@@ -209,6 +209,15 @@ def test_exif_position_within_xmp_is_read(lat: str, lon: str) -> None:
     assert tags(None, xmp).position == OPERA
 
 
+def test_letter_beside_an_xmp_position_is_read() -> None:
+    """As in immich-app/immich #3540: 60.5 and 68 with W and N beside them were placed in Russia."""
+    west = 'e:GPSLatitude="60.5" e:GPSLatitudeRef="N" e:GPSLongitude="{}" e:GPSLongitudeRef="{}"'
+    for number, letter in (("68", "W"), ("-68", "W"), ("-68", "West")):
+        assert tags(None, packet(west.format(number, letter))).position == (60.5, -68)
+    with pytest.raises(UnreadableTag, match=r"GPSLatitude 60\.5 N, GPSLongitude -68 E"):
+        tags(None, packet(west.format("-68", "E")))
+
+
 @pytest.mark.parametrize(
     ("attributes", "metres"),
     [
