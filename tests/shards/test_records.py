@@ -193,6 +193,6 @@ def test_job_verifies_and_exports_a_finished_set(
     assert "0 images, 15 without a position left out" in output
     (out / f"{manifest.shards[0].name}.tar").unlink()
     with pytest.raises(
-        Incomplete, match="is damaged in 1 points; run the command that packed it again"
+        Incomplete, match="is damaged in 1 places; run the command that packed it again"
     ):
         make_shards.main(MakeShardsSettings(out=str(out), verify=True))
