@@ -25,7 +25,7 @@ from ray.exceptions import RayTaskError
 from pipeline.core.errors import Incomplete
 from pipeline.core.progress import console
 
-Item = TypeVar("Item")
+_Item = TypeVar("_Item")
 
 CORES_PER_WORKER = 8
 "Of a worker without a GPU, unless the user chooses: a network's threads gain little beyond."
@@ -228,15 +228,15 @@ def stop_actor(actor: Any, first: "ray.ObjectRef[Any]", *queued: "ray.ObjectRef[
 
 
 def bounded_map(
-    submit: Callable[[Item], "ray.ObjectRef[Any]"], items: Iterable[Item], window: int
-) -> Iterator[tuple[Item, Any]]:
+    submit: Callable[[_Item], "ray.ObjectRef[Any]"], items: Iterable[_Item], window: int
+) -> Iterator[tuple[_Item, Any]]:
     """Call `submit` on every item with at most `window` calls in flight; yield (item, result) as
     they finish.
 
     An exception in a call is raised here as it is, and nothing new is submitted after it.
     """
     pending = iter(items)
-    running: dict[Any, Item] = {submit(item): item for item in islice(pending, window)}
+    running: dict[Any, _Item] = {submit(item): item for item in islice(pending, window)}
     while running:
         [done], _ = ray.wait(list(running), num_returns=1)
         item = running.pop(done)

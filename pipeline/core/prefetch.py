@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 In = TypeVar("In")
 Out = TypeVar("Out")
-Item = TypeVar("Item")
+_Item = TypeVar("_Item")
 
 
 def prefetch_map(
@@ -32,8 +32,8 @@ def prefetch_map(
 
 
 def prefetch(
-    items: Iterable[Item], depth: int, thread: Executor | None = None
-) -> Generator[Item, None, None]:
+    items: Iterable[_Item], depth: int, thread: Executor | None = None
+) -> Generator[_Item, None, None]:
     """The items in order, produced by one thread up to `depth` items before they are asked for.
 
     `thread`: an executor with a single thread that nothing else uses meanwhile.
