@@ -4,9 +4,11 @@ In: a `.pth` or `.safetensors` file. Out: its tensors by name, the backbone that
 a module that holds them. Each backbone brings its own table; LPN's is in `lpn.py`.
 """
 
+import pickle
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import safetensors.torch
 from torch import Tensor, nn
@@ -16,12 +18,20 @@ from model.backbones.base import Backbone, families
 from model.checkpoint import check_integrity
 from model.errors import CheckpointError
 from model.weights import torch_files
+from model.weights.unwrap import (
+    check_finite,
+    find_state_dict,
+    prefix_variants,
+    strip_torch_names,
+)
 
 TORCHVISION_HINT = (
     "a state dict of torchvision's ResNet: on a machine with a network, "
     "torchvision.models.resnet50(weights='IMAGENET1K_V1').state_dict() saved with torch.save"
 )
 "The weights that a backbone starts from, and where to get them."
+FOREIGN_CLASS = re.compile(r"GLOBAL ([\w.]+)")
+"The class in torch's message about an object that it does not unpickle."
 
 
 def read_state_dict(path: str) -> dict[str, Tensor]:
@@ -43,40 +53,53 @@ def read_state_dict(path: str) -> dict[str, Tensor]:
 
 def parse_state_dict(data: bytes, name: str) -> dict[str, Tensor]:
     """Tensors by name from the bytes of a file called `name`; `.safetensors` by its ending, else
-    torch's own format.
+    torch's own format, also as checkpoints of Lightning and of training scripts wrap it.
 
-    Raises CheckpointError.
+    Prefixes that DataParallel and torch.compile add to the names are taken off. Raises
+    CheckpointError; for a tensor with NaN or infinity by its name.
     """
     check_integrity(data, name)
-    try:
-        if name.endswith(".safetensors"):
-            return safetensors.torch.load(data)
-        state = torch_files.read(data)
-    except Exception as error:  # torch and safetensors raise many kinds over a damaged file
-        raise CheckpointError(
-            f"{name} is no state dict ({type(error).__name__}); expected .pth or .safetensors"
-        ) from error
-    if not isinstance(state, dict) or not all(
-        isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in state.items()
-    ):
-        raise CheckpointError(
-            f"{name} has other values than tensors by name; expected a state dict; save "
-            "model.state_dict() alone"
-        )
+    state = strip_torch_names(find_state_dict(_parse(data, name), name), name)
+    check_finite(state, name)
     return state
 
 
+def _parse(data: bytes, name: str) -> Any:
+    try:
+        if name.endswith(".safetensors"):
+            return safetensors.torch.load(data)
+        return torch_files.read(data)
+    except pickle.UnpicklingError as error:
+        if foreign := FOREIGN_CLASS.search(str(error)):
+            raise CheckpointError(
+                f"{name} holds an object of {foreign[1]}, which would run code when it is read; "
+                "expected tensors alone; where the file is trusted, read it with "
+                "torch.load(FILE, weights_only=False) and save its state dict with torch.save"
+            ) from error
+        raise _no_state_dict(name, error) from error
+    except Exception as error:  # torch and safetensors raise many kinds over a damaged file
+        raise _no_state_dict(name, error) from error
+
+
+def _no_state_dict(name: str, error: Exception) -> CheckpointError:
+    return CheckpointError(
+        f"{name} is no state dict ({type(error).__name__}); expected .pth or .safetensors"
+    )
+
+
 def infer_backbone(state: dict[str, Tensor], name: str) -> tuple[str, float]:
-    """Name and width of the backbone that a public state dict from the file `name` belongs to.
+    """Name and width of the backbone that a public state dict from the file `name` belongs to,
+    whose names may share a prefix.
 
     Raises CheckpointError when it is none of BACKBONES.
     """
-    reasons = []
-    for family in families():
-        try:
-            return family.infer(state)
-        except ValueError as error:
-            reasons.append(str(error))
+    for variant in prefix_variants(state):
+        reasons = list[str]()
+        for family in families():
+            try:
+                return family.infer(variant)
+            except ValueError as error:
+                reasons.append(str(error))
     raise CheckpointError(
         f"{name} is of no backbone that we build: {'; '.join(reasons)}, and the names begin with "
         f"{', '.join(list(state)[:3]) or 'nothing'}; expected torchvision's names and one of "
@@ -85,12 +108,15 @@ def infer_backbone(state: dict[str, Tensor], name: str) -> tuple[str, float]:
 
 
 def load_backbone(backbone: Backbone, state: dict[str, Tensor], name: str) -> None:
-    """Load public weights by the backbone's table of foreign names; a classifier is left out.
+    """Load public weights by the backbone's table of foreign names; a classifier is left out, and
+    a prefix that all names share.
 
     Raises CheckpointError that lists the names which are missing, unexpected or of another shape.
     """
+    own = {rename(key, backbone.foreign_names) for key in backbone.state_dict()}
+    best = max(prefix_variants(state), key=lambda one: len(own & one.keys()))
     given = {
-        key: tensor for key, tensor in state.items() if not key.startswith(backbone.foreign_extra)
+        key: tensor for key, tensor in best.items() if not key.startswith(backbone.foreign_extra)
     }
     load_renamed(
         backbone,

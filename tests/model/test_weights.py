@@ -85,7 +85,7 @@ def test_read_state_dict_rejects_damaged_file(tmp_path: Path, name: str) -> None
 
 
 @pytest.mark.parametrize(
-    "value", [[1, 2], torch.ones(3), {"state_dict": {"conv1.weight": torch.ones(1)}, "epoch": 3}]
+    "value", [[1, 2], torch.ones(3), {"student": {"conv1.weight": torch.ones(1)}, "epoch": 3}]
 )
 def test_read_state_dict_rejects_other_content(tmp_path: Path, value: object) -> None:
     torch.save(value, tmp_path / "else.pth")
@@ -151,10 +151,10 @@ def test_measure_backbone_finds_width_or_rejects() -> None:
     ):
         infer_backbone(resnet152, "deep.pth")
     with pytest.raises(
-        CheckpointError, match=r"conv1\.weight is missing, .*names begin with module\.conv1\.weight"
+        CheckpointError, match=r"conv1\.weight is missing, .*names begin with encoder_q\.conv1\.wei"
     ):
         infer_backbone(
-            {f"module.{key}": tensor for key, tensor in foreign().items()}, "wrapped.pth"
+            {f"encoder_q.{key}": tensor for key, tensor in foreign().items()}, "wrapped.pth"
         )
     with pytest.raises(CheckpointError, match="begin with nothing"):
         infer_backbone({}, "empty.pth")
