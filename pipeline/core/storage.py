@@ -51,6 +51,19 @@ def join(folder: str, *names: str) -> str:
     return "/".join([folder.rstrip("/"), *names])
 
 
+def beside(folder: str, ending: str) -> str:
+    """The path of a file next to a folder and named after it, where no reader of the folder looks.
+
+    Raises InputError where the folder is the root of its storage, which has nothing beside it.
+    """
+    path = absolute(folder)
+    if "/" not in resolve(path)[1].rstrip("/"):
+        raise InputError(
+            f"{folder} is the root of its storage, expected a folder in it; name one below it"
+        )
+    return path.rstrip("/") + ending
+
+
 def exists(path: str) -> bool:
     filesystem, inner = resolve(path)
     return bool(filesystem.exists(inner))
@@ -210,6 +223,13 @@ def link_or_copy(source: str, target: str) -> None:
         temporary.replace(other)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def make_folder(path: str) -> None:
+    """Make a folder of this machine where there is none; other storages have no empty folders."""
+    filesystem, inner = resolve(path)
+    if isinstance(filesystem, LocalFileSystem):
+        os.makedirs(inner, exist_ok=True)
 
 
 def remove(path: str) -> None:

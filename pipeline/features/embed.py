@@ -14,7 +14,7 @@ from typing import Any
 
 import ray
 
-from pipeline.core import cluster, storage
+from pipeline.core import cluster
 from pipeline.core.actor_pool import ActorPool, NoWorkerStarted, PoolConfig, PoolFailed, Skipped
 from pipeline.core.cluster import Node, Placement, plan_placement
 from pipeline.core.errors import Incomplete, InputError
@@ -29,7 +29,7 @@ from pipeline.features.embed_worker import (
     ShardResult,
     TableWriteFailed,
 )
-from pipeline.features.rejected import REJECTED
+from pipeline.features.rejected import rejected_file
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table_writer import ExpectedPart, FeatureTableWriter, WrittenTable
 from pipeline.shards.manifest import Shard
@@ -214,7 +214,7 @@ def report(
     if table.list_changed and table.rejected:
         console.print(
             f"{len(table.rejected)} images could not be decoded: "
-            f"{most_common_reasons(table.rejected)}; see {storage.join(settings.out, REJECTED)}",
+            f"{most_common_reasons(table.rejected)}; see {rejected_file(settings.out)}",
             style="yellow",
         )
     if run.skipped:

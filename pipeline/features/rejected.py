@@ -1,7 +1,7 @@
 """The list of the images and shards that have no row in a feature table, for people to query.
 
-In: rejected images with reasons. Out: a Parquet file below the table. The same entries are in the
-footers of the parts, by which embedding writes the list anew.
+In: rejected images with reasons. Out: a Parquet file beside the table's folder. The same entries
+are in the footers of the parts, by which embedding writes the list anew.
 """
 
 from collections.abc import Iterable
@@ -12,10 +12,17 @@ from pipeline.core import parquet as parquet_files
 from pipeline.core import rejections, storage
 from pipeline.core.errors import InputError
 
-REJECTED = f"_rejected/{rejections.REJECTED_FILE}"
-"""Within a table. In a folder of its own, so that `*.parquet` names parts only; readers that take
-folders (pandas, pyarrow, Spark) skip its underscore."""
+ENDING = ".rejected.parquet"
+"""Behind the table's path: beside the folder, since some readers (Polars) take every file within it
+for a part."""
+OLD_NAME = f"_rejected/{rejections.REJECTED_FILE}"
+"Within the table, where tables had the list at first; writing the list removes it."
 REJECTED_SCHEMA = pa.schema([(name, pa.string()) for name in ("shard", "key", "reason", "found")])
+
+
+def rejected_file(table: str) -> str:
+    """The path of a table's list."""
+    return storage.beside(table, ENDING)
 
 
 def write_rejected(table: str, rejected: Iterable[tuple[str, str | None, str, str]]) -> bool:
@@ -25,7 +32,9 @@ def write_rejected(table: str, rejected: Iterable[tuple[str, str | None, str, st
     and is not written again when it is the same. Returns whether it changed.
     """
     rows = sorted(rejected, key=lambda row: (row[0], row[1] or ""))
-    path = storage.join(table, REJECTED)
+    path, old = rejected_file(table), storage.join(table, OLD_NAME)
+    if storage.exists(old):
+        storage.remove_folder(old.rpartition("/")[0])
     entries = [dict(zip(REJECTED_SCHEMA.names, row, strict=True)) for row in rows]
     wanted = pa.Table.from_pylist(entries, REJECTED_SCHEMA)
     exists = storage.exists(path)
@@ -47,7 +56,7 @@ def read_rejected(table: str) -> pa.Table:
 
     Raises InputError when it cannot be read.
     """
-    path = storage.join(table, REJECTED)
+    path = rejected_file(table)
     if not storage.exists(path):
         return REJECTED_SCHEMA.empty_table()
     try:

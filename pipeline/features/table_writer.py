@@ -13,9 +13,13 @@ from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.progress import console
 from pipeline.core.records import Rejection
-from pipeline.features import expected_parts
+from pipeline.features.expected_parts import (
+    add_expected,
+    expected_parts_file,
+    remove_expected,
+)
 from pipeline.features.part import PartHeader, part_names, read_header, read_headers, verify_part
-from pipeline.features.rejected import write_rejected
+from pipeline.features.rejected import rejected_file, write_rejected
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +63,7 @@ class FeatureTableWriter:
         """
         self._expected = {part.name: part for part in parts}
         done = {name for name in part_names(self.path) if self._is_done(name, verify)}
-        expected_parts.add_expected(self.path, self._expected)
+        add_expected(self.path, self._expected)
         return [name for name in self._expected if name not in done]
 
     def _is_done(self, name: str, verify: bool) -> bool:
@@ -100,9 +104,11 @@ class FeatureTableWriter:
 
     def finish(self) -> WrittenTable:
         """Bring the lists up to date and remove what killed writers left half-written."""
-        expected_parts.remove_expected(self.path, self._skipped)
-        written = [expected_parts.EXPECTED_PARTS, *self._expected]
-        storage.remove_temporaries(self.path, written)
+        remove_expected(self.path, self._skipped)
+        storage.remove_temporaries(self.path, self._expected)
+        for path in (expected_parts_file(self.path), rejected_file(self.path)):
+            folder, _, name = path.rpartition("/")
+            storage.remove_temporaries(folder, [name])
         rejected = [
             (_stem(header.name), one)
             for header in read_headers(self.path)

@@ -58,7 +58,7 @@ class Workspace:
         self.folder.mkdir(parents=True)
         self._fault.unlink(missing_ok=True)
         for name in (*stage.reads, *([stage.writes] if with_output else [])):
-            shutil.copytree(self._intact / name, self.folder / name)
+            _copy_with_lists(self._intact, self.folder, name)
 
     def start(
         self, stage: Stage, distributed: bool, own_cluster: bool = False, verified: bool = False
@@ -135,9 +135,16 @@ class Workspace:
             self.arm("read fails", -1)
             self._seconds[stage.name, False] = self._complete(stage, distributed=False)
             operations, content = self.disarm(), stage.read_content(self.folder)
-            shutil.copytree(self.folder / stage.writes, self._intact / stage.writes)
+            _copy_with_lists(self.folder, self._intact, stage.writes)
             self._baselines[stage.name] = Baseline(content=content, operations=operations)
         return self._baselines[stage.name]
+
+
+def _copy_with_lists(source: Path, target: Path, name: str) -> None:
+    """Copy a folder, and the files beside it that are named after it."""
+    shutil.copytree(source / name, target / name)
+    for path in source.glob(f"{name}.*"):
+        shutil.copy(path, target)
 
 
 ENVIRONMENT = {

@@ -6,6 +6,7 @@ import fsspec
 import pytest
 
 from pipeline.core import storage
+from pipeline.core.errors import InputError
 
 
 @pytest.fixture(params=["disk", "file uri", "memory"])
@@ -44,6 +45,21 @@ def test_failed_write_leaves_the_old_file(folder: str) -> None:
 
 def test_absent_folder_has_no_names(tmp_path: Path) -> None:
     assert storage.list_names(str(tmp_path / "nowhere")) == []
+
+
+def test_beside_names_a_neighbour(
+    folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert storage.beside(f"{folder}/table/", ".json") == f"{folder}/table.json"
+    assert storage.beside("memory://table", ".json") == "memory://table.json"
+    monkeypatch.chdir(tmp_path)
+    assert storage.beside(".", ".json") == f"{tmp_path}.json"
+
+
+@pytest.mark.parametrize("root", ["/", "memory://", "file:///"])
+def test_beside_a_root_is_nowhere(root: str) -> None:
+    with pytest.raises(InputError, match="is the root of its storage, expected a folder in it"):
+        storage.beside(root, ".json")
 
 
 def test_absolute_changes_paths_and_not_uris(

@@ -14,7 +14,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.geo import Box
 from pipeline.core.records import Split, View
 from pipeline.features.part import PartFooter, PartRows, read_header, verify_part, write_part
-from pipeline.features.rejected import read_rejected, write_rejected
+from pipeline.features.rejected import read_rejected, rejected_file, write_rejected
 from pipeline.features.row_reader import RowReader
 from pipeline.features.table import open_table
 from tests.damaging import (
@@ -118,7 +118,7 @@ def test_part_without_checksums_is_read(part: Path) -> None:
 def test_rejected_of_table_damaged_is_rewritten(tmp_path: Path) -> None:
     rows = [("shard", "key", "reason", "found")]
     write_rejected(str(tmp_path), rows)
-    path = tmp_path / "_rejected" / "rejected.parquet"
+    path = Path(rejected_file(str(tmp_path)))
 
     look = raising_if_missing(path, lambda: read_rejected(str(tmp_path)).to_pylist())
     assert count_detected(path, look, 100) > 80

@@ -12,6 +12,7 @@ import pytest
 
 from pipeline.core.errors import InputError
 from pipeline.core.records import Rejection, Split, View
+from pipeline.features.expected_parts import add_expected
 from pipeline.features.part import PartFooter, PartRows, read_footer, write_part
 from pipeline.features.rejected import read_rejected, write_rejected
 from pipeline.features.table import open_table, verify_table
@@ -214,6 +215,7 @@ def test_table_rejects_mixed_dtypes(tmp_path: Path) -> None:
 
 def test_rejected_list_is_hidden_from_readers(tmp_path: Path) -> None:
     write(tmp_path, "query", "drone", 0)
+    add_expected(str(tmp_path), ["query-drone-000000.parquet"])
     assert write_rejected(
         str(tmp_path), [("s", "k", "not an image", "9 bytes"), ("r", None, "unusable", "cut off")]
     )
@@ -226,8 +228,19 @@ def test_rejected_list_is_hidden_from_readers(tmp_path: Path) -> None:
         == pyarrow.dataset.dataset(tmp_path).count_rows()
         == open_table(str(tmp_path)).rows
     )
+    assert [path.name for path in tmp_path.iterdir()] == ["query-drone-000000.parquet"]
     assert write_rejected(str(tmp_path), [])
     assert len(read_rejected(str(tmp_path))) == 0
+
+
+def test_table_folder_is_read_by_polars(tmp_path: Path) -> None:
+    polars = pytest.importorskip("polars")
+    vectors = write(tmp_path, "query", "drone", 0, "float16")
+    add_expected(str(tmp_path), ["query-drone-000000.parquet"])
+    write_rejected(str(tmp_path), [("s", "k", "not an image", "9 bytes")])
+    frame = polars.read_parquet(tmp_path)
+    assert frame["key"].to_list() == [f"query-drone-{row}" for row in range(len(vectors))]
+    assert np.array_equal(frame["embedding"].to_numpy(), vectors)
 
 
 def test_docs_snippets_run(tmp_path: Path) -> None:
@@ -248,6 +261,6 @@ def test_docs_snippets_run(tmp_path: Path) -> None:
         from '{tmp_path}/*.parquet' t, photo order by score desc limit 1""").fetchall()
     assert nearest[0][0] == "query-drone-2"
     rejected = connection.sql(
-        f"select shard, key, reason from '{tmp_path}/_rejected/*.parquet'"
+        f"select shard, key, reason from '{tmp_path}.rejected.parquet'"
     ).fetchall()
     assert rejected == [("s", "k", "not an image")]

@@ -1,14 +1,21 @@
 """The books of a feature table that is being filled: expected, done and skipped parts."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline.core.errors import InputError
+from pipeline.core.json_files import write_checksummed
 from pipeline.core.records import Rejection
 from pipeline.features.encoding import EncodingConfig
-from pipeline.features.expected_parts import EXPECTED_PARTS, add_expected, check_expected
+from pipeline.features.expected_parts import (
+    OLD_NAME,
+    add_expected,
+    check_expected,
+    expected_parts_file,
+)
 from pipeline.features.part import SCHEMA_VERSION, PartFooter, PartRows, read_footer, write_part
 from pipeline.features.rejected import read_rejected
 from pipeline.features.table import open_table
@@ -74,11 +81,14 @@ def test_finish_drops_skipped_parts_and_leftovers(tmp_path: Path) -> None:
     writer.expect(EXPECTED)
     write(tmp_path, NAMES[0], rows=2, rejected=(REJECTION,))
     (tmp_path / f".{NAMES[1]}.0123abcd").write_bytes(b"half")
+    leftover = tmp_path.with_name(f".{tmp_path.name}.parts.json.0123abcd")
+    leftover.write_bytes(b"half")
     writer.skip(NAMES[1], "unusable", "cut off")
     written = writer.finish()
     assert (written.rejected, written.list_changed) == ((REJECTION,), True)
     assert open_table(str(tmp_path)).rows == 2
-    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+    assert [path.name for path in tmp_path.iterdir()] == [NAMES[0]]
+    assert not leftover.exists()
     listed = [(row["shard"], row["key"]) for row in read_rejected(str(tmp_path)).to_pylist()]
     assert listed == [("query-drone-000000", REJECTION.path), ("query-drone-000001", None)]
     assert not writer.finish().list_changed
@@ -86,11 +96,41 @@ def test_finish_drops_skipped_parts_and_leftovers(tmp_path: Path) -> None:
 
 def test_expected_parts_damaged_list_is_replaced(tmp_path: Path) -> None:
     add_expected(str(tmp_path), NAMES)
-    (tmp_path / EXPECTED_PARTS).write_bytes(b'{"parts": [')
-    with pytest.raises(InputError, match=r"_parts\.json is damaged.*embed_gallery command"):
+    Path(expected_parts_file(str(tmp_path))).write_bytes(b'{"parts": [')
+    with pytest.raises(InputError, match=r"\.parts\.json is damaged.*embed_gallery command"):
         check_expected(str(tmp_path), NAMES)
     add_expected(str(tmp_path), NAMES)
     check_expected(str(tmp_path), NAMES)
+
+
+def test_expected_parts_within_an_older_table_are_moved(tmp_path: Path) -> None:
+    table = tmp_path / "table"
+    write(table, NAMES[0])
+    write_checksummed(str(table / OLD_NAME), {"parts": [*NAMES]})
+    (table / "_rejected").mkdir()
+    (table / "_rejected" / "rejected.parquet").write_bytes(b"an older list")
+    with pytest.raises(InputError, match=r"lacks 1 of the 2 parts .* delete .*table/_parts\.json"):
+        open_table(str(table))
+    writer_of(table).expect(EXPECTED[:1])
+    with pytest.raises(InputError, match=r"lacks 1 of the 2 parts .* delete .*table\.parts\.json"):
+        open_table(str(table))
+    write(table, NAMES[1])
+    writer_of(table).finish()
+    assert sorted(path.name for path in table.iterdir()) == [*NAMES]
+    assert open_table(str(table)).rows == 6
+
+
+def test_expected_parts_of_a_deleted_table_are_forgotten(tmp_path: Path) -> None:
+    table = tmp_path / "table"
+    writer_of(table).expect(EXPECTED)
+    writer_of(table).expect(EXPECTED[:1])  # killed before its first part, run with other flags
+    write(table, NAMES[0])
+    with pytest.raises(InputError, match="lacks 1 of the 2 parts"):
+        open_table(str(table))
+    shutil.rmtree(table)
+    writer_of(table).expect(EXPECTED[:1])
+    write(table, NAMES[0])
+    assert open_table(str(table)).rows == 3
 
 
 @pytest.mark.parametrize(
