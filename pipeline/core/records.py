@@ -87,6 +87,13 @@ MAX_EXCERPT_LENGTH = 200
 "Characters of a damaged value that are shown."
 MAX_FOUND_LENGTH = 600
 "Characters of `Rejection.found` that are kept."
+MISSING_WORDS = frozenset(
+    (
+        "", "nan", "-nan", "na", "n/a", "<na>", "#n/a", "#n/a n/a", "null", "#null!", "none", "nil",
+        "nat",
+    )
+)  # fmt: skip
+"Words for a missing value in R, SQL, Python and spreadsheets, in lower case; pandas reads them so."
 KEY_PATTERN = re.compile(rf"[a-z0-9_-]{{1,{MAX_KEY_LENGTH}}}")
 
 

@@ -54,7 +54,7 @@ class CameraTags:
     taken_at: str | None = None
     "ISO 8601; without an offset the camera's own clock."
     ignored: tuple[str, ...] = ()
-    "Blocks and positions that could not be read, as sentences."
+    "Blocks and tags that are there and could not be used, as sentences."
 
 
 def read_tags(blocks: MetadataBlocks) -> CameraTags:
@@ -73,37 +73,55 @@ def read_tags(blocks: MetadataBlocks) -> CameraTags:
     except UnreadableTag as error:
         ignored.append(str(error))
     position, unreadable = read_position(exif.gps, xmp)
-    pitch = _first_number(xmp, XMP_PITCH)
+    ignored += unreadable
+    pitch = _first_number(xmp, XMP_PITCH, ignored)
     if pitch is not None and abs(pitch) > 90:
         overshoot = abs(pitch) <= 90 + GIMBAL_OVERSHOOT_DEG
+        ignored += [] if overshoot else [f"a pitch of {pitch:g}, not from -90 to 90"]
         pitch = max(-90.0, min(90.0, pitch)) if overshoot else None
-    sea_level = _altitude(exif.gps)
+    height, sea_level = _first_number(xmp, XMP_HEIGHT, ignored), _altitude(exif.gps)
+    if sea_level is None:
+        sea_level = _first_number(xmp, ("AbsoluteAltitude",), ignored)
+    heading, taken_at = _heading(exif.gps, xmp, pitch, ignored), _taken_at(exif.photo, ignored)
     return CameraTags(
         position=position,
-        height_m=_first_number(xmp, XMP_HEIGHT),
-        sea_level_m=_first_number(xmp, ("AbsoluteAltitude",)) if sea_level is None else sea_level,
-        heading_deg=_heading(exif.gps, xmp, pitch),
+        height_m=height,
+        sea_level_m=sea_level,
+        heading_deg=heading,
         pitch_deg=pitch,
-        taken_at=_taken_at(exif.photo),
-        ignored=(*ignored, *unreadable),
+        taken_at=taken_at,
+        ignored=tuple(dict.fromkeys(ignored)),
     )
 
 
-def _heading(gps: Directory, xmp: Mapping[str, str], pitch: float | None) -> float | None:
-    gimbal, roll = _first_number(xmp, XMP_HEADING), _first_number(xmp, XMP_ROLL)
+def _heading(
+    gps: Directory, xmp: Mapping[str, str], pitch: float | None, ignored: list[str]
+) -> float | None:
+    gimbal = _first_number(xmp, XMP_HEADING, ignored)
+    roll = _first_number(xmp, XMP_ROLL, ignored)
     if gimbal is not None:
         rolled_over = roll is not None and 90 < abs(roll) <= 180
         nadir = pitch is None or pitch <= NADIR_PITCH_DEG
         return (gimbal + (180 if rolled_over and nadir else 0)) % 360
-    direction = _direction(gps)
-    heading = _first_number(xmp, XMP_BODY_HEADING) if direction is None else direction
+    direction = _direction(gps, ignored)
+    heading = _first_number(xmp, XMP_BODY_HEADING, ignored) if direction is None else direction
     return None if heading is None else heading % 360
 
 
-def _first_number(xmp: Mapping[str, str], names: tuple[str, ...]) -> float | None:
-    """The first of these properties that is a number."""
-    values = (parse_number(xmp.get(name, "")) for name in names)
-    return next((value for value in values if value is not None), None)
+def _first_number(
+    xmp: Mapping[str, str], names: tuple[str, ...], ignored: list[str]
+) -> float | None:
+    """The first of these properties that is a number; those before it that hold something else are
+    added to `ignored`.
+    """
+    for name in names:
+        text = xmp.get(name, "").strip()
+        value = parse_number(text)
+        if value is not None:
+            return value
+        if text:
+            ignored.append(f"{name} {text[:40]!r}")
+    return None
 
 
 def _first_rational(gps: Directory, tag: int) -> float | None:
@@ -119,20 +137,29 @@ def _altitude(gps: Directory) -> float | None:
     return -value if value is not None and below else value
 
 
-def _direction(gps: Directory) -> float | None:
+def _direction(gps: Directory, ignored: list[str]) -> float | None:
     """Degrees from true north; None if magnetic, because the declination is unknown here."""
-    magnetic = DIRECTION_REF in gps and gps[DIRECTION_REF].text().upper() == "M"
     value = _first_rational(gps, DIRECTION)
-    return value if value is not None and not magnetic and 0 <= value <= 360 else None
+    if value is None:
+        return None
+    if DIRECTION_REF in gps and gps[DIRECTION_REF].text().upper() == "M":
+        ignored.append("GPSImgDirection from magnetic north")
+        return None
+    if not 0 <= value <= 360:
+        ignored.append(f"GPSImgDirection {value:g}, not from 0 to 360")
+        return None
+    return value
 
 
-def _taken_at(photo: Directory) -> str | None:
+def _taken_at(photo: Directory, ignored: list[str]) -> str | None:
     taken, offset, fraction = (
         photo[tag].text() if tag in photo else "" for tag in (TAKEN, TAKEN_OFFSET, TAKEN_FRACTION)
     )
     try:
         time = datetime.strptime(taken, "%Y:%m:%d %H:%M:%S").isoformat()
     except ValueError:
-        return None  # "0000:00:00 00:00:00" of a clock that was never set
+        if re.search(r"[1-9]", taken):  # else "0000:00:00 00:00:00" of a clock that was never set
+            ignored.append(f"DateTimeOriginal {taken[:40]!r}")
+        return None
     time += f".{fraction[:6]}" if re.fullmatch(r"[0-9]+", fraction) else ""
     return time + (offset if re.fullmatch(r"[+-](0\d|1[0-4]):[0-5]\d", offset, re.ASCII) else "")

@@ -15,6 +15,7 @@ import simplejpeg
 from PIL import Image, UnidentifiedImageError
 
 from pipeline.core.arrays import Pixels
+from pipeline.images.libtiff import silence_libtiff
 from pipeline.images.stretch import FEWEST_LEVELS, deep_to_8bit
 
 PILLOW_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF", "PPM")
@@ -99,12 +100,15 @@ def _require_levels(image_HW3: Pixels) -> None:
 def decode_errors(data: bytes) -> Iterator[None]:
     """Turn any error over an image's bytes into a DecodeError with a countable reason.
 
-    Pillow's warnings of odd metadata are not shown: they come with each photo of a camera.
+    Pillow's warnings of odd metadata, and libtiff's lines about TIFF files, are not shown: they
+    come with each photo of a camera.
     """
     if PILLOW_WARNINGS not in warnings.filters:
         warnings.filterwarnings("ignore", module=PILLOW_WARNINGS[3].pattern)
     if not data:
         raise DecodeError("empty file", "0 bytes")
+    if data.startswith((b"II", b"MM")):
+        silence_libtiff()
     try:
         yield
     except (DecodeError, MemoryError):  # the latter is this machine's fault and not the image's

@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from pipeline.core import storage
 from pipeline.core.progress import console
 from pipeline.core.records import ImageRecord, Rejection, Scanned, SkippedFile
+from pipeline.images.decode import DecodeError
 from pipeline.images.inspect import undecoded_format
+from pipeline.images.optional_formats import convert_optional, extra_for
 
 MAX_REASONS = 6
 "Reasons that the summary of a scan names, the most common first."
@@ -32,15 +34,20 @@ class Source(ABC):
         """
 
     def read(self, record: ImageRecord) -> bytes:
-        """The encoded image: the file's own bytes, unless a source cuts its images out of larger
-        ones.
+        """The encoded image: the file's own bytes, unless it is of a format that an extra converts
+        or a source cuts its images out of larger ones.
 
         Raises OSError, or DecodeError with a reason that fits better.
         """
-        return storage.read_bytes(record.path)
+        data = convert_optional(record.path, storage.read_bytes(record.path))
+        if isinstance(data, Rejection):
+            raise DecodeError(data.reason, data.found)
+        return data
 
     def ending(self, record: ImageRecord) -> str:
         """The suffix of the image in a shard, behind the key's dot: jpg, png, tif, webp."""
+        if extra_for(record.path):
+            return "png"
         ending = record.path.rsplit(".", 1)[-1].lower()
         return {"jpeg": "jpg", "tiff": "tif"}.get(ending, ending)
 

@@ -25,7 +25,13 @@ from pipeline.core.records import (
 )
 from pipeline.images.camera_tags import CameraTags, read_tags
 from pipeline.images.image_blocks import UnreadableTag, find_metadata
-from pipeline.images.inspect import RAW_SUFFIXES, is_image_name
+from pipeline.images.inspect import RAW_SUFFIXES
+from pipeline.images.optional_formats import (
+    extra_for,
+    find_optional_metadata,
+    is_decodable_name,
+    undecodable_format,
+)
 from pipeline.sources.base import Source, not_an_image
 from pipeline.sources.maps.georeference import ELLIPSOID
 
@@ -65,25 +71,27 @@ class Photos(Source):
         if not storage.is_folder(root):
             raise InputError(f"no folder {root}; expected a folder of photos; check --root")
         files = storage.walk(root)
-        if not any(map(is_image_name, files)):
+        if not any(map(is_decodable_name, files)):
             endings = Counter(path.rpartition(".")[2] for path in files).most_common(3)
             found = ", ".join(f"{count} .{ending}" for ending, count in endings)
+            undecoded = next(filter(None, map(undecodable_format, files)), None)
+            found += f" ({undecoded.found})" if undecoded else ""
             raise InputError(
                 f"no images below {root}, but {found or 'nothing at all'}; expected photos in any "
                 "folders; check --root"
             )
-        stems = {_stem(path) for path in files if is_image_name(path)}
+        stems = {_stem(path) for path in files if is_decodable_name(path) and not _is_raw(path)}
         yield from prefetch_map(
             lambda photo: self._read(root, *photo, stems), list(files.items()), THREADS, PREFETCH
         )
 
     def _read(self, root: str, path: str, size: int, stems: set[str]) -> Scanned:
-        """A file's record. `stems`: the paths of all photos without their endings."""
+        """A file's record. `stems`: the paths of all photos but raw ones, without their endings."""
         full_path = storage.join(root, path)
-        if not is_image_name(path):
-            if path.lower().endswith(RAW_SUFFIXES) and _stem(path) in stems:
-                return SkippedFile(path=full_path, reason="raw copy of a photo")
-            return not_an_image(full_path)
+        if _is_raw(path) and _stem(path) in stems:
+            return SkippedFile(path=full_path, reason="raw copy of a photo")
+        if not is_decodable_name(path):
+            return undecodable_format(full_path) or not_an_image(full_path)
         try:
             ignored = self.geotags == "ignored"
             tags = CameraTags() if ignored else read_photo(full_path, size)
@@ -108,6 +116,10 @@ class Photos(Source):
         )
 
 
+def _is_raw(path: str) -> bool:
+    return path.lower().endswith(RAW_SUFFIXES)
+
+
 def _stem(path: str) -> str:
     return path.rpartition(".")[0].lower()
 
@@ -120,6 +132,8 @@ def read_photo(path: str, size: int) -> CameraTags:
     """
     if not size:
         return CameraTags()  # packing refuses the file; object stores refuse an empty range
+    if extra_for(path):  # their tags may lie anywhere
+        return read_tags(find_optional_metadata(path, storage.read_bytes(path)))
     blocks = find_metadata(storage.read_head(path, HEAD_BYTES), complete=size <= HEAD_BYTES)
     if blocks.truncated and size > HEAD_BYTES:
         blocks = find_metadata(storage.read_bytes(path), complete=True)

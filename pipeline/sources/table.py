@@ -14,33 +14,22 @@ from typing import Any
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
-from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View
+from pipeline.core.records import (
+    MISSING_WORDS,
+    GeoTag,
+    ImageRecord,
+    Rejection,
+    Split,
+    View,
+)
 from pipeline.images.camera_position import parse_number, validate_position
 from pipeline.images.image_blocks import UnreadableTag
-from pipeline.images.inspect import is_image_name
+from pipeline.images.optional_formats import is_decodable_name, undecodable_format
 from pipeline.sources.base import Source
 from pipeline.sources.maps.geojson_shapes import Shape, order_footprint, wrap_longitude
 from pipeline.sources.table_rows import BROKEN_COLUMN, SHAPE_COLUMN, Row, read_table_rows
 from pipeline.sources.text_tables import distance_m
 
-MISSING = frozenset(
-    (
-        "",
-        "nan",
-        "-nan",
-        "na",
-        "n/a",
-        "<na>",
-        "#n/a",
-        "#n/a n/a",
-        "null",
-        "#null!",
-        "none",
-        "nil",
-        "nat",
-    )
-)
-"Words for a missing value in R, SQL, Python and spreadsheets, in lower case; pandas reads them so."
 WHOLE_FLOAT = re.compile(r"(-?\d+)\.0+", re.ASCII)
 """A whole number that became a float, as pandas writes a column of numbers in which one is
 missing."""
@@ -84,7 +73,9 @@ class Table(Source):
         if not path:
             raise BadRow("missing path", "no path")
         name = path.rpartition("/")[2]
-        if not is_image_name(name):
+        if rejection := undecodable_format(name):
+            raise BadRow(rejection.reason, rejection.found)
+        if not is_decodable_name(name):
             raise BadRow("not an image's name", name)
         view = _cell_text(row, "view").lower() or self.view
         split = _cell_text(row, "split").lower() or self.split
@@ -194,7 +185,7 @@ def _cell_text(row: Row, name: str) -> str:
     if value is None or value != value:  # NaN, which pandas writes for a missing value
         return ""
     text = str(value).strip()
-    return "" if text.lower() in MISSING else text
+    return "" if text.lower() in MISSING_WORDS else text
 
 
 def _cell_number(row: Row, name: str) -> float | None:

@@ -103,6 +103,44 @@ def test_gimbal_precedes_aircraft_and_take_off_precedes_sea(
     assert tags_of(PARIS, packet('drone-dji:GimbalPitchDegree="-90.10"')).pitch_deg == -90
 
 
+@pytest.mark.parametrize(
+    ("gps", "attributes", "ignored"),
+    [
+        ({}, 'd:RelativeAltitude="n/a" d:GimbalYawDegree="10"', ("RelativeAltitude 'n/a'",)),
+        ({}, 'd:GimbalPitchDegree="-120"', ("a pitch of -120, not from -90 to 90",)),
+        ({}, 'd:GimbalPitchDegree="-90.5"', ()),
+        ({17: 33.0, 16: "M"}, "", ("GPSImgDirection from magnetic north",)),
+        ({17: 33.0, 16: "M"}, 'd:GimbalYawDegree="10"', ()),  # another tag answers
+        ({17: 400.0}, "", ("GPSImgDirection 400, not from 0 to 360",)),
+        (
+            {},
+            'd:GimbalYawDegree="x" d:FlightYawDegree="?"',
+            ("GimbalYawDegree 'x'", "FlightYawDegree '?'"),
+        ),
+    ],
+)
+def test_tags_that_cannot_be_used_are_all_listed(
+    gps: dict[int, object], attributes: str, ignored: tuple[str, ...]
+) -> None:
+    tags = tags_of(PARIS | gps, packet(attributes))
+    assert (tags.position, tags.ignored) == (PARIS_POSITION, ignored)
+
+
+@pytest.mark.parametrize(
+    ("taken", "ignored"),
+    [
+        ("0000:00:00 00:00:00", ()),
+        ("    :  :     :  :  ", ()),
+        ("2024-05-01T12:34:56", ("DateTimeOriginal '2024-05-01T12:34:56'",)),
+    ],
+)
+def test_time_that_is_no_time_is_listed(taken: str, ignored: tuple[str, ...]) -> None:
+    block = Image.Exif()
+    block.get_ifd(0x8769)[0x9003] = taken
+    tags = read_tags(MetadataBlocks(exif=block.tobytes().removeprefix(b"Exif\0\0")))
+    assert (tags.taken_at, tags.ignored) == (None, ignored)
+
+
 @pytest.mark.parametrize(("attributes", "elements"), MAKERS.values(), ids=MAKERS)
 def test_tags_are_read_in_the_forms_of_all_makers(attributes: str, elements: str) -> None:
     tags = tags_of(xmp=packet(attributes, elements))

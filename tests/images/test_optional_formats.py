@@ -77,9 +77,13 @@ def test_optional_format_raw_is_developed(monkeypatch: pytest.MonkeyPatch) -> No
     rawpy.imread = lambda stream: Raw()  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "rawpy", rawpy)
     monkeypatch.setattr(optional_formats, "find_spec", lambda module: module)
-    converted = convert_optional("c.DNG", b"II*\0")
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0x9003] = TAKEN
+    converted = convert_optional("c.DNG", exif.tobytes().removeprefix(b"Exif\0\0"))
     assert isinstance(converted, bytes)
     assert (decode(converted) == pixels_HW3).all()
+    assert read_taken_at(converted) == "2026-11-24T09:30:05"
+    assert isinstance(convert_optional("c.DNG", b"II*\0"), bytes), "a raw file without tags"
     Raw.sizes = SimpleNamespace(width=20_000, height=20_000)
     rejection = convert_optional("c.DNG", b"II*\0")
     assert isinstance(rejection, Rejection)

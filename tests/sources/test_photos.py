@@ -11,6 +11,7 @@ from PIL import Image, TiffImagePlugin
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import ImageRecord, Rejection, SkippedFile, Split, View
+from pipeline.images import optional_formats
 from pipeline.images.decode import decode
 from pipeline.sources import name_of, source_class
 from pipeline.sources.base import scan_images
@@ -73,7 +74,10 @@ def test_photos_view_and_split_come_from_settings(tmp_path: Path) -> None:
     assert record.key.startswith("gallery-satellite-")
 
 
-def test_photos_companions_skipped_and_undecoded_refused(tmp_path: Path) -> None:
+def test_photos_companions_skipped_and_undecoded_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(optional_formats, "find_spec", lambda module: None)
     photo(tmp_path / "DJI_0001.JPG")
     companions = {
         "DJI_0001.DNG": "raw copy of a photo",
@@ -88,6 +92,7 @@ def test_photos_companions_skipped_and_undecoded_refused(tmp_path: Path) -> None
     refused = {
         "DJI_0002.DNG": "format not decoded (.dng)",
         "IMG_0001.HEIC": "format not decoded (.heic)",
+        "IMG_0002.avif": "format not decoded (.avif)",
     }
     for name in (*companions, *refused):
         (tmp_path / name).write_bytes(b"x")
@@ -98,7 +103,10 @@ def test_photos_companions_skipped_and_undecoded_refused(tmp_path: Path) -> None
     assert rejected == refused
     heic = found["IMG_0001.HEIC"]
     assert isinstance(heic, Rejection)
-    assert heic.found == "IMG_0001.HEIC: HEIC is not decoded; convert it to JPEG, PNG or TIFF"
+    assert heic.found == (
+        "IMG_0001.HEIC: HEIC is not decoded; convert it to JPEG, PNG or TIFF, or install the extra "
+        "`heif`: pip install pvda[heif]"
+    )
 
 
 def test_scan_images_summary_counts_positions_and_reasons(
@@ -185,13 +193,18 @@ def test_photo_that_cannot_be_read_is_refused(
     )
 
 
-def test_photos_missing_and_empty_folder_are_refused(tmp_path: Path) -> None:
+def test_photos_missing_and_empty_folder_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(optional_formats, "find_spec", lambda module: None)
     with pytest.raises(InputError, match=r"no folder .*nowhere; expected a folder of photos"):
         list(Photos().scan(str(tmp_path / "nowhere")))
     with pytest.raises(InputError, match=r"no images below .*, but nothing at all"):
         list(Photos().scan(str(tmp_path)))
     (tmp_path / "1.DNG").write_bytes(b"")
-    with pytest.raises(InputError, match=r"but 1 \.DNG; expected photos"):
+    with pytest.raises(
+        InputError, match=r"but 1 \.DNG \(1\.DNG: DNG is not .*pvda\[raw\]\); expected photos"
+    ):
         list(Photos().scan(str(tmp_path)))
 
 
