@@ -10,7 +10,7 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import IO, Any, cast
 
@@ -18,19 +18,33 @@ from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.integrity import HashingStream
 from pipeline.core.progress import console, progress
-from pipeline.core.records import Split, View, escape_non_utf8, is_position, make_key
+from pipeline.core.records import (
+    MISSING_WORDS,
+    Split,
+    View,
+    escape_non_utf8,
+    is_position,
+    make_key,
+)
 from pipeline.shards.manifest import MANIFEST, Manifest, Shard
 from pipeline.shards.tar_reader import ALL_SUFFIXES, IMAGE_SUFFIXES, read_members
 
 EXTERNAL = "others"
 "The source in the manifest's packing settings of shards that others made."
 TAR_ENDINGS = (".tar", ".tar.gz", ".tgz")
+ARCHIVE = re.compile(
+    r"\.(tar(\.(gz|bz2|xz|zst|lz4|lzma|\d+|part\w*|crdownload))?|tgz|tbz2?|txz|tzst|zip|7z|rar)$",
+    re.IGNORECASE,
+)
+"""Names of archives of any kind: those that are not TAR_ENDINGS, unfinished downloads among them,
+are reported."""
 LOCATIONS = ("location", "label", "class", "class_name", "class_id", "place", "place_id", "id")
 "Fields of a sample's JSON that may name the place it shows, the most reliable first."
 LATITUDES = ("lat", "latitude", "gps_latitude", "gpslatitude")
 LONGITUDES = ("lon", "lng", "long", "longitude", "gps_longitude", "gpslongitude")
 NESTED = ("geotag", "gps", "position", "location", "coordinates", "geolocation", "geometry")
 "Fields that may hold an object with the position."
+USED_FIELDS = frozenset(LOCATIONS + LATITUDES + LONGITUDES + NESTED)
 WHOLE_FLOAT = re.compile(r"(-?\d+)\.0+")
 "A whole number as a table with missing values writes it: 12.0 for 12."
 OUR_NAMES = re.compile(rf"({'|'.join(Split)})-({'|'.join(View)})-")
@@ -51,14 +65,20 @@ class ScanReport:
     "Keys of metadata without an image."
     skipped: Counter[str] = field(default_factory=Counter)
     "Endings of members that are neither images nor metadata."
+    contradicting: list[str] = field(default_factory=list)
+    "Samples whose JSON members state different values, with the fields."
     other_tars: list[str] = field(default_factory=list)
     "Tars whose names state another split or view."
+    other_archives: list[str] = field(default_factory=list)
+    "Archives of kinds that are not read, and tars in folders below."
 
     def add(self, key: str, members: Mapping[str, bytes], images: list[str]) -> None:
         """Count one sample."""
         self.images += 1
         self.further_images += [f"{key}.{suffix}" for suffix in images[1:]]
         stated, _ = find_metadata(members)
+        if fields := [name for name in merge_json(members)[1] if name.lower() in USED_FIELDS]:
+            self.contradicting.append(f"{key}: {', '.join(fields)}")
         if find_position(stated) is None:
             self.without_position += 1
             self.fields.update(stated.keys())
@@ -75,7 +95,15 @@ class ScanReport:
         for listed, what in (
             (self.further_images, "further images of a sample were left out"),
             (self.without_image, "samples have no image and were left out"),
+            (
+                self.contradicting,
+                "samples have JSON members that contradict each other in fields, now ignored",
+            ),
             (self.other_tars, "tars whose names state another split or view were left out"),
+            (
+                self.other_archives,
+                "archives were left out, as only .tar, .tar.gz and .tgz in this folder are read",
+            ),
         ):
             if listed:
                 more = ", ..." if len(listed) > 3 else ""
@@ -85,9 +113,12 @@ class ScanReport:
             yield f"{self.skipped.total()} members of other kinds were left out ({endings})"
 
 
-def scan_tars(folder: str, tars: list[str], split: Split, view: View) -> Manifest:
+def scan_tars(
+    folder: str, tars: list[str], split: Split, view: View, others: Sequence[str] = ()
+) -> Manifest:
     """A manifest of the tars of this split and view: all but those whose names state another.
 
+    `others`: archives in the folder that are not read, for the report.
     Raises InputError where two samples have one key, and as `read_tar` does.
     """
     console.print(
@@ -98,7 +129,7 @@ def scan_tars(folder: str, tars: list[str], split: Split, view: View) -> Manifes
     files: dict[str, str] = {}
     scattered: list[str] = []
     seen: dict[str, str] = {}  # key -> the tar that holds it
-    report = ScanReport()
+    report = ScanReport(other_archives=list(others))
     with progress(len(tars), "reading", "tars") as meter:
         for file in tars:
             if (stated := OUR_NAMES.match(file)) and stated.groups() != (split, view):
@@ -167,10 +198,26 @@ def find_suffixes(members: Mapping[str, bytes], endings: tuple[str, ...]) -> lis
 
 
 def find_metadata(members: Mapping[str, bytes]) -> tuple[dict[str, Any], bytes | None]:
-    """A sample's JSON object, and its label."""
-    stated, labels = (find_suffixes(members, (ending,)) for ending in ("json", "cls"))
-    label = members[labels[0]] if labels else None
-    return parse_json(members[stated[0]] if stated else None), label
+    """A sample's JSON objects as one, without the fields that they contradict each other in, and
+    its label.
+    """
+    stated, contradictions = merge_json(members)
+    labels = find_suffixes(members, ("cls",))
+    kept = {name: value for name, value in stated.items() if name not in contradictions}
+    return kept, members[labels[0]] if labels else None
+
+
+def merge_json(members: Mapping[str, bytes]) -> tuple[dict[str, Any], list[str]]:
+    """The fields of all JSON objects of a sample, and the names of those with several values."""
+    objects = [parse_json(members[suffix]) for suffix in find_suffixes(members, ("json",))]
+    merged: dict[str, Any] = {}
+    contradictions = []
+    for stated in objects:
+        contradictions += [
+            name for name in stated if merged.get(name, stated[name]) != stated[name]
+        ]
+        merged = stated | merged
+    return merged, contradictions
 
 
 def external_metadata(
@@ -197,10 +244,14 @@ def external_metadata(
 
 
 def _name(value: object) -> str:
-    """A location's name from text or a number, 12 for 12.0; empty where it is none."""
+    """A location's name from text or a number, 12 for 12.0; empty where it is none, or a word for
+    a missing value.
+    """
     if isinstance(value, bool) or not isinstance(value, str | int | float):
         return ""
     text = str(value).strip()
+    if text.lower() in MISSING_WORDS:
+        return ""
     whole = WHOLE_FLOAT.fullmatch(text)
     return whole[1] if whole else text
 
@@ -237,9 +288,11 @@ def _number(value: object) -> float | None:
 
 
 def parse_json(data: bytes | None) -> dict[str, Any]:
-    """A JSON object; empty where the bytes are none."""
+    """A JSON object, perhaps alone in a list; empty where the bytes are none."""
     try:
         stated = json.loads(data or b"{}")
     except (ValueError, RecursionError):
         return {}
+    if isinstance(stated, list) and len(stated) == 1:
+        [stated] = stated
     return stated if isinstance(stated, dict) else {}

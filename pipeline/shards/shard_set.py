@@ -13,7 +13,7 @@ from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.shards import record_table
-from pipeline.shards.external import EXTERNAL, TAR_ENDINGS, scan_tars
+from pipeline.shards.external import ARCHIVE, EXTERNAL, TAR_ENDINGS, scan_tars
 from pipeline.shards.manifest import MANIFEST, Manifest, Shard, read_manifest, repair_hint
 from pipeline.shards.samples import Sample, read_locations, read_samples
 from pipeline.shards.tar_reader import IMAGE_SUFFIXES, read_tar
@@ -151,13 +151,22 @@ def open_shards(path: str) -> ShardSet:
 def open_or_scan(path: str, split: Split | None = None, view: View | None = None) -> ShardSet:
     """Open a set of shards; one that others made has no manifest, and is read once to make it.
 
-    Raises InputError where there is neither a manifest nor a tar, or where there are only tars and
+    Raises InputError where there is neither a manifest nor a tar, but perhaps archives of other
+    kinds or tars in folders below it, or where there are only tars and
     not both split and view are given: an interrupted packing of ours looks the same, and must not
     pass for a complete set.
     """
     if storage.exists(storage.join(path, MANIFEST)):
         return open_shards(path)
-    tars = [name for name in storage.list_names(path) if name.endswith(TAR_ENDINGS)]
+    files = storage.walk(path) if storage.is_folder(path) else {}
+    tars = [name for name in files if name.endswith(TAR_ENDINGS) and "/" not in name]
+    others = [name for name in files if ARCHIVE.search(name) and name not in tars]
+    if others and not tars:
+        raise InputError(
+            f"{path} holds {len(others)} archives that are not read here, {others[0]} first, "
+            "expected .tar, .tar.gz or .tgz directly in it; name the folder of the tars, or "
+            "convert the archives"
+        )
     if not tars:
         return open_shards(path)  # raises, and says what is missing
     if split is None or view is None:
@@ -166,7 +175,7 @@ def open_or_scan(path: str, split: Split | None = None, view: View | None = None
             "be finished with jobs/make_shards.py, or shards that others made, of which expected "
             "both --split and --view; give them"
         )
-    return ShardSet(path=path, manifest=scan_tars(path, tars, split, view))
+    return ShardSet(path=path, manifest=scan_tars(path, tars, split, view, others))
 
 
 def first_three(sentences: Collection[str]) -> str:

@@ -25,6 +25,8 @@ pickles."""
 ALL_SUFFIXES = IMAGE_SUFFIXES + METADATA_SUFFIXES
 OUTSIDE = re.compile(r"[/\\]|.:|(?:.*[/\\])?\.\.(?:[/\\]|$)", re.DOTALL)
 "Names that lead out of the folder that a tar is unpacked in."
+DUPLICATE = re.compile(r"(.*): duplicate file name in tar file", re.DOTALL)
+"webdataset's message about two members of a sample with the same ending."
 
 
 def read_tar(
@@ -58,7 +60,12 @@ def read_members(
 
     def is_wanted(name: str) -> bool:
         check_member_name(name, path)
-        suffix = name.rpartition("/")[2].partition(".")[2].lower()
+        file = name.rpartition("/")[2]
+        if file.startswith("."):  # such as the `._a.jpg` that macOS writes beside `a.jpg`
+            if skipped is not None:
+                skipped["hidden"] += 1
+            return False
+        suffix = file.partition(".")[2].lower()
         ending = suffix.rpartition(".")[2] if external else suffix
         if ending not in suffixes and skipped is not None:
             skipped[f".{ending}" if ending else "no ending"] += 1
@@ -83,6 +90,12 @@ def read_members(
         raise InputError(_reason(error, guard)) from None
     # ValueError and RecursionError are raised for headers that make no sense.
     except (*GZIP_ERRORS, tarfile.TarError, EOFError, ValueError, RecursionError) as error:
+        if twice := DUPLICATE.match(_reason(error, guard)):
+            raise InputError(
+                f"{path} holds a second {twice[1]} in one sample (capital and small letters are "
+                "the same in endings), expected one file of each ending; pack the tar again "
+                "without one of them"
+            ) from None
         raise InputError(
             f"{path} is cut off or damaged after {samples} samples ({_reason(error, guard)}), "
             "expected a complete tar; copy it again from where it came from, or pack again with "

@@ -57,6 +57,57 @@ def test_external_members_are_joined(
     assert "left out" not in capsys.readouterr().err
 
 
+def test_external_member_twice_in_a_sample_is_named(tmp_path: Path) -> None:
+    tar_file(tmp_path / "0.tar", {"a.jpg": picture(1), "a.JPG": picture(2), "a.json": label("x")})
+    with pytest.raises(
+        InputError, match=r"0\.tar holds a second a\.JPG in one sample .*, expected"
+    ):
+        read_all(tmp_path)
+
+
+def test_external_json_members_of_a_sample_are_joined(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`a.info.json` has the label, `a.jpg.json` the position; those of b contradict each other."""
+    members = {
+        "a.jpg": picture(1),
+        "a.info.json": json.dumps({"label": "x", "note": 1}).encode(),
+        "a.jpg.json": json.dumps([{"lat": 47.5, "lon": 8, "note": 2}]).encode(),
+        "b.jpg": picture(2),
+        "b.info.json": json.dumps({"label": "y", "lat": 1, "lon": 2}).encode(),
+        "b.jpg.json": json.dumps({"label": "y", "lat": -1, "lon": 2}).encode(),
+    }
+    tar_file(tmp_path / "0.tar", members)
+    shards = open_or_scan(str(tmp_path), *TWO)
+    [first, second] = shards.samples(shards.manifest.shards[0])
+    assert (first.metadata["location"], second.metadata["location"]) == ("x", "y")
+    assert first.metadata["geotag"] == {"lat": 47.5, "lon": 8}
+    assert second.metadata["geotag"] is None
+    report = " ".join(capsys.readouterr().err.split())
+    assert "1 samples have JSON members that contradict each other" in report
+    assert "(b: lat)" in report
+    assert "1 of 2 images: no position found" in report
+
+
+@pytest.mark.parametrize("word", [b"NaN", b'"nan"', b'"NA"', b"null", b'""', b'" none "'])
+def test_external_location_that_is_missing_is_none(word: bytes, tmp_path: Path) -> None:
+    members = {f"{name}.jpg": picture(shade) for shade, name in enumerate("ab")}
+    members |= {f"{name}.json": b'{"label": %s}' % word for name in "ab"}
+    tar_file(tmp_path / "0.tar", members)
+    assert read_all(tmp_path) == {"a-a": "a", "b-b": "b"}
+
+
+def test_external_hidden_members_are_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As macOS writes its attributes of files: `._a.jpg` beside `a.jpg`."""
+    members = {"./._a.jpg": b"x", "./a.jpg": picture(1), "./._a.json": b"x", "./a.json": label("x")}
+    tar_file(tmp_path / "0.tar", members | {"__MACOSX/._a.jpg": b"x"})
+    assert read_all(tmp_path) == {"x-a": "x"}
+    report = " ".join(capsys.readouterr().err.split())
+    assert "3 members of other kinds were left out (3 hidden)" in report
+
+
 @pytest.mark.parametrize("name", ["0.tar.gz", "0.tgz", "0.tar"])
 def test_external_tar_in_gzip_is_read(name: str, tmp_path: Path) -> None:
     tar_file(tmp_path / name, {"a.jpg": picture(1), "a.json": label("x")}, "w:gz")
@@ -71,6 +122,32 @@ def test_external_tar_and_gzip_of_one_name_are_both_read(tmp_path: Path) -> None
     tar_file(tmp_path / "0.tar", {"a.jpg": picture(1), "a.json": label("x")})
     tar_file(tmp_path / "0.tar.gz", {"b.jpg": picture(2), "b.json": label("y")}, "w:gz")
     assert read_all(tmp_path) == {"x-a": "x", "y-b": "y"}
+
+
+def test_external_archives_of_other_kinds_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tar_file(tmp_path / "0.tar", {"a.jpg": picture(1), "a.json": label("x")})
+    archives = ("1.tar.bz2", "2.tar.xz", "3.zip", "4.tar.zst", "5.tar.part", "6.TAR", "x/7.tar")
+    for name in archives:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"x")
+    for name in ("0.tar.md5", "0.tar.idx", "0.json", "0.parquet", "0_stats.json"):
+        (tmp_path / name).write_bytes(b"x")
+    assert read_all(tmp_path) == {"x-a": "x"}
+    report = " ".join(capsys.readouterr().err.split())
+    assert f"{len(archives)} archives were left out" in report
+    assert "(1.tar.bz2, 2.tar.xz, 3.zip, ...)" in report
+
+
+@pytest.mark.parametrize("name", ["0.tar.bz2", "0.zip", "train/0.tar"])
+def test_external_folder_without_readable_tars_names_them(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(
+        InputError, match=rf"holds 1 archives that are not read here, {name} first, expected \.tar,"
+    ):
+        open_or_scan(str(tmp_path), *TWO)
 
 
 def test_external_gzip_of_a_huge_file_is_refused(tmp_path: Path) -> None:
