@@ -123,7 +123,8 @@ def test_tags_that_cannot_be_used_are_all_listed(
     gps: dict[int, object], attributes: str, ignored: tuple[str, ...]
 ) -> None:
     tags = tags_of(PARIS | gps, packet(attributes))
-    assert (tags.position, tags.ignored) == (PARIS_POSITION, ignored)
+    assert tags.position == PARIS_POSITION
+    assert tags.ignored == ignored
 
 
 @pytest.mark.parametrize(
