@@ -15,6 +15,13 @@ MAX_DEPTH = 32
 "Elements within elements; cameras need five."
 STRUCTURAL_ELEMENTS = {"xmpmeta", "xapmeta", "RDF", "Description", "Seq", "Bag", "Alt", "li"}
 "Elements that hold properties and are none."
+WIDE_ENCODINGS = {
+    b"\0\0\xfe\xff": "utf-32-be", b"\xff\xfe\0\0": "utf-32-le", b"\xfe\xff": "utf-16-be",
+    b"\xff\xfe": "utf-16-le", b"\0\0\0<": "utf-32-be", b"<\0\0\0": "utf-32-le", b"\0<": "utf-16-be",
+    b"<\0": "utf-16-le",
+}  # fmt: skip
+"""How packets begin whose characters have two or four bytes [XMP part 3, 1.1.2]: with a byte order
+mark, or the first character of XML. Longer ones first."""
 
 
 def read_xmp(packet: bytes) -> dict[str, str]:
@@ -49,13 +56,13 @@ def read_xmp(packet: bytes) -> dict[str, str]:
     def doctype(*_: object) -> None:
         raise UnreadableTag("XMP with a DOCTYPE")
 
-    parser = expat.ParserCreate()
+    content, encoding = _narrow(packet)
+    parser = expat.ParserCreate(encoding)
     parser.StartElementHandler, parser.EndElementHandler = begin, end
     parser.CharacterDataHandler = text.append
     parser.StartDoctypeDeclHandler = doctype
     try:
-        # Padding behind the last element is common.
-        parser.Parse(packet.strip(b"\0 \t\r\n"), True)
+        parser.Parse(content, True)
     except expat.ExpatError as error:
         raise UnreadableTag(f"XMP that is not XML: {error}") from None
     except (ValueError, LookupError) as error:
@@ -63,6 +70,17 @@ def read_xmp(packet: bytes) -> dict[str, str]:
             raise
         raise UnreadableTag(f"XMP in an unknown encoding: {error}") from None
     return properties
+
+
+def _narrow(packet: bytes) -> tuple[bytes, str | None]:
+    """A packet without the padding that is common at its end, and the encoding that it has whatever
+    its XML says; None: as it says.
+    """
+    for start, encoding in WIDE_ENCODINGS.items():
+        if packet.startswith(start):
+            text = packet.decode(encoding, "replace").strip("\ufeff\0 \t\r\n")
+            return text.encode("utf-8", "replace"), "utf-8"
+    return packet.strip(b"\0 \t\r\n"), None
 
 
 def _local_name(name: str) -> str:

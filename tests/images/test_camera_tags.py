@@ -148,6 +148,19 @@ def test_tags_are_read_in_the_forms_of_all_makers(attributes: str, elements: str
     assert (tags.position, tags.heading_deg, tags.pitch_deg) == ((48.8582, -2.2945), 10, -80)
 
 
+@pytest.mark.parametrize("encoding", ["utf-16-be", "utf-16-le", "utf-32-be", "utf-32-le"])
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+@pytest.mark.parametrize("padding", ["", " \n\0"])
+def test_xmp_in_two_or_four_bytes_a_character_is_read(
+    encoding: str, mark: str, padding: str
+) -> None:
+    text = packet(DJI).decode()
+    declared = f'<?xml version="1.0" encoding="UTF-16"?>{text[text.index("<x:xmpmeta") :]}'
+    for written in (text, declared):
+        wide = f"{mark}{written}{padding}".encode(encoding)
+        assert read_xmp(wide) == read_xmp(packet(DJI))
+
+
 def test_xmp_with_a_doctype_is_refused_in_any_encoding() -> None:
     laughs = '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;">]>'
     for hostile in (packet(before=laughs), packet(before=laughs).decode().encode("utf-16")):
