@@ -21,6 +21,7 @@ from pipeline.images.inspect import (
     is_image_name,
     undecoded_format,
 )
+from pipeline.images.tiff_extents import pixels_end
 
 HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 EXTRAS = {"heif": (HEIF_SUFFIXES, "pillow_heif"), "raw": (RAW_SUFFIXES, "rawpy")}
@@ -110,6 +111,9 @@ def _heif_to_png(data: bytes) -> bytes:
 def _raw_to_png(data: bytes) -> bytes:
     import rawpy
 
+    if (end := pixels_end(data)) > len(data):
+        found = f"{len(data)} bytes of a raw file whose pixels end at {end}"
+        raise DecodeError("truncated image", found)
     with rawpy.imread(io.BytesIO(data)) as raw:
         _check_size(raw.sizes.width, raw.sizes.height)
         pixels_HW3 = raw.postprocess(use_camera_wb=True)  # upright

@@ -84,6 +84,13 @@ def test_optional_format_raw_is_developed(monkeypatch: pytest.MonkeyPatch) -> No
     assert (decode(converted) == pixels_HW3).all()
     assert read_taken_at(converted) == "2026-11-24T09:30:05"
     assert isinstance(convert_optional("c.DNG", b"II*\0"), bytes), "a raw file without tags"
+    whole = io.BytesIO()
+    picture().save(whole, "TIFF")
+    assert isinstance(convert_optional("c.NEF", whole.getvalue()), bytes)
+    rejection = convert_optional("c.NEF", whole.getvalue()[:-1000])
+    assert isinstance(rejection, Rejection)
+    assert (rejection.reason, len(whole.getvalue())) == ("truncated image", 28_940)
+    assert "bytes of a raw file whose pixels end at 28940" in rejection.found
     Raw.sizes = SimpleNamespace(width=20_000, height=20_000)
     rejection = convert_optional("c.DNG", b"II*\0")
     assert isinstance(rejection, Rejection)
