@@ -3,6 +3,7 @@ TABLE`
 """
 
 from dataclasses import fields
+from functools import cache
 
 from jobs.command_line.cli import run
 from jobs.encoding.settings import EncoderSettings
@@ -15,6 +16,7 @@ def main(settings: EmbedSettings) -> None:
     """Embed shards into a feature table, one part per shard; finished parts are skipped."""
     from jobs.encoding.encoder import make_encoder_spec, read_checkpoint_bytes
     from pipeline.features.embed import embed_gallery
+    from pipeline.shards.shard_set import ShardSet, open_or_scan
 
     checkpoint = read_checkpoint_bytes(settings.checkpoint)
     given = {field.name: getattr(settings, field.name) for field in fields(EmbeddingSettings)}
@@ -23,8 +25,13 @@ def main(settings: EmbedSettings) -> None:
     encoder = EncoderSettings(
         **{field.name: getattr(settings, field.name) for field in fields(EncoderSettings)}
     )
-    spec = make_encoder_spec(checkpoint, settings.checkpoint, embedding, encoder)
-    embed_gallery(embedding, spec)
+
+    @cache  # of shards without a manifest it takes a pass over all tars
+    def open_set() -> ShardSet:
+        return open_or_scan(embedding.shards, embedding.split, embedding.view)
+
+    spec = make_encoder_spec(checkpoint, settings.checkpoint, embedding, encoder, open_set)
+    embed_gallery(embedding, spec, open_set())
 
 
 if __name__ == "__main__":

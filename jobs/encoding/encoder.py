@@ -5,6 +5,7 @@ In: a checkpoint's bytes, the settings of encoding, and some images of the shard
 EncoderSpec, with the fingerprint and the encoding that the feature table records.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -28,7 +29,7 @@ from pipeline.features.embed_worker import EncoderSpec
 from pipeline.features.encoding import EncodingConfig
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.images.transforms import preprocessing_name
-from pipeline.shards.shard_set import open_or_scan
+from pipeline.shards.shard_set import ShardSet, open_or_scan
 
 COMPILED: dict[Compiling, bool | Literal["auto"]] = {"auto": "auto", "always": True, "never": False}
 "`compiled` of `optimise_encoder` by the setting."
@@ -91,10 +92,15 @@ def read_checkpoint_bytes(path: str) -> bytes:
 
 
 def make_encoder_spec(
-    data: bytes, name: str, embedding: EmbeddingSettings, settings: EncoderSettings | None = None
+    data: bytes,
+    name: str,
+    embedding: EmbeddingSettings,
+    settings: EncoderSettings | None = None,
+    open_set: Callable[[], ShardSet] | None = None,
 ) -> EncoderSpec:
     """The spec of a checkpoint whose bytes were read from `name`.
 
+    `open_set` opens the shards of `embedding`; it is called when the checkpoint has proved usable.
     Raises CheckpointError when the bytes are no checkpoint, InputError where the precision is not
     available or no image can be decoded.
     """
@@ -102,8 +108,9 @@ def make_encoder_spec(
     checkpoint = loads(data, name)
     precision = _available_precision(settings, embedding)
     size = checkpoint.network.image_size
-    # Opened once: of shards without a manifest it takes a pass over all tars.
-    shards = open_or_scan(embedding.shards, embedding.split, embedding.view)
+    shards = (
+        open_set() if open_set else open_or_scan(embedding.shards, embedding.split, embedding.view)
+    )
     count = PROBE_IMAGES + (CALIBRATION_IMAGES if precision == "int8" else 0)
     images_B3HW = first_images(shards, size, settings.resizer, count)
     calibration_B3HW = images_B3HW[PROBE_IMAGES:] if precision == "int8" else None

@@ -61,16 +61,19 @@ class EmbeddingRun:
     "Of threads, by what they did: read, decode, infer, write."
 
 
-@locks_output(lambda settings, encoder: settings.out)
-def embed_gallery(settings: EmbeddingSettings, encoder: EncoderSpec) -> int:
+@locks_output(lambda settings, encoder, shard_set=None: settings.out)
+def embed_gallery(
+    settings: EmbeddingSettings, encoder: EncoderSpec, shard_set: ShardSet | None = None
+) -> int:
     """Embed every shard that has no finished part yet; returns how many images were embedded.
 
+    `shard_set`: the set of the settings, where it is open already.
     `settings` must name paths that a worker can open (absolute, or URIs). Raises InputError on
     unusable input, Incomplete where shards are unreadable or kill their workers; the others are
     done then.
     """
     writer = FeatureTableWriter(settings.out, encoder.fingerprint, settings.dtype)
-    plan = plan_embedding(settings, writer)
+    plan = plan_embedding(settings, writer, shard_set)
     run = run_workers(settings, encoder, plan)
     for name, skipped in run.skipped.items():
         writer.skip(part_name(name), skipped.reason, skipped.found)
@@ -83,12 +86,14 @@ def part_name(shard: str) -> str:
     return f"{shard}.parquet"
 
 
-def plan_embedding(settings: EmbeddingSettings, writer: FeatureTableWriter) -> EmbeddingPlan:
+def plan_embedding(
+    settings: EmbeddingSettings, writer: FeatureTableWriter, shard_set: ShardSet | None = None
+) -> EmbeddingPlan:
     """Find the shards that have no finished part.
 
     Raises InputError when none was requested, or the table is another encoder's.
     """
-    shard_set = open_or_scan(settings.shards, settings.split, settings.view)
+    shard_set = shard_set or open_or_scan(settings.shards, settings.split, settings.view)
     if settings.verify and not shard_set.external:
         require_intact(shard_set)
     shards = requested_shards(settings, shard_set)
