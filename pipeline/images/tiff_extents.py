@@ -1,8 +1,8 @@
 """Where the pixels of a TIFF's images lie, to find files that end before them.
 
-Raw decoders fill the missing part of a photo with black and say nothing: a copy that was cut off
-looks like a dark photo. In: the bytes of a raw file in TIFF's structure (DNG, NEF, CR2, ARW, PEF).
-Out: how far its strips and tiles reach.
+LibRaw makes a picture of compressed pixels that were cut off, of whatever its memory held, and
+raises no error: such a copy would be packed as noise. In: the bytes of a raw file in TIFF's
+structure (DNG, NEF, CR2, ARW, PEF). Out: how far its strips and tiles reach.
 """
 
 import io
