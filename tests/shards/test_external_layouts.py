@@ -90,11 +90,14 @@ def test_external_json_members_of_a_sample_are_joined(
 
 
 @pytest.mark.parametrize("word", [b"NaN", b'"nan"', b'"NA"', b"null", b'""', b'" none "'])
-def test_external_location_that_is_missing_is_none(word: bytes, tmp_path: Path) -> None:
+def test_external_location_that_is_missing_is_none(
+    word: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     members = {f"{name}.jpg": picture(shade) for shade, name in enumerate("ab")}
     members |= {f"{name}.json": b'{"label": %s}' % word for name in "ab"}
     tar_file(tmp_path / "0.tar", members)
     assert read_all(tmp_path) == {"a-a": "a", "b-b": "b"}
+    assert "contradict" not in capsys.readouterr().err
 
 
 def test_external_hidden_members_are_counted(
