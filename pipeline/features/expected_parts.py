@@ -11,15 +11,15 @@ from collections.abc import Iterable
 from pipeline.core import json_files, storage
 from pipeline.core.errors import InputError
 
-ENDING = ".parts.json"
+PARTS_ENDING = ".parts.json"
 "Behind the table's path."
-OLD_NAME = "_parts.json"
+OLD_PARTS_NAME = "_parts.json"
 "Within the table, where tables had the list at first; adding parts moves it."
 
 
 def expected_parts_file(table: str) -> str:
     """The path of a table's list, of the old one where there is only that."""
-    path, old = storage.beside(table, ENDING), storage.join(table, OLD_NAME)
+    path, old = storage.beside(table, PARTS_ENDING), storage.join(table, OLD_PARTS_NAME)
     return old if not storage.exists(path) and storage.exists(old) else path
 
 
@@ -27,7 +27,7 @@ def add_expected(table: str, names: Iterable[str]) -> None:
     """Add parts to the list; those that were added before stay, unless the table's folder is gone.
     A damaged list is replaced.
     """
-    old = storage.join(table, OLD_NAME)
+    old = storage.join(table, OLD_PARTS_NAME)
     known = set(_read(table, replace_damaged=True)) if storage.is_folder(table) else set[str]()
     if not known.issuperset(added := set(names)) or storage.exists(old):
         _write(table, known | added)
@@ -70,4 +70,4 @@ def _read(table: str, replace_damaged: bool = False) -> list[str]:
 
 
 def _write(table: str, names: set[str]) -> None:
-    json_files.write_checksummed(storage.beside(table, ENDING), {"parts": sorted(names)})
+    json_files.write_checksummed(storage.beside(table, PARTS_ENDING), {"parts": sorted(names)})

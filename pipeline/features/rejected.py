@@ -12,17 +12,17 @@ from pipeline.core import parquet as parquet_files
 from pipeline.core import rejections, storage
 from pipeline.core.errors import InputError
 
-ENDING = ".rejected.parquet"
+REJECTED_ENDING = ".rejected.parquet"
 """Behind the table's path: beside the folder, since some readers (Polars) take every file within it
 for a part."""
-OLD_NAME = f"_rejected/{rejections.REJECTED_FILE}"
+OLD_REJECTED_NAME = f"_rejected/{rejections.REJECTED_FILE}"
 "Within the table, where tables had the list at first; writing the list removes it."
 REJECTED_SCHEMA = pa.schema([(name, pa.string()) for name in ("shard", "key", "reason", "found")])
 
 
 def rejected_file(table: str) -> str:
     """The path of a table's list."""
-    return storage.beside(table, ENDING)
+    return storage.beside(table, REJECTED_ENDING)
 
 
 def write_rejected(table: str, rejected: Iterable[tuple[str, str | None, str, str]]) -> bool:
@@ -32,7 +32,7 @@ def write_rejected(table: str, rejected: Iterable[tuple[str, str | None, str, st
     and is not written again when it is the same. Returns whether it changed.
     """
     rows = sorted(rejected, key=lambda row: (row[0], row[1] or ""))
-    path, old = rejected_file(table), storage.join(table, OLD_NAME)
+    path, old = rejected_file(table), storage.join(table, OLD_REJECTED_NAME)
     if storage.exists(old):
         storage.remove_folder(old.rpartition("/")[0])
     entries = [dict(zip(REJECTED_SCHEMA.names, row, strict=True)) for row in rows]

@@ -212,9 +212,9 @@ def merge_json(members: Mapping[str, bytes]) -> tuple[dict[str, Any], list[str]]
     objects = [parse_json(members[suffix]) for suffix in find_suffixes(members, ("json",))]
     merged: dict[str, Any] = {}
     contradictions = []
-    for stated in objects:
+    for stated in objects:  # compared as text, since NaN is not equal to itself
         contradictions += [
-            name for name in stated if merged.get(name, stated[name]) != stated[name]
+            name for name in stated if name in merged and repr(stated[name]) != repr(merged[name])
         ]
         merged = stated | merged
     return merged, contradictions

@@ -11,7 +11,7 @@ from pipeline.core.json_files import write_checksummed
 from pipeline.core.records import Rejection
 from pipeline.features.encoding import EncodingConfig
 from pipeline.features.expected_parts import (
-    OLD_NAME,
+    OLD_PARTS_NAME,
     add_expected,
     check_expected,
     expected_parts_file,
@@ -106,7 +106,7 @@ def test_expected_parts_damaged_list_is_replaced(tmp_path: Path) -> None:
 def test_expected_parts_within_an_older_table_are_moved(tmp_path: Path) -> None:
     table = tmp_path / "table"
     write(table, NAMES[0])
-    write_checksummed(str(table / OLD_NAME), {"parts": [*NAMES]})
+    write_checksummed(str(table / OLD_PARTS_NAME), {"parts": [*NAMES]})
     (table / "_rejected").mkdir()
     (table / "_rejected" / "rejected.parquet").write_bytes(b"an older list")
     with pytest.raises(InputError, match=r"lacks 1 of the 2 parts .* delete .*table/_parts\.json"):

@@ -160,7 +160,10 @@ def test_open_external_without_split_or_view_is_refused(foreign: str, tmp_path: 
         open_or_scan(foreign, view=View.SATELLITE)
     with pytest.raises(InputError, match=r"part-00\.tar was not packed by jobs/make_shards\.py"):
         list(read_samples(f"{foreign}/part-00.tar"))
+    (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="not a finished set of shards"):
+        open_or_scan(str(tmp_path / "empty"), *TWO)
+    with pytest.raises(InputError, match=r"holds 2 archives .*, foreign/part-00\.tar first, exp"):
         open_or_scan(str(tmp_path), *TWO)
     with pytest.raises(InputError, match=r"no manifest\.json"):
         TrainingStream(open_shards(foreign), StreamConfig())
