@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core.errors import InputError
-from pipeline.core.integrity import FileChecksum
 from pipeline.core.json_files import (
     CHECKSUM_KEY,
     checksum_of,
@@ -22,22 +21,15 @@ from pipeline.core.json_files import (
     read_checksummed,
 )
 from pipeline.core.records import Split, View
-from pipeline.features.encoding import EncodingConfig
 from pipeline.index.metadata import (
-    IndexMetadata,
-    PartMetadata,
-    SearchParams,
     metadata_dict,
     read_metadata,
 )
 from pipeline.locate.calibration import (
     FEATURE_NAMES,
-    Calibration,
     read_calibration,
     write_calibration,
 )
-from pipeline.locate.logistic import LogisticModel
-from pipeline.locate.reliability import ReliabilityBin
 from pipeline.shards.manifest import Manifest, Shard, read_manifest
 from pipeline.shards.pack import find_finished
 from pipeline.shards.settings import PackingSettings
@@ -45,6 +37,8 @@ from pipeline.simulation.settings import SimulationSettings
 from pipeline.simulation.simulate import simulate
 from tests.fuzz.bounds import bounded, examples
 from tests.fuzz.hostile import damaged, twisted
+from tests.index.metadata_builder import make_metadata
+from tests.locate.calibrations import make_calibration
 
 SHARD = Shard(
     name="query-drone-000000",
@@ -59,61 +53,6 @@ MANIFEST = Manifest(
     classes=("0001",),
     packing={"source": "photos"},
     rejected=0,
-)
-FILE = FileChecksum(bytes=10, sha256="0" * 64)
-METADATA = IndexMetadata(
-    factory="Flat",
-    metric="inner product",
-    rows=2,
-    dimension=4,
-    fingerprint="0" * 64,
-    encoding=EncodingConfig(mirror=True, resizer="torch", precision="float32"),
-    table="/nowhere",
-    settings={"split": None},
-    reason="small",
-    refine="none",
-    on_disk=False,
-    search_params=SearchParams(nprobe_or_ef=1),
-    target_recall=0.95,
-    unit_rows=2,
-    part_rows=2,
-    training_sample=0,
-    build_seconds=0.1,
-    bytes_per_vector=16.0,
-    expected_bytes=None,
-    measured={"recall_at_1": 1.0},
-    parts=(
-        PartMetadata(
-            faiss="index.faiss",
-            ids="ids.arrow",
-            first_row=0,
-            rows=2,
-            table_parts={"query-drone-000000.parquet": "0" * 64},
-            files={"index.faiss": FILE, "ids.arrow": FILE},
-        ),
-    ),
-    trained={"trained.faiss": FILE},
-)
-NUMBERS = (0.1,) * len(FEATURE_NAMES)
-CALIBRATION = Calibration(
-    fingerprint="0" * 64,
-    gallery_rows=2,
-    photo_selection="photos",
-    spacing_m=20.0,
-    agreement_radius_m=50.0,
-    tolerance_m=25.0,
-    outside=0.5,
-    model=LogisticModel(mean_F=NUMBERS, scale_F=NUMBERS, coefficient_F=NUMBERS, intercept=0.0),
-    threshold=0.5,
-    inverse_temperature=1.0,
-    none_log_odds=0.0,
-    photos=10,
-    locations=5,
-    accuracy=0.5,
-    right_kept=0.5,
-    outside_unknown=0.5,
-    calibration_error=0.1,
-    bins=(ReliabilityBin(predicted=0.5, observed=0.5, share=1.0),),
 )
 
 
@@ -164,7 +103,7 @@ def test_shard_name_outside_the_folder_is_rejected(name: str, folder: Path) -> N
 @given(st.data())
 @examples(120)
 def test_damaged_index_metadata_is_read_or_rejected(folder: Path, data: st.DataObject) -> None:
-    put(data, folder / "index" / "index.json", metadata_dict(METADATA))
+    put(data, folder / "index" / "index.json", metadata_dict(make_metadata()))
     with bounded(InputError):
         found = read_metadata(str(folder / "index"))
         assert all(is_file_name(name) for part in found.parts for name in part.files)
@@ -174,7 +113,7 @@ def test_damaged_index_metadata_is_read_or_rejected(folder: Path, data: st.DataO
 @examples(80)
 def test_damaged_calibration_is_read_or_rejected(folder: Path, data: st.DataObject) -> None:
     path = folder / "calibration.json"
-    write_calibration(str(path), CALIBRATION)
+    write_calibration(str(path), make_calibration(fingerprint="0" * 64))
     put(data, path, read_checksummed(str(path)))
     with bounded(InputError):
         found = read_calibration(str(path), "0" * 64)

@@ -4,13 +4,10 @@ damaged by flipped bits, zeroed blocks, truncation and removal: rejected, or rea
 
 from pathlib import Path
 
-from pipeline.locate.calibration import Calibration, read_calibration, write_calibration
+from pipeline.locate.calibration import read_calibration, write_calibration
 from pipeline.locate.logistic import LogisticModel
-from pipeline.locate.reliability import ReliabilityBin
-from tests.damaging import (
-    count_detected,
-    raising_if_missing,
-)
+from tests.damaging import count_detected, raising_if_missing
+from tests.locate.calibrations import make_calibration
 
 
 def test_calibration_damaged_is_rejected(tmp_path: Path) -> None:
@@ -20,26 +17,7 @@ def test_calibration_damaged_is_rejected(tmp_path: Path) -> None:
         coefficient_F=(1.5, 2.5, 3.5, 4.5),
         intercept=0.25,
     )
-    calibration = Calibration(
-        fingerprint="f" * 64,
-        gallery_rows=5,
-        photo_selection="places held out",
-        spacing_m=10.0,
-        agreement_radius_m=5.0,
-        tolerance_m=3.0,
-        outside=0.5,
-        model=model,
-        threshold=0.5,
-        inverse_temperature=9.0,
-        none_log_odds=0.1,
-        photos=3,
-        locations=2,
-        accuracy=0.7,
-        right_kept=0.6,
-        outside_unknown=0.8,
-        calibration_error=0.02,
-        bins=(ReliabilityBin(predicted=0.5, observed=0.4, share=1.0),),
-    )
+    calibration = make_calibration(model=model)
     path = tmp_path / "calibration.json"
     write_calibration(str(path), calibration)
     look = raising_if_missing(path, lambda: read_calibration(str(path), "f" * 64))

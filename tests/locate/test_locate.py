@@ -29,8 +29,8 @@ from pipeline.locate.locate import (
     relative_scores,
 )
 from pipeline.locate.logistic import LogisticModel
-from pipeline.locate.reliability import ReliabilityBin
 from pipeline.locate.track import Motion
+from tests.locate.calibrations import make_calibration
 
 METRE = 1 / 111_195.08  # degrees of latitude
 
@@ -52,27 +52,7 @@ def calibration(**changes: Any) -> Calibration:
     model = LogisticModel(
         mean_F=(0, 0.1, 0, 0), scale_F=(1, 0.05, 1, 1), coefficient_F=(0, 2.0, 0, 0), intercept=0.0
     )
-    plain = Calibration(
-        fingerprint="f" * 64,
-        gallery_rows=3,
-        photo_selection="",
-        spacing_m=300.0,
-        agreement_radius_m=150.0,
-        tolerance_m=25.0,
-        outside=0.5,
-        model=model,
-        threshold=0.4,
-        inverse_temperature=20.0,
-        none_log_odds=1.0,
-        photos=100,
-        locations=20,
-        accuracy=0.7,
-        right_kept=0.8,
-        outside_unknown=0.9,
-        calibration_error=0.02,
-        bins=(ReliabilityBin(predicted=0.1, observed=0.2, share=1.0),),
-    )
-    return replace(plain, **changes)
+    return make_calibration(**{"model": model} | changes)
 
 
 class Gallery:

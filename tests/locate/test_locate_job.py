@@ -4,6 +4,7 @@ listed."""
 import csv
 import io
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from jobs.stages.locate import locate, locate_photos
 from jobs.stages.settings import LocateSettings
 from model.checkpoint import Checkpoint, dumps, loads
 from model.config import PVDAConfig
-from model.pvda import FeatureEncoder
 from pipeline.core import storage
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.geo import Circle
@@ -27,8 +27,9 @@ from pipeline.images import optional_formats
 from pipeline.images.transforms import resize
 from pipeline.index.build import build_index
 from pipeline.index.settings import IndexSettings
-from pipeline.locate.calibration import Calibration, write_calibration
-from pipeline.locate.logistic import LogisticModel
+from pipeline.locate.calibration import write_calibration
+from tests.conftest import make_lively_encoder
+from tests.locate.calibrations import make_calibration
 
 LOCATIONS = 12
 STEP = 1e-3  # degrees between locations, about 111 m
@@ -43,16 +44,18 @@ def photo(number: int, blur: int = 80) -> bytes:
     return stream.getvalue()
 
 
-@pytest.fixture
-def world(tmp_path: Path, lively_encoder: FeatureEncoder) -> dict[str, str]:
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A checkpoint, an index of locations north of each other, and a folder with a photo of each of
-    the first four."""
+    the first four; the fingerprint of the encoder."""
+    folder = tmp_path_factory.mktemp("made")
+    encoder = make_lively_encoder()
     network = PVDAConfig(backbone="resnet18", width=0.25, image_size=64, parts=2, part_dim=16)
-    state = {"modules": {"encoder": lively_encoder.state_dict()}}
+    state = {"modules": {"encoder": encoder.state_dict()}}
     data = dumps(
         Checkpoint(network=network, recipe={}, locations=[], epoch=0, history=[], state=state)
     )
-    (tmp_path / "last.pt").write_bytes(data)
+    (folder / "last.pt").write_bytes(data)
     mark = encoder_fingerprint(loads(data), ENCODING)
     rows_ND, _ = PhotoEncoder(data, "last.pt", mark, ENCODING).encode(
         [photo(number) for number in range(LOCATIONS)]
@@ -68,11 +71,19 @@ def world(tmp_path: Path, lively_encoder: FeatureEncoder) -> dict[str, str]:
         embeddings_BD=rows_ND,
     )
     footer = PartFooter(fingerprint=mark, shard_sha256="s", rows=LOCATIONS, encoding=ENCODING)
-    write_part(str(tmp_path / "table" / "gallery-satellite-000000.parquet"), rows, footer)
-    build_index(IndexSettings(table=str(tmp_path / "table"), out=str(tmp_path / "index")))
-    (tmp_path / "photos").mkdir()
+    write_part(str(folder / "table" / "gallery-satellite-000000.parquet"), rows, footer)
+    build_index(IndexSettings(table=str(folder / "table"), out=str(folder / "index")))
+    (folder / "photos").mkdir()
     for number in range(4):
-        (tmp_path / "photos" / f"{number}.jpg").write_bytes(photo(number, 96))
+        (folder / "photos" / f"{number}.jpg").write_bytes(photo(number, 96))
+    return folder, mark
+
+
+@pytest.fixture
+def world(tmp_path: Path, made: tuple[Path, str]) -> dict[str, str]:
+    """A copy of what was made, and where the answers go."""
+    folder, mark = made
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     paths = {name: str(tmp_path / name) for name in ("index", "photos")}
     return paths | {
         "checkpoint": str(tmp_path / "last.pt"),
@@ -89,26 +100,13 @@ def settings(world: dict[str, str], **changes: Any) -> LocateSettings:
 
 
 def calibrated(world: dict[str, str]) -> None:
-    sure = LogisticModel(mean_F=(0,) * 4, scale_F=(1,) * 4, coefficient_F=(0,) * 4, intercept=2.0)
-    confidence = Calibration(
+    confidence = make_calibration(
         fingerprint=world["mark"],
         gallery_rows=LOCATIONS,
-        photo_selection="",
         spacing_m=111.0,
         agreement_radius_m=50.0,
-        tolerance_m=25.0,
-        outside=0.5,
-        model=sure,
-        threshold=0.4,
         inverse_temperature=5000.0,
         none_log_odds=0.0,
-        photos=100,
-        locations=20,
-        accuracy=0.7,
-        right_kept=0.8,
-        outside_unknown=0.9,
-        calibration_error=0.02,
-        bins=(),
     )
     write_calibration(f"{world['index']}/calibration.json", confidence)
 
