@@ -16,6 +16,10 @@ if TYPE_CHECKING:
 # The same for every Ray process that the tests start.
 os.environ.setdefault("RAY_AUTH_MODE", "disabled")
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+# Ray Train looks after its workers every 2 s otherwise, and ends that much later.
+os.environ.setdefault("RAY_TRAIN_HEALTH_CHECK_INTERVAL_S", "0.5")
+# Never a cluster that someone, or another test, runs on this machine.
+os.environ["RAY_ADDRESS"] = "local"
 # Waiting threads yield their core: on a busy machine, a spinning thread takes it from the thread
 # that it waits for.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -32,24 +36,46 @@ hypothesis.settings.load_profile("house")
 
 SLOW_FIXTURES = {"ray_cluster", "prepared", "browser", "workspace"}
 "Tests that use one of them start Ray, jobs or Chromium: `make test-fast` leaves them out."
+LONGEST = (
+    "tests/chaos/test_chaos.py",
+    "tests/test_benchmarks.py",
+    "tests/jobs/test_submit.py",
+    "tests/jobs/test_checkpoints.py",
+    "tests/jobs/test_ray_group.py",
+    "tests/jobs/test_jobs.py",
+    "tests/service/test_serve.py",
+)
+"Files that several test processes (pytest -n) begin with, so that none ends with one of them."
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for item in items:
         if SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
+    if hasattr(config, "workerinput"):  # a process of pytest-xdist
+        order = {file: number for number, file in enumerate(LONGEST)}
+        items.sort(key=lambda item: order.get(item.nodeid.partition("::")[0], len(order)))
 
 
 @pytest.fixture(scope="session")
 def ray_cluster() -> Iterator[None]:
-    """A local Ray of this test session."""
+    """A local Ray of this test session, or of this process of several.
+
+    Ray gives itself 30 s to start, which a busy machine exceeds now and then: tried three times.
+    """
     import ray
 
     from pipeline.core import cluster
+    from pipeline.core.errors import Incomplete
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RAY_ADDRESS", "local")  # never a cluster that someone runs on this machine
-        cluster.connect()
+    for attempt in (1, 2, 3):
+        try:
+            cluster.connect()
+            break
+        except Incomplete:
+            ray.shutdown()
+            if attempt == 3:
+                raise
     yield
     ray.shutdown()
 
@@ -98,8 +124,7 @@ def ray_address(ray_cluster: None, monkeypatch: pytest.MonkeyPatch) -> str:
     return address
 
 
-@pytest.fixture
-def lively_encoder() -> "FeatureEncoder":
+def make_lively_encoder() -> "FeatureEncoder":
     """A ResNet-18 of a quarter's width at 64 px with BatchNorms that change its output."""
     import torch
     from torch import nn
@@ -121,3 +146,9 @@ def lively_encoder() -> "FeatureEncoder":
                 module.weight.uniform_(0.5, 1.5)
                 module.bias.normal_(0, 0.3)
     return encoder
+
+
+@pytest.fixture
+def lively_encoder() -> "FeatureEncoder":
+    """A new one for each test: `make_lively_encoder`."""
+    return make_lively_encoder()

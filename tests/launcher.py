@@ -4,6 +4,7 @@ A run starts within milliseconds instead of seconds. Each child is a session of 
 what `python FOLDER/NAME.py ARGUMENTS` would do.
 """
 
+import ast
 import atexit
 import importlib
 import json
@@ -25,19 +26,16 @@ ROOT = Path(__file__).parents[1]
 PYTHON_PATH = (str(Path(__file__).parent / "chaos" / "hook"), str(ROOT))
 "PYTHONPATH of every process: the hook for storage faults, and the project."
 LIBRARIES = (
-    "torch",
-    "ray",
+    "torch._dynamo",  # the first optimizer imports it
     "ray.train.torch",
-    "faiss",
-    "pyarrow.parquet",
     "tensorboard",
-    "PIL.Image",
-    "simplejpeg",
+    "scipy.io",
+    "webdataset",
+    "yaml",
 )
+"Libraries that jobs import within their work, besides those that their modules import."
 TIMEOUT_S = 300.0
 "Longest run of a job on a busy machine."
-JOBS = ("simulate", "make_shards", "train", "embed_gallery", "build_index", "evaluate")
-"Jobs whose modules are imported before the first fork."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,12 +134,22 @@ class Launcher:
                 self._started.append(event["pid"])
 
 
+def job_modules() -> list[str]:
+    """The modules that the scripts of jobs/ import, those within their functions too."""
+    return [
+        node.module
+        for script in sorted((ROOT / "jobs").glob("*.py"))
+        for node in ast.walk(ast.parse(script.read_text()))
+        if isinstance(node, ast.ImportFrom) and node.module
+    ]
+
+
 def serve() -> dict[str, Any]:
     """Fork a child per order read from stdin; returns in the children only, with their order.
 
     The server exits at the end of its input.
     """
-    for name in (*LIBRARIES, *(f"jobs.{job}" for job in JOBS)):
+    for name in (*LIBRARIES, *job_modules()):
         importlib.import_module(name)
     buffer, is_open = b"", True
     while is_open:

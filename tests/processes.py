@@ -85,9 +85,11 @@ def start_cluster(cpus: int, environment: dict[str, str]) -> Iterator[tuple[int,
     # resources of a dead one reserved.
     words = ["start", "--head", "--block", f"--port={port}", f"--num-cpus={cpus}"]
     ray = Path(sys.executable).with_name("ray")
+    environment = os.environ | environment
+    environment.pop("RAY_ADDRESS", None)  # of another cluster
     head = subprocess.Popen(
         [str(ray), *words, "--disable-usage-stats", "--node-ip-address=127.0.0.1"],
-        env=os.environ | environment,
+        env=environment,
         start_new_session=True,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

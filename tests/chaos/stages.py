@@ -31,7 +31,8 @@ class Stage:
     distributed: str
     "Arguments that have Ray's workers do the work."
     in_process: str
-    "Arguments that have one process do the work; empty for a stage that always uses Ray."
+    """Arguments that have this process, or else a single worker, do the work; empty for a stage
+    that has no such choice."""
     verify_output: str | None = None
     "Arguments that check every byte of the output; None if `verify_input` or a rerun does."
     verify_input: str = ""
@@ -157,7 +158,7 @@ STAGES = (
         job="embed_gallery",
         reads=("shards", "run"),
         writes="table",
-        in_process="",
+        in_process="--workers 1",
         distributed="--workers 2",
         arguments="--shards {here}/shards --checkpoint {here}/run/last.pt --out {here}/table "
         "--batch-size 2 --cpus-per-worker 1",
@@ -181,7 +182,7 @@ STAGES = (
         job="evaluate",
         reads=("table", "shards"),
         writes="evaluation",
-        in_process="",
+        in_process="--workers 0",
         distributed="--workers 2",
         arguments="--table {here}/table --shards {here}/shards --out {here}/evaluation --panels 2",
         verify_input="--verify",

@@ -5,6 +5,7 @@ import asyncio
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -26,7 +27,6 @@ from jobs.stages.serve import serve as main
 from jobs.stages.settings import ServeSettings
 from model.checkpoint import Checkpoint, dumps
 from model.config import PVDAConfig
-from model.pvda import FeatureEncoder
 from pipeline.core import json_files
 from pipeline.core.errors import InputError
 from pipeline.features.part import PartFooter, PartRows, write_part
@@ -35,21 +35,24 @@ from pipeline.index.settings import IndexSettings
 from pipeline.service import replicas
 from pipeline.service.engine import NotReady
 from pipeline.service.replicas import Replica
+from tests.conftest import make_lively_encoder
 from tests.jobs.test_photo_encoder import identity_of, photo
 from tests.processes import command_line, descendants
 
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture
-def checkpoint_and_index(tmp_path: Path, lively_encoder: FeatureEncoder) -> tuple[Path, Path]:
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkpoint, and an index of three photos that it embedded."""
-    state = {"modules": {"encoder": lively_encoder.state_dict()}}
+    folder = tmp_path_factory.mktemp("made")
+    encoder = make_lively_encoder()
+    state = {"modules": {"encoder": encoder.state_dict()}}
     config = PVDAConfig(backbone="resnet18", width=0.25, image_size=64, parts=2, part_dim=16)
     data = dumps(
         Checkpoint(network=config, recipe={}, locations=[], epoch=0, history=[], state=state)
     )
-    (tmp_path / "last.pt").write_bytes(data)
+    (folder / "last.pt").write_bytes(data)
     embeddings_BD, _ = PhotoEncoder(data, "last.pt", *identity_of(data)).encode(
         [photo(seed) for seed in range(3)]
     )
@@ -65,8 +68,15 @@ def checkpoint_and_index(tmp_path: Path, lively_encoder: FeatureEncoder) -> tupl
     footer = PartFooter(
         fingerprint=identity_of(data)[0], shard_sha256="s", rows=3, encoding=identity_of(data)[1]
     )
-    write_part(str(tmp_path / "table" / "a.parquet"), part, footer)
-    build_index(IndexSettings(table=str(tmp_path / "table"), out=str(tmp_path / "index")))
+    write_part(str(folder / "table" / "a.parquet"), part, footer)
+    build_index(IndexSettings(table=str(folder / "table"), out=str(folder / "index")))
+    return folder
+
+
+@pytest.fixture
+def checkpoint_and_index(tmp_path: Path, made: Path) -> tuple[Path, Path]:
+    """A copy of them."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     return tmp_path / "last.pt", tmp_path / "index"
 
 
