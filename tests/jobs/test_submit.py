@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 import urllib.request
 from collections.abc import Iterator
@@ -39,12 +40,13 @@ def takes_jobs(address: str) -> bool:
 
 
 @pytest.fixture(scope="module")
-def submit_environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+def submit_environment() -> Iterator[dict[str, str]]:
     """A head node of its own ports and session folder; ended by its process group, never by `ray
     stop`.
     """
     port, dashboard, client = free_ports(3)
-    scratch = tmp_path_factory.mktemp("r")
+    # Not in pytest's folder: the paths of Ray's sockets may have 107 characters.
+    scratch = Path(tempfile.mkdtemp(prefix="ray-"))
     environment = os.environ | {
         "RAY_AUTH_MODE": "disabled",
         "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}",
