@@ -31,8 +31,9 @@ from model.config import Optimization
 from model.schedule import schedule_at
 from model.training import Training
 from model.weights.load import load_backbone
-from pipeline.batches.training import StreamConfig, TrainingStream
-from pipeline.images.transforms import Augmentation
+from pipeline.batches.settings import StreamConfig
+from pipeline.batches.training import TrainingStream
+from pipeline.images.augmentation import Augmentation
 from pipeline.shards.shard_set import open_shards
 
 AfterEpoch = Callable[[Training, int, dict[str, float]], None]

@@ -21,7 +21,7 @@ from jobs.training.loop import BatchTensors, load_batches
 from jobs.training.recipes import Recipe, paper, smoke
 from jobs.training.settings import RunConfig
 from jobs.training.state import TrainingState, WorkerContext
-from model.losses import adversarial_terms, location_terms
+from model.losses.pvda import adversarial_terms, location_terms
 from model.schedule import ScheduleState
 from pipeline.core import json_files, storage
 from pipeline.core.records import ImageRecord, Split, View

@@ -15,6 +15,7 @@ import re
 import zipfile
 from typing import Any
 
+import safetensors.torch
 import torch
 
 from model.config import PVDAConfig
@@ -72,11 +73,71 @@ def dumps(checkpoint: Checkpoint) -> bytes:
     return buffer.getvalue()
 
 
+def dumps_encoder(checkpoint: Checkpoint) -> bytes:
+    """The encoder alone as the bytes of a `.safetensors` file, matrices in float16: for sharing.
+
+    No training resumes from it. Vectors, BatchNorm's among them, stay float32.
+    """
+    weights = {
+        name: tensor.half() if tensor.is_floating_point() and tensor.dim() > 1 else tensor
+        for name, tensor in checkpoint.encoder_weights.items()
+    }
+    metadata = {
+        "format": str(FORMAT),
+        "network": json.dumps(dataclasses.asdict(checkpoint.network)),
+        "recipe": json.dumps(checkpoint.recipe),
+        "epoch": str(checkpoint.epoch),
+    }
+    return safetensors.torch.save(
+        {name: tensor.contiguous() for name, tensor in weights.items()}, metadata
+    )
+
+
+def _loads_encoder(data: bytes, name: str) -> Checkpoint:
+    """The checkpoint of `dumps_encoder`: without classifier, discriminator and history."""
+    try:
+        metadata = json.loads(_safetensors_header(data))["__metadata__"]
+        if metadata["format"] != str(FORMAT):
+            raise ValueError(f"format {metadata['format']}")
+        weights = {
+            key: tensor.float() if tensor.is_floating_point() else tensor
+            for key, tensor in safetensors.torch.load(data).items()
+        }
+        checkpoint = Checkpoint(
+            network=PVDAConfig(**json.loads(metadata["network"])),
+            recipe=json.loads(metadata["recipe"]),
+            locations=[],
+            epoch=int(metadata["epoch"]),
+            history=[],
+            state={"modules": {"encoder": weights}},
+        )
+        _check_fields(checkpoint)
+    except Exception as error:  # safetensors raises its own kinds over a damaged file
+        raise CheckpointError(
+            f"{name} is no encoder of format {FORMAT} ({type(error).__name__}); expected a "
+            ".safetensors file written by jobs/export_weights.py; name that file"
+        ) from error
+    return checkpoint
+
+
+def is_checkpoint(data: bytes) -> bool:
+    """Whether these are the bytes of a checkpoint of ours, and not of public weights."""
+    return CHECKSUM_MARK in data[-CHECKSUM_BYTES:] or b'"network"' in _safetensors_header(data)
+
+
+def _safetensors_header(data: bytes) -> bytes:
+    """The JSON at the start of a safetensors file; empty for other files."""
+    length = int.from_bytes(data[:8], "little")
+    return data[8 : 8 + length] if data[8:9] == b"{" and length < len(data) else b""
+
+
 def loads(data: bytes, name: str = "the checkpoint") -> Checkpoint:
-    """The checkpoint that `dumps` wrote; error messages call it `name`.
+    """The checkpoint that `dumps` or `dumps_encoder` wrote; error messages call it `name`.
 
     Raises CheckpointError.
     """
+    if _safetensors_header(data):
+        return _loads_encoder(data, name)
     check_integrity(data, name)
     try:
         plain = torch_files.read(data)

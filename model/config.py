@@ -53,7 +53,36 @@ class PVDAConfig:
         return self.parts * self.part_dim
 
 
+@dataclass(frozen=True, kw_only=True)
+class LossWeights:
+    """What encoder and classifier minimise beside the adversary's term. The defaults are the
+    paper's."""
+
+    location: float = 1.0
+    "Weight of Eq. 1, the classification of locations [paper]."
+    contrastive: float = 0.0
+    "Weight of symmetric InfoNCE between the views' embeddings [paper: none; Sample4Geo: 1]."
+    temperature: float = 0.05
+    "InfoNCE divides cosines by it [chosen]."
+    label_smoothing: float = 0.1
+    "Share of InfoNCE's target that is spread over all rows [Sample4Geo]."
+
+    def __post_init__(self) -> None:
+        if min(self.location, self.contrastive) < 0 or self.location + self.contrastive == 0:
+            raise ValueError(
+                f"location is {self.location} and contrastive {self.contrastive}, expected weights "
+                "of 0 or more that are not both 0"
+            )
+        if not (self.temperature > 0 and 0 <= self.label_smoothing < 1):
+            raise ValueError(
+                f"temperature is {self.temperature} and label_smoothing {self.label_smoothing}, "
+                "expected more than 0, and a share below 1"
+            )
+
+
 Precision = Literal["auto", "float32", "bfloat16"]
+Start = Literal["random", "imagenet", "builtin"]
+"Weights that a training starts from."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,3 +104,6 @@ class Optimization:
     "Of SGD [LPN]."
     weight_decay: float = 5e-4
     "Of encoder and classifier [LPN]; D has none [chosen]."
+    frozen_stages: int = 0
+    """Stages of the backbone, counted from the image, that keep their weights and BatchNorm
+    statistics [paper: none]."""

@@ -11,43 +11,18 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import get_total_norm
-from torch.optim import SGD, Adam, AdamW, Optimizer
 
-from model.config import Optimization, Precision, PVDAConfig
-from model.losses import adversarial_terms, feature_loss, location_terms, view_terms
-from model.pvda import FeatureEncoder, LocationClassifier, ViewDiscriminator
+from model.config import LossWeights, Optimization, Precision, PVDAConfig
+from model.inference.embed import unit_embedding
+from model.losses.contrastive import info_nce
+from model.losses.pvda import adversarial_terms, feature_loss, location_terms, view_terms
+from model.optimizers import build_optimizers
+from model.pvda import ViewDiscriminator
 from model.schedule import ScheduleState
+from model.two_views import EncoderWithClassifier
 
 Module = TypeVar("Module", bound=nn.Module)
 VIEWS = ("drone", "satellite")
-
-
-class EncoderWithClassifier(nn.Module):
-    """Encoder and classifier as one module: DDP expects one forward pass an iteration.
-
-    The encoder runs once per view, so that BatchNorm's statistics are a view's own [LPN]; with
-    `joint_bn` once on both, so that they are common. Only common ones match the running means that
-    the encoder is tested with.
-    """
-
-    def __init__(self, config: PVDAConfig, locations: int, joint_bn: bool = False) -> None:
-        super().__init__()
-        self.joint_bn = joint_bn
-        self.encoder = FeatureEncoder(config)
-        self.classifier = LocationClassifier(config, locations)
-
-    def forward(
-        self, images1_B3HW: Tensor, images2_B3HW: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """UAV and satellite images -> maps (B, C, H, W) and location logits (B, P, L) of each."""
-        if self.joint_bn:
-            count = len(images1_B3HW)
-            maps_BCHW, g_BPD = self.encoder(torch.cat([images1_B3HW, images2_B3HW]))
-            logits_BPL = self.classifier(g_BPD)
-            return maps_BCHW[:count], maps_BCHW[count:], logits_BPL[:count], logits_BPL[count:]
-        maps1_BCHW, g1_BPD = self.encoder(images1_B3HW)
-        maps2_BCHW, g2_BPD = self.encoder(images2_B3HW)
-        return maps1_BCHW, maps2_BCHW, self.classifier(g1_BPD), self.classifier(g2_BPD)
 
 
 class Training:
@@ -67,6 +42,7 @@ class Training:
         optimization: Optimization,
         locations: int,
         *,
+        losses: LossWeights | None = None,
         adversary: bool = True,
         device: torch.device | str = "cpu",
         precision: Precision = "float32",
@@ -75,7 +51,7 @@ class Training:
         compile_for: int | None = None,
         wrap_ddp: Callable[[nn.Module], nn.Module] = lambda module: module,
     ) -> None:
-        self.device = torch.device(device)
+        self.device, self.losses = torch.device(device), losses or LossWeights()
         self.bfloat16 = precision == "bfloat16" or (
             precision == "auto" and self.device.type == "cuda"
         )
@@ -88,43 +64,14 @@ class Training:
             self.discriminator = _to_device(discriminator, self.device, sync_bn)
         for module in self.modules.values():
             module.train()
+        self.model.encoder.backbone.freeze(optimization.frozen_stages)
         self.compile_error = (
             None if compile_for is None else self._compile(config.image_size, compile_for)
         )
         "Why the networks are not compiled though compilation was requested."
         self._wrapped = wrap_ddp(self.model)
         self._discriminator = None if self.discriminator is None else wrap_ddp(self.discriminator)
-        self.optimizers = self._build_optimizers(optimization)
-
-    def _build_optimizers(self, config: Optimization) -> list[Optimizer]:
-        """One for encoder and classifier, one for D where there is one; `start` of a group is its
-        initial learning rate.
-        """
-
-        def group(name: str, module: nn.Module, rate: float) -> dict[str, Any]:
-            return {"params": list(module.parameters()), "start": rate, "name": name}
-
-        groups = [
-            group("backbone", self.model.encoder.backbone, config.backbone_lr),
-            group("head", self.model.encoder.refine, config.head_lr),
-            group("classifier", self.model.classifier, config.classifier_lr),
-        ]
-        optimizers: list[Optimizer] = [
-            SGD(
-                groups,
-                lr=0.0,
-                momentum=config.momentum,
-                nesterov=True,
-                weight_decay=config.weight_decay,
-            )
-            if config.optimizer == "sgd"
-            else AdamW(groups, lr=0.0, weight_decay=config.weight_decay)
-        ]
-        if self.discriminator is not None:
-            optimizers.append(
-                Adam([group("discriminator", self.discriminator, config.discriminator_lr)], lr=0.0)
-            )
-        return optimizers
+        self.optimizers = build_optimizers(self.model, self.discriminator, optimization)
 
     @property
     def modules(self) -> dict[str, nn.Module]:
@@ -154,7 +101,8 @@ class Training:
         location2_B: Tensor,
         schedule: ScheduleState,
     ) -> dict[str, Tensor]:
-        """One iteration: D takes a step on Eq. 2, then encoder and classifier one on Eq. 4.
+        """One iteration: D takes a step on Eq. 2, then encoder and classifier one on Eq. 4, to
+        which InfoNCE is added where `losses` says so: row i of both views is then one location.
 
         One encoder pass serves both steps; D gets both views in one batch, since BatchNorm over
         separate batches would erase the shift between the views that D learns from. Returns the
@@ -165,21 +113,32 @@ class Training:
             for group in optimizer.param_groups:
                 group["lr"] = group["start"] * schedule.lr_scale
         with self._autocast():
-            maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = self._wrapped(
-                images1_B3HW, images2_B3HW
+            drone, satellite = self._wrapped(images1_B3HW, images2_B3HW)
+        located_VP = location_terms(
+            drone.logits_BPL, location1_B, satellite.logits_BPL, location2_B
+        )
+        location = located_VP.sum()
+        metrics = {"location_loss": location} | _by_view("location_loss", located_VP)
+        total = self.losses.location * location
+        if self.losses.contrastive:
+            contrastive = info_nce(
+                unit_embedding(drone.g_BPD.float()),
+                unit_embedding(satellite.g_BPD.float()),
+                location1_B,
+                self.losses.temperature,
+                self.losses.label_smoothing,
             )
-        located_VP = location_terms(logits1_BPL, location1_B, logits2_BPL, location2_B)
-        total = located_VP.sum()
-        metrics = {"location_loss": total} | _by_view("location_loss", located_VP)
+            metrics["contrastive_loss"] = contrastive
+            total = total + self.losses.contrastive * contrastive
         if self.discriminator is not None:
-            both_BCHW = torch.cat([maps1_BCHW, maps2_BCHW])
-            metrics |= self.discriminate(both_BCHW.detach(), len(maps1_BCHW))
+            both_BCHW = torch.cat([drone.maps_BCHW, satellite.maps_BCHW])
+            metrics |= self.discriminate(both_BCHW.detach(), len(drone.maps_BCHW))
             # D's weights are constants of the second step; its BatchNorm stays in training mode.
             self.discriminator.requires_grad_(False)
             with self._autocast():
                 verdict_B2 = self.discriminator(both_BCHW)
             self.discriminator.requires_grad_(True)
-            adversarial_V = adversarial_terms(*verdict_B2.tensor_split([len(maps1_BCHW)]))
+            adversarial_V = adversarial_terms(*verdict_B2.tensor_split([len(drone.maps_BCHW)]))
             adversarial = adversarial_V.sum()
             total = feature_loss(total, adversarial, schedule.alpha)
             metrics |= {"adversarial_loss": adversarial} | _by_view(
@@ -234,9 +193,11 @@ class Training:
             for network in networks:
                 network.compile()
             with self._autocast():
-                maps1_BCHW, maps2_BCHW, *logits = self.model(images_B3HW, images_B3HW)
+                views = self.model(images_B3HW, images_B3HW)
+                logits = [view.logits_BPL for view in views]
                 if self.discriminator is not None:
-                    logits.append(self.discriminator(torch.cat([maps1_BCHW, maps2_BCHW])))
+                    maps_BCHW = torch.cat([view.maps_BCHW for view in views])
+                    logits.append(self.discriminator(maps_BCHW))
             sum(one.float().mean() for one in logits).backward()
         except Exception as error:  # the compiler's own kinds, the C++ compiler's, the driver's
             for network in networks:

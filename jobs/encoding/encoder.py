@@ -22,6 +22,7 @@ from model.inference.precision import (
     describe_preprocessing,
     effective_precision,
 )
+from model.weights.builtin import BUILTIN, read_builtin
 from pipeline.core import storage
 from pipeline.core.arrays import Floats
 from pipeline.core.errors import InputError
@@ -80,15 +81,23 @@ class WorkerEncoder:
 
 
 def read_checkpoint_bytes(path: str) -> bytes:
-    """The bytes of a checkpoint.
+    """The bytes of a checkpoint, or of the built-in encoder.
 
     Raises InputError when there is none.
     """
+    if path == BUILTIN:
+        return read_builtin()
     if not storage.is_file(path):
         raise InputError(
-            f"no checkpoint at {path}; expected a last.pt of jobs/train.py; check --checkpoint"
+            f"no checkpoint at {path}; expected {BUILTIN}, or a last.pt of jobs/train.py; check "
+            "--checkpoint"
         )
     return storage.read_bytes(path)
+
+
+def absolute_checkpoint(path: str) -> str:
+    """The checkpoint's path for a process in another folder; the built-in encoder's name stays."""
+    return path if path == BUILTIN else storage.absolute(path)
 
 
 def make_encoder_spec(
@@ -115,7 +124,7 @@ def make_encoder_spec(
     images_B3HW = first_images(shards, size, settings.resizer, count)
     calibration_B3HW = images_B3HW[PROBE_IMAGES:] if precision == "int8" else None
     encoding = EncodingConfig(
-        mirror=settings.mirror,
+        mirror=trained_on_mirrors(checkpoint) if settings.mirror is None else settings.mirror,
         resizer=settings.resizer,
         precision=precision,
         calibration=digest_of(calibration_B3HW),
@@ -136,6 +145,13 @@ def make_encoder_spec(
         image_size=size,
         factory=partial(WorkerEncoder, recipe),
     )
+
+
+def trained_on_mirrors(checkpoint: Checkpoint) -> bool:
+    """Whether training mirrored images; imported weights, whose training is unknown, count so, as
+    all public methods do."""
+    augmentation = checkpoint.recipe.get("augmentation")
+    return not isinstance(augmentation, dict) or augmentation.get("mirror") is not False
 
 
 def _available_precision(

@@ -16,8 +16,9 @@ Compiling = Literal["auto", "always", "never"]
 class EncoderSettings:
     """How images become embeddings. All but `compiling` is part of the fingerprint."""
 
-    mirror: bool = True
-    "Whether the embeddings of an image and its mirror image are summed [LPN]."
+    mirror: bool | None = None
+    """Whether the embeddings of an image and its mirror image are summed [LPN]; by default where
+    the encoder was trained on mirrored images."""
     resizer: Resizer = "torch"
     """Whose bicubic resizes the images: torch's, or pillow's, which is faster on CPUs without AVX2;
     tables do not mix."""

@@ -10,6 +10,7 @@ from functools import partial
 import torch
 from aiohttp import web
 
+from jobs.encoding.encoder import absolute_checkpoint, read_checkpoint_bytes
 from jobs.encoding.photo_encoder import PhotoEncoder
 from jobs.stages.settings import ServeSettings
 from model.errors import CheckpointError
@@ -32,7 +33,7 @@ def load_predictor(checkpoint: str, index: str, shards: str | None, threads: int
 
     def encoder_for(metadata: IndexMetadata) -> PhotoEncoder:
         try:
-            data = storage.read_bytes(checkpoint)
+            data = read_checkpoint_bytes(checkpoint)
             return PhotoEncoder(data, checkpoint, metadata.fingerprint, metadata.encoding, shards)
         except CheckpointError as error:
             raise InputError(str(error)) from None
@@ -42,12 +43,12 @@ def load_predictor(checkpoint: str, index: str, shards: str | None, threads: int
 
 def serve(settings: ServeSettings) -> None:
     """Answer over HTTP where photos were taken, until Ctrl-C or SIGTERM."""
-    for name, path, hint in (
-        ("checkpoint", settings.checkpoint, "a last.pt of jobs/train.py"),
-        ("index", storage.join(settings.index, METADATA_FILE), "an index of jobs/build_index.py"),
-    ):
-        if not storage.is_file(path):
-            raise InputError(f"no {name} at {path}; expected {hint}; check --{name}")
+    read_checkpoint_bytes(settings.checkpoint)
+    path = storage.join(settings.index, METADATA_FILE)
+    if not storage.is_file(path):
+        raise InputError(
+            f"no index at {path}; expected an index of jobs/build_index.py; check --index"
+        )
     token = settings.token()
     cluster.connect()
     asyncio.run(listen(settings, token))
@@ -59,7 +60,8 @@ async def listen(settings: ServeSettings, token: str | None) -> None:
         cluster.nodes(), settings.replicas, settings.replicas, settings.threads
     )
     shards = None if settings.shards is None else storage.absolute(settings.shards)
-    checkpoint, index = storage.absolute(settings.checkpoint), storage.absolute(settings.index)
+    checkpoint = absolute_checkpoint(settings.checkpoint)
+    index = storage.absolute(settings.index)
     make_predictor = partial(load_predictor, checkpoint, index, shards, placement.cpus)
     replicas = Replicas(f"pvda-{os.getpid()}", placement, make_predictor)
     runner = Service(settings, replicas, token, concurrency=placement.workers).runner()

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 from jobs.encoding.settings import EncoderSettings
+from model.weights.builtin import BUILTIN
 from pipeline.core.errors import InputError, require
 from pipeline.core.geo import Circle
 from pipeline.core.records import Split, View
@@ -35,8 +36,9 @@ class MakeShardsSettings(PackingSettings):
 class EmbedSettings(EmbeddingSettings, EncoderSettings):
     """Which shards are embedded, by which network, into which table."""
 
-    checkpoint: str
-    "A last.pt of jobs/train.py, or what jobs/import_weights.py wrote."
+    checkpoint: str = BUILTIN
+    """The encoder: `builtin`, a last.pt of jobs/train.py, or what jobs/import_weights.py or
+    jobs/export_weights.py wrote."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +85,7 @@ class LocateSettings:
 
     photos: tyro.conf.Positional[tuple[str, ...]]
     "Photos, or folders with photos below them; paths or URIs."
-    checkpoint: str
+    checkpoint: str = BUILTIN
     "The encoder that the index was made with."
     index: str
     "Folder or URI of the index."
@@ -137,7 +139,7 @@ class LocateSettings:
 class CalibrateSettings(CalibrationCriteria):
     """The index to calibrate, and the photos to do it with."""
 
-    checkpoint: str
+    checkpoint: str = BUILTIN
     "The encoder that the index was made with."
     shards: str
     """Folder or URI of shards with photos of locations that the encoder was not trained on, and the
@@ -165,7 +167,7 @@ class CalibrateSettings(CalibrationCriteria):
 class ServeSettings(ServiceSettings):
     """The index, its encoder, the address and the limits of the service."""
 
-    checkpoint: str
+    checkpoint: str = BUILTIN
     "The checkpoint that the index's gallery was embedded with."
     index: str
     "Folder or URI of the index; the service switches to one that is built there later."
@@ -231,3 +233,17 @@ class DemoSettings:
     "Side of the images in pixels."
     epochs: int = 80
     "Epochs of recipe smoke."
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportWeightsSettings:
+    """Which encoder is exported, and where to."""
+
+    checkpoint: str
+    "A last.pt of jobs/train.py, or what jobs/import_weights.py wrote."
+    out: str
+    "File or URI, ending in .safetensors."
+
+    def __post_init__(self) -> None:
+        ending = "a name that ends in .safetensors"
+        require(self.out.endswith(".safetensors"), "out", self.out, ending)

@@ -15,9 +15,8 @@ from jobs.training.ray_group import show_report, train_on_ray
 from jobs.training.settings import RECIPE, RUN_CONFIG_FILE, RunConfig, TrainSettings
 from jobs.training.state import WorkerContext, open_stream
 from jobs.training.worker import train_worker
-from model.backbones.base import build_backbone
 from model.pvda import FeatureEncoder
-from model.weights.load import load_backbone, read_state_dict
+from model.weights.start import load_start
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.lock import locks_output
@@ -79,9 +78,9 @@ def check_input(settings: TrainSettings, run: RunConfig, resumes: bool) -> int:
     else:
         shards.require_tars(shards.manifest.of(Split.TRAIN))
     steps = open_stream(run, WorkerContext(world_size=max(1, settings.workers))).steps
-    if run.weights is not None and not resumes:
-        backbone = build_backbone(run.recipe.network.backbone, run.recipe.network.width)
-        load_backbone(backbone, read_state_dict(run.weights), run.weights)
+    if not resumes:
+        encoder = FeatureEncoder(run.recipe.network)
+        load_start(encoder, run.recipe.network.backbone, run.recipe.start, run.weights)
     return steps
 
 

@@ -3,10 +3,12 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from model.config import Optimization, Precision, PVDAConfig
+from model.config import LossWeights, Optimization, Precision, PVDAConfig, Start
 from model.schedule import Schedule
+from pipeline.batches.settings import Sampler
 from pipeline.core.errors import require
-from pipeline.images.transforms import Augmentation, Resizer
+from pipeline.images.augmentation import Augmentation
+from pipeline.images.transforms import Resizer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,6 +18,10 @@ class Recipe:
     name: str = "paper"
     "Name of the recipe."
     network: PVDAConfig = field(default_factory=PVDAConfig)
+    start: Start = "random"
+    """Weights before the first step: random; imagenet, from an installed package; or those of the
+    built-in encoder. A file of --weights goes before it."""
+    losses: LossWeights = field(default_factory=LossWeights)
     optimization: Optimization = field(default_factory=Optimization)
     schedule: Schedule = field(default_factory=Schedule)
     augmentation: Augmentation = field(default_factory=Augmentation)
@@ -24,6 +30,9 @@ class Recipe:
     [chosen]."""
     adversary: bool = True
     "Train with a view discriminator; without it PVDA is LPN."
+    sampler: Sampler = "independent"
+    """How a step's images are drawn: each view by itself, or as pairs of distinct locations
+    [LPN lineage: independent]."""
     batch_size: int = 8
     "Images of each view per step and worker [LPN lineage: 8]."
     seed: int = 0
@@ -45,6 +54,11 @@ class Recipe:
     def __post_init__(self) -> None:
         few = "at least 2: BatchNorm needs two images of a view"
         require(self.batch_size >= 2, "batch_size", self.batch_size, few)
+        pairs = "unique_pairs, since InfoNCE compares the views row by row"
+        require(
+            not self.losses.contrastive or self.sampler == "unique_pairs",
+            "sampler", self.sampler, pairs,
+        )  # fmt: skip
         share = "a share of the locations, from 0 to below 1"
         require(0 <= self.hold_out < 1, "hold_out", self.hold_out, share)
 
@@ -128,7 +142,38 @@ def smoke(epochs: int = 80) -> Recipe:
     )
 
 
+def builtin(epochs: int = 30) -> Recipe:
+    """The built-in encoder's: EfficientNet-Lite0 from ImageNet, InfoNCE on pairs beside Eq. 4.
+
+    An hour on two cores where the paper's ResNet-50 takes days. Rates, sizes and losses are chosen,
+    by the trials in docs/results.md.
+    """
+    return Recipe(
+        name="builtin",
+        network=PVDAConfig(
+            backbone="efficientnet_lite0", image_size=128, part_dim=256, dropout=0.0,
+            ring_divisor="ring", discriminator_channels=64,
+        ),
+        start="imagenet",
+        losses=LossWeights(contrastive=1.0, location=0.1),
+        optimization=Optimization(
+            optimizer="adamw", backbone_lr=3e-4, head_lr=1e-3, classifier_lr=1e-3,
+            discriminator_lr=1e-3, weight_decay=0.01, frozen_stages=4,
+        ),
+        schedule=Schedule(
+            epochs=epochs, lr_schedule="cosine", warmup_epochs=1, alpha=0.1, alpha_step=0.0
+        ),
+        augmentation=Augmentation(
+            pad=0, rotation=180, mirror=False, free=True, drone_rotation=10, scale=0.2, shift=0.08,
+            colour=1.0, blur=0.8, noise=8.0, jpeg=0.3, hide=0.2,
+        ),
+        sampler="unique_pairs",
+        batch_size=24,
+        joint_bn=True,
+    )  # fmt: skip
+
+
 RECIPES: dict[str, Callable[[], Recipe]] = {
     recipe.__name__: recipe
-    for recipe in (paper, paper_384, lpn, constant_alpha, no_restart, alpha_zero, smoke)
+    for recipe in (paper, paper_384, lpn, constant_alpha, no_restart, alpha_zero, smoke, builtin)
 }

@@ -67,7 +67,7 @@ class RunConfig(RunOptions):
     "Folder or URI of the run, likewise."
     recipe: Recipe
     weights: str | None = None
-    "State dict of torchvision's ResNet to start from."
+    "File of weights to start from, in place of the recipe's `start`."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +80,8 @@ class TrainSettings(RunOptions):
     out: str
     "Folder or URI of the run."
     weights: str | None = None
-    "State dict of torchvision's ResNet (.pth or .safetensors) to start from."
+    """File to start from (.pt, .pth, .safetensors), in place of the recipe's `start`: a checkpoint
+    of ours, or public weights of the backbone."""
     workers: int = 1
     "Ray Train workers; 0 trains in this process."
     gpus_per_worker: float | None = None

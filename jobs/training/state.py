@@ -17,8 +17,9 @@ from jobs.training.settings import RunConfig
 from model.checkpoint import Checkpoint, dumps
 from model.errors import CheckpointError
 from model.training import Training
-from model.weights.load import load_backbone, read_state_dict
-from pipeline.batches.training import StreamConfig, TrainingStream
+from model.weights.start import load_start
+from pipeline.batches.settings import StreamConfig
+from pipeline.batches.training import TrainingStream
 from pipeline.core import storage
 from pipeline.core.errors import Incomplete
 from pipeline.shards.shard_set import open_shards
@@ -124,6 +125,7 @@ def open_stream(run: RunConfig, context: WorkerContext) -> TrainingStream:
         seed=recipe.seed,
         threads=max(1, torch.get_num_threads()),
         hold_out=recipe.hold_out,
+        sampler=recipe.sampler,
     )
     return TrainingStream(open_shards(run.shards), config, context.rank, context.world_size)
 
@@ -136,6 +138,7 @@ def build_training(run: RunConfig, context: WorkerContext, locations: int) -> Tr
         recipe.network,
         recipe.optimization,
         locations,
+        losses=recipe.losses,
         adversary=recipe.adversary,
         device=context.device,
         wrap_ddp=context.wrap_ddp,
@@ -144,8 +147,7 @@ def build_training(run: RunConfig, context: WorkerContext, locations: int) -> Tr
         joint_bn=recipe.joint_bn,
         compile_for=recipe.batch_size if run.compile else None,
     )
-    if run.weights is not None:
-        load_backbone(training.model.encoder.backbone, read_state_dict(run.weights), run.weights)
+    load_start(training.model.encoder, recipe.network.backbone, recipe.start, run.weights)
     return training
 
 

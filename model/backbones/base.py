@@ -4,9 +4,11 @@ In: a name of `BACKBONES` and a width. Out: the module with its stride, channels
 table of foreign names.
 """
 
+from collections.abc import Sequence
 from importlib import import_module
-from typing import ClassVar, Protocol, cast
+from typing import ClassVar, Self
 
+import torch
 from torch import Tensor, nn
 
 from model.backbones import BACKBONES
@@ -30,29 +32,81 @@ class Backbone(nn.Module):
     "Beginnings of names in public weights that this module has no use for, such as a classifier's."
     channels: int
     "C, the channels of the maps."
+    frozen_stages = 0
+    "How many of the first stages keep their weights in training; set by `freeze`."
 
-
-class Family(Protocol):
-    """What a module of `BACKBONES` offers."""
-
-    def build(self, name: str, width: float) -> Backbone:
+    @classmethod
+    def build(cls, name: str, width: float) -> Self:
         """The backbone of that name, `width` times as wide as published.
 
         Raises ValueError for a width that it cannot have.
         """
+        raise NotImplementedError
 
-    def infer(self, state: dict[str, Tensor]) -> tuple[str, float]:
+    @classmethod
+    def infer(cls, state: dict[str, Tensor]) -> tuple[str, float]:
         """Name and width of the backbone that a public state dict belongs to.
 
-        Raises ValueError that says how the state dict differs from all of the family.
+        Raises ValueError that says how the state dict differs from all of this class.
         """
+        raise NotImplementedError
+
+    def stages(self) -> Sequence[Sequence[nn.Module]]:
+        """The layers in the order of `forward`, in the groups that `freeze` counts."""
+        raise NotImplementedError
+
+    def forward(self, images_B3HW: Tensor) -> Tensor:
+        """Normalised images (B, 3, H, W) -> maps (B, C, H/stride, W/stride).
+
+        Frozen stages run without gradients.
+        """
+        stages = self.stages()
+        with torch.no_grad():
+            maps_BCHW = _run(stages[: self.frozen_stages], images_B3HW)
+        return _run(stages[self.frozen_stages :], maps_BCHW)
+
+    def freeze(self, count: int) -> None:
+        """Keep the weights and BatchNorm statistics of the first `count` stages in training.
+
+        Raises ValueError where there are not so many.
+        """
+        stages = self.stages()
+        if not 0 <= count <= len(stages):
+            raise ValueError(
+                f"frozen_stages is {count}, expected 0 to {len(stages)}, the stages of this "
+                "backbone"
+            )
+        self.frozen_stages = count
+        for layer in (layer for stage in stages[:count] for layer in stage):
+            layer.requires_grad_(False)
+        self.train(self.training)
+
+    def train(self, mode: bool = True) -> Self:
+        """As every module's, but frozen stages stay in evaluation mode."""
+        super().train(mode)
+        for layer in (layer for stage in self.stages()[: self.frozen_stages] for layer in stage):
+            layer.eval()
+        return self
 
 
-def families() -> list[Family]:
-    """Each module of `BACKBONES` once."""
-    return [cast(Family, import_module(module)) for module in dict.fromkeys(BACKBONES.values())]
+def _run(stages: Sequence[Sequence[nn.Module]], x: Tensor) -> Tensor:
+    for layer in (layer for stage in stages for layer in stage):
+        x = layer(x)
+    return x
+
+
+def backbone_class(name: str) -> type[Backbone]:
+    """The class of a name in `BACKBONES`."""
+    module, _, kind = BACKBONES[name].partition(":")
+    found: type[Backbone] = getattr(import_module(module), kind)
+    return found
+
+
+def backbone_classes() -> list[type[Backbone]]:
+    """Each class of `BACKBONES` once."""
+    return list(dict.fromkeys(map(backbone_class, BACKBONES)))
 
 
 def build_backbone(name: str, width: float) -> Backbone:
-    """The backbone of a name in `BACKBONES`. Raises ValueError as `Family.build` does."""
-    return cast(Family, import_module(BACKBONES[name])).build(name, width)
+    """The backbone of a name in `BACKBONES`. Raises ValueError as `Backbone.build` does."""
+    return backbone_class(name).build(name, width)

@@ -5,7 +5,7 @@ at full width.
 """
 
 import re
-from typing import ClassVar
+from typing import ClassVar, Self
 
 from torch import Tensor, nn
 
@@ -116,51 +116,50 @@ class ResNet(Backbone):
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
-    def forward(self, images_B3HW: Tensor) -> Tensor:
-        x: Tensor = self.maxpool(self.relu(self.bn1(self.conv1(images_B3HW))))
-        for name in ("layer1", "layer2", "layer3", "layer4"):
-            x = self.get_submodule(name)(x)
-        return x
+    def stages(self) -> list[list[nn.Module]]:
+        """The stem, and layer1 to layer4."""
+        layers = [self.get_submodule(f"layer{number}") for number in (1, 2, 3, 4)]
+        return [[self.conv1, self.bn1, self.relu, self.maxpool], *([layer] for layer in layers)]
 
+    @classmethod
+    def build(cls, name: str, width: float) -> Self:
+        """One of `LAYOUTS`. Raises ValueError for a width with too few or too many channels."""
+        # Channels that leave layer1 and enter the first strided shortcut.
+        channels = round(64 * width) * LAYOUTS[name][0].expansion
+        if channels < MIN_CHANNELS:
+            raise ValueError(
+                f"width is {width}, which gives layer1 of {name} {channels} channels; expected at "
+                f"least {MIN_CHANNELS} (thinner ones crash oneDNN); use a larger width"
+            )
+        if channels > MAX_CHANNELS:
+            raise ValueError(
+                f"width is {width}, which gives layer1 of {name} {channels} channels; expected at "
+                f"most {MAX_CHANNELS}; use a smaller width"
+            )
+        return cls(name, width)
 
-def build(name: str, width: float) -> ResNet:
-    """A ResNet of `LAYOUTS`. Raises ValueError for a width with too few or too many channels."""
-    # Channels that leave layer1 and enter the first strided shortcut.
-    channels = round(64 * width) * LAYOUTS[name][0].expansion
-    if channels < MIN_CHANNELS:
-        raise ValueError(
-            f"width is {width}, which gives layer1 of {name} {channels} channels; expected at "
-            f"least {MIN_CHANNELS} (thinner ones crash oneDNN); use a larger width"
+    @classmethod
+    def infer(cls, state: dict[str, Tensor]) -> tuple[str, float]:
+        """Name and width of the ResNet that a state dict with torchvision's names belongs to.
+
+        Raises ValueError that says which blocks it has where that is none of `LAYOUTS`.
+        """
+        positions = {
+            tuple(map(int, found.groups()))
+            for key in state
+            if (found := re.match(r"layer(\d)\.(\d+)\.", key))
+        }
+        blocks = tuple(
+            1 + max((block for at, block in positions if at == layer), default=-1)
+            for layer in (1, 2, 3, 4)
         )
-    if channels > MAX_CHANNELS:
+        bottleneck = any(re.match(r"layer\d\.\d+\.conv3\.", key) for key in state)
+        conv1 = state.get("conv1.weight")
+        if conv1 is not None and conv1.ndim == 4:
+            for name, (block, counts) in LAYOUTS.items():
+                if counts == blocks and bottleneck == (block is Bottleneck):
+                    return name, len(conv1) / 64
         raise ValueError(
-            f"width is {width}, which gives layer1 of {name} {channels} channels; expected at most "
-            f"{MAX_CHANNELS}; use a smaller width"
+            f"conv1.weight is {'missing' if conv1 is None else 'there'}, layers 1 to 4 have "
+            f"{', '.join(map(str, blocks))} {'bottleneck' if bottleneck else 'basic'} blocks"
         )
-    return ResNet(name, width)
-
-
-def infer(state: dict[str, Tensor]) -> tuple[str, float]:
-    """Name and width of the ResNet that a state dict with torchvision's names belongs to.
-
-    Raises ValueError that says which blocks it has where that is none of `LAYOUTS`.
-    """
-    positions = {
-        tuple(map(int, found.groups()))
-        for key in state
-        if (found := re.match(r"layer(\d)\.(\d+)\.", key))
-    }
-    blocks = tuple(
-        1 + max((block for at, block in positions if at == layer), default=-1)
-        for layer in (1, 2, 3, 4)
-    )
-    bottleneck = any(re.match(r"layer\d\.\d+\.conv3\.", key) for key in state)
-    conv1 = state.get("conv1.weight")
-    if conv1 is not None and conv1.ndim == 4:
-        for name, (block, counts) in LAYOUTS.items():
-            if counts == blocks and bottleneck == (block is Bottleneck):
-                return name, len(conv1) / 64
-    raise ValueError(
-        f"conv1.weight is {'missing' if conv1 is None else 'there'}, layers 1 to 4 have "
-        f"{', '.join(map(str, blocks))} {'bottleneck' if bottleneck else 'basic'} blocks"
-    )

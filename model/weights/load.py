@@ -14,7 +14,7 @@ import safetensors.torch
 from torch import Tensor, nn
 
 from model.backbones import BACKBONES
-from model.backbones.base import Backbone, families
+from model.backbones.base import Backbone, backbone_classes
 from model.checkpoint import check_integrity
 from model.errors import CheckpointError
 from model.weights import torch_files
@@ -40,15 +40,19 @@ def read_state_dict(path: str) -> dict[str, Tensor]:
 
     Raises CheckpointError.
     """
+    return parse_state_dict(read_weights_file(path), path)
+
+
+def read_weights_file(path: str) -> bytes:
+    """The bytes of a file of weights. Raises CheckpointError where it cannot be read."""
     try:
-        data = Path(path).read_bytes()
+        return Path(path).read_bytes()
     except FileNotFoundError:
         raise CheckpointError(f"no weights at {path}; expected {TORCHVISION_HINT}") from None
     except OSError as error:
         raise CheckpointError(
             f"{path} is no state dict ({error}); expected .pth or .safetensors"
         ) from error
-    return parse_state_dict(data, path)
 
 
 def parse_state_dict(data: bytes, name: str) -> dict[str, Tensor]:
@@ -95,7 +99,7 @@ def infer_backbone(state: dict[str, Tensor], name: str) -> tuple[str, float]:
     """
     for variant in prefix_variants(state):
         reasons = list[str]()
-        for family in families():
+        for family in backbone_classes():
             try:
                 return family.infer(variant)
             except ValueError as error:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from model.config import PVDAConfig
 from model.errors import CheckpointError
-from model.training import EncoderWithClassifier
+from model.two_views import EncoderWithClassifier
 from model.weights.load import infer_backbone, load_renamed
 
 OURS_TO_LPN = {

@@ -56,6 +56,11 @@ def decode_sample(sample: Sample, image_size: int, resizer: Resizer = "torch") -
         return sample, error
 
 
+def is_damaged(one: Decoded) -> bool:
+    """Whether an image could not be decoded."""
+    return isinstance(one[1], DecodeError)
+
+
 def split_failed(images: Iterable[Decoded]) -> tuple[list[tuple[Sample, Pixels]], list[str]]:
     """The images that could be decoded, and the keys of the others."""
     intact: list[tuple[Sample, Pixels]] = []

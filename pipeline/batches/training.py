@@ -6,8 +6,9 @@ when is a pure function of the seed, the epoch and the rank, so a resumed run se
 
 import random
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,21 @@ import numpy.typing as npt
 import webdataset as wds
 
 from pipeline.batches.holdout import exclude_locations, holdout_locations
-from pipeline.batches.ordered import Decoded, check_unchanged, split_failed, stack
+from pipeline.batches.ordered import (
+    Decoded,
+    check_unchanged,
+    is_damaged,
+    split_failed,
+    stack,
+)
+from pipeline.batches.pairs import SatelliteImages, group_distinct
 from pipeline.batches.sampler import Span, plan_pass, read_spans
+from pipeline.batches.settings import StreamConfig
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import Split, View, key_matches
+from pipeline.images.augmentation import augment
 from pipeline.images.decode import DecodeError, decode
-from pipeline.images.transforms import Augmentation, Resizer, augment
 from pipeline.shards.samples import Sample
 from pipeline.shards.shard_set import ShardSet
 
@@ -40,31 +49,12 @@ class Batch:
     """
 
 
-@dataclass(frozen=True, kw_only=True)
-class StreamConfig:
-    """How training images are read."""
-
-    batch_size: int = 8
-    "Images of each view per step and worker [LPN lineage: 8]."
-    image_size: int = 256
-    "Side in pixels of the network's input."
-    resizer: Resizer = "torch"
-    "Whose bicubic resizes images to it."
-    augmentation: Augmentation = field(default_factory=Augmentation)
-    seed: int = 0
-    shuffle_buffer: int = 4096
-    "Encoded images buffered for shuffling; those of University-1652 take some 40 kB each."
-    threads: int = 2
-    "Threads that decode and augment ahead of the network."
-    hold_out: float = 0.0
-    "Share of the locations that is left out: `held_out` of the stream."
-
-
 class TrainingStream:
-    """Pairs of batches of a set's training split, drawn independently from each view.
+    """Pairs of batches of a set's training split, drawn from the views as the sampler says.
 
     An epoch is one pass over the satellite view; its last partial batch is dropped, other images
-    each time. The UAV view gives as many images, drawn anew each epoch.
+    each time. The UAV view gives as many images, drawn anew each epoch. With `unique_pairs` the UAV
+    view is drawn so, and each image brings its location's satellite image along.
 
     Raises InputError when the set cannot be trained on.
     """
@@ -101,11 +91,81 @@ class TrainingStream:
         The first `skip` batches are skipped without decoding them; the others are those of a full
         epoch.
         """
+        if self.config.sampler == "unique_pairs":
+            return self._paired_epoch(epoch, skip)
         return zip(
             self.pipeline(View.DRONE, epoch, skip),
             self.pipeline(View.SATELLITE, epoch, skip),
             strict=True,
         )
+
+    def _paired_epoch(self, epoch: int, skip: int) -> Iterator[tuple[Batch, Batch]]:
+        size = self.config.batch_size
+        if len(self.classes) < size:
+            raise InputError(
+                f"{self.shards.path} has {len(self.classes)} training locations, expected at least "
+                f"{size}, one for each pair of a batch; train with a smaller batch"
+            )
+        drones = self._endless_drones(epoch)
+        groups = group_distinct(drones, lambda sample: sample.metadata["location"], size)
+        rows = enumerate(chain.from_iterable(islice(groups, skip, self.steps)), start=skip * size)
+        for group in wds.batched(size, collation_fn=None)(
+            prefetch_map(partial(self._prepare_pair, epoch), rows, self.config.threads, 4 * size)
+        ):
+            yield self._collate_pairs(group)
+
+    def _endless_drones(self, epoch: int) -> Iterator[Sample]:
+        """The UAV samples of an epoch, shuffled, over and over: groups of distinct locations may
+        take more of them than they keep."""
+        config = self.config
+        wanted = self.steps * config.batch_size
+        numpy_rng = np.random.default_rng([config.seed, epoch, 0])
+        rng = random.Random(repr((config.seed, epoch, View.DRONE.value, self.rank)))
+
+        def spans() -> Iterator[Span]:
+            while True:
+                yield from plan_pass(
+                    self._shards[View.DRONE], wanted, self.rank, self.world, numpy_rng
+                )
+
+        buffer = min(config.shuffle_buffer, sum(s.samples for s in self._shards[View.DRONE]))
+        shuffled = wds.shuffle(buffer, initial=buffer, rng=rng)
+        samples: Iterator[Sample] = shuffled(read_spans(self.shards, self.held_out, spans()))
+        return samples
+
+    @cached_property
+    def _satellites(self) -> SatelliteImages:
+        return SatelliteImages(self.shards, self._shards[View.SATELLITE], self.held_out)
+
+    def _prepare_pair(self, epoch: int, numbered: tuple[int, Sample]) -> tuple[Decoded, Decoded]:
+        number, drone = numbered
+        rng = np.random.default_rng([self.config.seed, epoch, 2, self.rank, number])
+        satellite = self._satellites.one_of(drone.metadata["location"], rng)
+        return (
+            self._prepare(View.DRONE, epoch, number, drone),
+            self._prepare(View.SATELLITE, epoch, number, satellite),
+        )
+
+    def _collate_pairs(self, group: list[tuple[Decoded, Decoded]]) -> tuple[Batch, Batch]:
+        """A batch of each view. A pair with a damaged image is replaced by the first intact one."""
+        views = (View.DRONE, View.SATELLITE)
+        damaged = {
+            view: tuple(pair[side][0].key for pair in group if is_damaged(pair[side]))
+            for side, view in enumerate(views)
+        }
+        intact = next((pair for pair in group if not any(map(is_damaged, pair))), None)
+        if intact is None:
+            first = (damaged[View.DRONE] + damaged[View.SATELLITE])[0]
+            raise InputError(
+                f"not one of {len(group)} pairs of a batch from {self.shards.path} can be decoded "
+                f"({first} and on), expected at least one; pack these shards again"
+            )
+        chosen = [intact if any(map(is_damaged, pair)) else pair for pair in group]
+        drones, satellites = (
+            replace(self._collate(view, [pair[side] for pair in chosen]), damaged=damaged[view])
+            for side, view in enumerate(views)
+        )
+        return drones, satellites
 
     def pipeline(self, view: View, epoch: int, skip: int = 0) -> Any:
         """The batches of one view and epoch: a `webdataset.DataPipeline` of `Batch`, to iterate
@@ -145,22 +205,31 @@ class TrainingStream:
         self, view: View, epoch: int, numbered: Iterable[tuple[int, Sample]]
     ) -> Iterator[Decoded]:
         """The samples' images, decoded and augmented by threads, in order."""
-        config, view_number = self.config, list(View).index(view)
+        return prefetch_map(
+            lambda one: self._prepare(view, epoch, *one),
+            numbered,
+            self.config.threads,
+            4 * self.config.batch_size,
+        )
 
-        def prepare(numbered: tuple[int, Sample]) -> Decoded:
-            number, sample = numbered
-            # A generator for each image, so that its augmentation does not depend on the thread.
-            rng = np.random.default_rng([config.seed, epoch, view_number, self.rank, number])
-            try:
-                check_unchanged(sample)
-                image_HW3 = decode(sample.data)
-            except DecodeError as error:
-                return sample, error
-            return sample, augment(
-                image_HW3, view, config.image_size, config.augmentation, rng, config.resizer
-            )
-
-        return prefetch_map(prepare, numbered, config.threads, 4 * config.batch_size)
+    def _prepare(self, view: View, epoch: int, number: int, sample: Sample) -> Decoded:
+        """One image, decoded and augmented."""
+        config = self.config
+        # A generator for each image, so that its augmentation does not depend on the thread.
+        seed = [config.seed, epoch, list(View).index(view), self.rank, number]
+        try:
+            check_unchanged(sample)
+            image_HW3 = decode(sample.data)
+        except DecodeError as error:
+            return sample, error
+        return sample, augment(
+            image_HW3,
+            view,
+            config.image_size,
+            config.augmentation,
+            np.random.default_rng(seed),
+            config.resizer,
+        )
 
     def _collate(self, view: View, group: list[Decoded]) -> Batch:
         """One batch. Raises InputError where none of its images can be decoded."""

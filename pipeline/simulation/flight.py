@@ -1,11 +1,13 @@
-"""The flight around a building as in University-1652: a plan and a radius come in, poses go out.
+"""The flight over a location: a plan and a radius come in, poses go out.
 
 University-1652 circles each building in three turns while the altitude falls from 256 m to 121.5 m,
-and keeps 54 views.
+and keeps 54 views: `FlightPlan`. A `FreeFlight` comes by from anywhere, as a UAV on its way does.
 """
 
 from dataclasses import dataclass
 from math import atan, cos, degrees, radians, sin, tan
+
+import numpy as np
 
 UNIVERSITY_VIEWS = 54
 
@@ -99,3 +101,62 @@ class FlightPlan:
                 )
             )
         return flown
+
+
+LOWEST_RAY_DEG = 22.0
+"""Least angle below the horizon of any ray of a free flight's frame: flatter ones see far beyond
+the world's edge."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreeFlight:
+    """Views from any heading, steep or oblique, near or far, with the place off the middle. All
+    ranges are chosen."""
+
+    views: int
+    """Number of images."""
+    steepest_deg: float = 90.0
+    """Largest camera angle below the horizon: 90 looks straight down."""
+    flattest_deg: float = 40.0
+    """Smallest one."""
+    narrowest: float = 0.9
+    """Half the frame's width on the ground, at its middle, in target radii: at least."""
+    widest: float = 2.0
+    """Likewise, at most: 1.7 is the satellite image's."""
+    fov_deg: tuple[float, float] = (30.0, 65.0)
+    """Range of the field of view, of lenses of 28 to 65 mm in 35 mm format."""
+    off_centre: float = 0.35
+    """Largest distance of the frame's middle from the location's along an axis, in target radii."""
+    days: int = 3
+    """Days on which the views are taken, in turn."""
+
+    def __post_init__(self) -> None:
+        if self.views < 1:
+            raise ValueError(f"views is {self.views}: expected 1 or more")
+        if not LOWEST_RAY_DEG + 10 <= self.flattest_deg <= self.steepest_deg <= 90:
+            raise ValueError(
+                f"angles of {self.flattest_deg} to {self.steepest_deg} degrees below the horizon: "
+                f"expected {LOWEST_RAY_DEG + 10:.0f} <= flattest <= steepest <= 90"
+            )
+
+    def poses(self, *, radius_m: float, rng: np.random.Generator) -> list[Pose]:
+        """Poses of the views, each drawn independently."""
+        return [self._pose(radius_m, rng) for _ in range(self.views)]
+
+    def _pose(self, radius_m: float, rng: np.random.Generator) -> Pose:
+        heading = float(rng.uniform(0, 360))
+        down = float(rng.uniform(self.flattest_deg, self.steepest_deg))
+        widest_fov = min(self.fov_deg[1], 2 * (down - LOWEST_RAY_DEG))
+        fov = float(rng.uniform(min(self.fov_deg[0], widest_fov), widest_fov))
+        half_width_m = radius_m * float(rng.uniform(self.narrowest, self.widest))
+        slant_m = half_width_m / tan(radians(fov) / 2)
+        away_m = slant_m * cos(radians(down))
+        east_m, north_m = radius_m * rng.uniform(-self.off_centre, self.off_centre, 2)
+        return Pose(
+            x_m=float(east_m) - away_m * sin(radians(heading)),
+            y_m=float(north_m) - away_m * cos(radians(heading)),
+            altitude_m=slant_m * sin(radians(down)),
+            heading_deg=heading,
+            pitch_deg=-down,
+            fov_deg=fov,
+        )

@@ -5,15 +5,17 @@ A pure function of its spec: the images do not depend on the process, the time o
 
 import time
 from dataclasses import dataclass, replace
+from itertools import cycle
 from math import cos, pi, radians, sin, sqrt
 
 import numpy as np
 import simplejpeg
 
 from pipeline.simulation.appearance import sample_day
-from pipeline.simulation.flight import FlightPlan, Pose
+from pipeline.simulation.flight import FlightPlan, FreeFlight, Pose
 from pipeline.simulation.render import render_nadir, render_perspective
 from pipeline.simulation.scene import prepare_scene
+from pipeline.simulation.settings import Flight
 from pipeline.simulation.texture import FLIGHT_OVER_TEXTURE, textured_world
 from pipeline.simulation.town.town import make_town
 from pipeline.simulation.world import ByteMap
@@ -42,6 +44,7 @@ class LocationSpec:
     "Number of UAV images."
     size: int
     "Side of every image, pixels."
+    flight: Flight = "spiral"
     texture: str | None = None
     "A real overhead image to fly over instead of a procedural town."
     texture_metres_per_pixel: float = 0.3
@@ -88,10 +91,17 @@ def render_location(spec: LocationSpec) -> LocationImages:
         turn_deg=float(for_satellite.uniform(-5, 5)),
         rng=for_satellite,
     )
-    scene = prepare_scene(world, sample_day(for_flight_day))
-    first_heading = float(for_flight.uniform(0, 360))
-    poses = plan.poses(radius_m=radius, first_heading_deg=first_heading)
-    frames = [render_perspective(scene, pose, size=spec.size, rng=for_flight) for pose in poses]
+    if spec.flight == "free":
+        free = FreeFlight(views=spec.views)
+        poses, days = free.poses(radius_m=radius, rng=for_flight), min(free.days, free.views)
+    else:
+        first_heading = float(for_flight.uniform(0, 360))
+        poses, days = plan.poses(radius_m=radius, first_heading_deg=first_heading), 1
+    scenes = [prepare_scene(world, sample_day(for_flight_day)) for _ in range(days)]
+    frames = [
+        render_perspective(scene, pose, size=spec.size, rng=for_flight)
+        for scene, pose in zip(cycle(scenes), poses, strict=False)
+    ]
     rendered = time.perf_counter()
     satellite, drone = encode_jpeg(above), [encode_jpeg(frame) for frame in frames]
     seconds = {

@@ -26,6 +26,9 @@ BAND_RAYS = 65_536
 """Rays of a band: a dozen arrays of this size fit a core's cache."""
 BUNDLE_STEP_PX = 3.0
 """Map pixels between two lookups of a bundle in the coarse map."""
+LONGEST_FALL_M = 2.0
+"""Metres that a ray descends in one step, at most: the bisections then still tell the top of a
+surface from a wall."""
 WALL_DEPTH_M = 0.35
 """A hit so far below the surface's top is on a wall."""
 
@@ -77,7 +80,9 @@ def _trace_band(
 ) -> NDArray[np.uint32]:
     """Packed colours at the hits of a band's rays."""
     col_a, col_b, row_a, row_b = rays
-    fall = 1 / np.sqrt(col_b * col_b + row_b * row_b)  # metres down per map pixel along
+    # Metres down per map pixel along; a vertical ray would fall for ever.
+    along = np.sqrt(col_b * col_b + row_b * row_b)
+    fall = 1 / np.maximum(along, np.float32(1 / LONGEST_FALL_M))
     z = _bundle_start(scene, col_a, col_b, row_a, row_b, fall)
     flat = [a.ravel() for a in (col_a, col_b, row_a, row_b, fall)]
     above, below = _march(scene, z.ravel(), *flat)

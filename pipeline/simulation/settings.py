@@ -4,11 +4,15 @@ Imports nothing heavy, so that the command line is parsed at once.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 from pipeline.core.errors import InputError, require
 
 MAX_LOCATIONS, MAX_VIEWS = 1_000_000, 10_000
 "Beyond any use: a typing mistake fills the memory with plans before it fills the disk."
+
+Flight = Literal["spiral", "free"]
+"University-1652's descending spiral, or views from anywhere on several days."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,12 +29,17 @@ class SimulationSettings:
     "Locations in the gallery only. University-1652: 250."
     views: int = 54
     "UAV images per location, along the whole flight. University-1652: 54."
+    flight: Flight = "spiral"
+    """How the UAV comes by: `spiral` as in University-1652, or `free`: any heading, 40 to 90
+    degrees below the horizon, near and far, the place off the middle, on three days."""
     size: int = 512
     "Side of every image, pixels. University-1652: 512."
     seed: int = 0
     "Another seed makes other locations."
     textures: str | None = None
     "Folder of real overhead images to fly over, one per location; by default procedural towns."
+    fill_with_towns: bool = False
+    "Locations beyond those images are procedural towns, in place of an error."
     texture_metres_per_pixel: float = 0.3
     "Resolution of those images."
 

@@ -77,14 +77,15 @@ def plan_jobs(settings: SimulationSettings, root: str, textures: list[str]) -> l
     roles: list[Role] = ["train"] * settings.train_locations
     roles += ["test"] * settings.test_locations
     roles += ["distractor"] * settings.distractors
-    if settings.textures and len(textures) < len(roles):
+    if settings.textures and len(textures) < len(roles) and not settings.fill_with_towns:
         raise InputError(
             f"{settings.textures} holds {len(textures)} usable images for {len(roles)} locations; "
-            "expected one each; add images or ask for fewer locations"
+            "expected one each; add images, ask for fewer locations, or set --fill-with-towns"
         )
     rng = np.random.default_rng([settings.seed, 0])
     numbers = rng.permutation(len(roles)) + 1
-    texture_order = rng.permutation(len(textures)) if textures else None
+    # By the location's number; a number beyond the images is a town's.
+    texture_of = dict(enumerate((textures[at] for at in rng.permutation(len(textures))), start=1))
     return [
         LocationJob(
             root=root,
@@ -94,9 +95,8 @@ def plan_jobs(settings: SimulationSettings, root: str, textures: list[str]) -> l
                 location=int(number),
                 views=settings.views,
                 size=settings.size,
-                texture=(
-                    None if texture_order is None else textures[int(texture_order[int(number) - 1])]
-                ),
+                flight=settings.flight,
+                texture=texture_of.get(int(number)),
                 texture_metres_per_pixel=settings.texture_metres_per_pixel,
             ),
         )

@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from pipeline.batches.training import Batch, StreamConfig, TrainingStream
+from pipeline.batches.settings import StreamConfig
+from pipeline.batches.training import Batch, TrainingStream
 from pipeline.core import json_files, storage
 from pipeline.core.records import ImageRecord, Split, View
-from pipeline.images.transforms import Augmentation
+from pipeline.images.augmentation import Augmentation
 from pipeline.shards.manifest import MANIFEST, Manifest
 from pipeline.shards.plan import ShardPlan
 from pipeline.shards.shard_set import open_shards

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.batches.training import TrainingStream
 from pipeline.core.errors import InputError
-from pipeline.images.transforms import Augmentation
+from pipeline.images.augmentation import Augmentation
 from pipeline.shards.shard_set import open_shards
 from tests.batches.conftest import PLAIN, epoch
 

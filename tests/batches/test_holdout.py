@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.batches.holdout import exclude_locations, holdout_locations
-from pipeline.batches.training import StreamConfig, TrainingStream
+from pipeline.batches.settings import StreamConfig
+from pipeline.batches.training import TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.shards.manifest import read_manifest

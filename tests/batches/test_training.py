@@ -12,8 +12,8 @@ from pipeline.batches.training import TrainingStream
 from pipeline.core import json_files, storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import View
+from pipeline.images.augmentation import Augmentation
 from pipeline.images.decode import decode
-from pipeline.images.transforms import Augmentation
 from pipeline.shards.manifest import MANIFEST
 from pipeline.shards.shard_set import open_shards
 from tests.batches.conftest import CLASSES, PLAIN, SATELLITES, epoch, keys

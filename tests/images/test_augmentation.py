@@ -10,7 +10,8 @@ import pytest
 
 from pipeline.core.arrays import Pixels
 from pipeline.core.records import View
-from pipeline.images.transforms import Augmentation, augment, resize
+from pipeline.images.augmentation import Augmentation, augment
+from pipeline.images.transforms import resize
 
 
 def noise(height: int = 37, width: int = 50) -> Pixels:

@@ -10,7 +10,8 @@ import torch
 from jobs.training.probes import embed_view, probe, view_gap
 from jobs.training.recipes import smoke
 from model.pvda import FeatureEncoder
-from pipeline.batches.training import StreamConfig, TrainingStream
+from pipeline.batches.settings import StreamConfig
+from pipeline.batches.training import TrainingStream
 from pipeline.core.arrays import Floats, Pixels
 from pipeline.core.errors import InputError
 from pipeline.core.records import View

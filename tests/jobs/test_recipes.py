@@ -56,6 +56,7 @@ def test_recipes_are_listed_by_their_names() -> None:
         "no_restart",
         "alpha_zero",
         "smoke",
+        "builtin",
     ]
     assert all(make().name == name for name, make in RECIPES.items())
     assert all((make.__doc__ or "").splitlines()[0].endswith(".") for make in RECIPES.values())

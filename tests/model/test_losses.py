@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from model.losses import adversarial_loss, feature_loss, location_loss, view_loss
+from model.losses.pvda import adversarial_loss, feature_loss, location_loss, view_loss
 
 THREE, SEVEN, EVEN = [log(3), 0.0], [0.0, log(7)], [0.0, 0.0]
 

@@ -13,9 +13,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model.config import Optimization
-from model.losses import location_loss
+from model.losses.pvda import location_loss
 from model.schedule import ScheduleState
-from model.training import EncoderWithClassifier, Training
+from model.training import Training
+from model.two_views import EncoderWithClassifier
 from tests.model.tiny_training import (
     NOW,
     TINY,
@@ -61,12 +62,15 @@ def reference(
     Eq. 1.
     """
     images1_B3HW, location1_B, images2_B3HW, location2_B = batch()
-    maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = learner(images1_B3HW, images2_B3HW)
-    verdict_B2 = discriminator(torch.cat([maps1_BCHW, maps2_BCHW]))
+    drone, satellite = learner(images1_B3HW, images2_B3HW)
+    verdict_B2 = discriminator(torch.cat([drone.maps_BCHW, satellite.maps_BCHW]))
     swapped = F.cross_entropy(verdict_B2[:3], torch.ones(3, dtype=torch.long)) + F.cross_entropy(
         verdict_B2[3:], torch.zeros(3, dtype=torch.long)
     )
-    total = location_loss(logits1_BPL, location1_B, logits2_BPL, location2_B) + alpha * swapped
+    total = (
+        location_loss(drone.logits_BPL, location1_B, satellite.logits_BPL, location2_B)
+        + alpha * swapped
+    )
     names, parameters = zip(*learner.named_parameters(), strict=True)
     return dict(zip(names, torch.autograd.grad(total, parameters), strict=True))
 
@@ -106,7 +110,7 @@ def test_second_step_gives_discriminator_no_gradient() -> None:
 def test_encoder_gradient_is_of_swapped_labels() -> None:
     adversary, plain = (reference(make().model, _discriminator(), alpha) for alpha in (1.0, 0.0))
     training = make()
-    maps1_BCHW, maps2_BCHW, *_ = training.model(batch()[0], batch()[2])
+    (maps1_BCHW, *_), (maps2_BCHW, *_) = training.model(batch()[0], batch()[2])
     verdict_B2 = _discriminator()(torch.cat([maps1_BCHW, maps2_BCHW]))
     straight = F.cross_entropy(verdict_B2, torch.tensor([0, 0, 0, 1, 1, 1])) * 2
     first = training.model.encoder.backbone.get_parameter("conv1.weight")

@@ -11,7 +11,8 @@ from torch.optim import SGD, Adam, AdamW
 from model.checkpoint import Checkpoint, dumps, loads
 from model.config import Optimization
 from model.schedule import ScheduleState
-from model.training import EncoderWithClassifier, Training
+from model.training import Training
+from model.two_views import EncoderWithClassifier
 from tests.model.tiny_training import LOCATIONS, NOW, TINY, assert_same, batch, make
 
 
@@ -99,10 +100,13 @@ def test_joint_bn_encodes_both_views_in_one_batch() -> None:
     torch.manual_seed(0)
     learner = EncoderWithClassifier(TINY, 3, joint_bn=True)
     images_B3HW = torch.randint(0, 256, (5, 3, 64, 64), dtype=torch.uint8)
-    maps1, maps2, logits1, logits2 = learner(images_B3HW[:2], images_B3HW[2:])
+    (maps1, g1, logits1), (maps2, g2, logits2) = learner(images_B3HW[:2], images_B3HW[2:])
     maps_BCHW, g_BPD = learner.encoder(images_B3HW)
     assert torch.equal(torch.cat([maps1, maps2]), maps_BCHW)
+    assert torch.equal(torch.cat([g1, g2]), g_BPD)
     assert torch.allclose(torch.cat([logits1, logits2]), learner.classifier(g_BPD))
     apart = EncoderWithClassifier(TINY, 3)
     apart.load_state_dict(learner.state_dict())
-    assert not torch.allclose(apart(images_B3HW[:2], images_B3HW[2:])[0], maps1, atol=1e-3)
+    assert not torch.allclose(
+        apart(images_B3HW[:2], images_B3HW[2:])[0].maps_BCHW, maps1, atol=1e-3
+    )

@@ -7,8 +7,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from model.backbones import BACKBONES
-from model.backbones.resnet import ResNet
+from model.backbones.resnet import LAYOUTS, ResNet
 from model.errors import CheckpointError
 from model.weights.load import infer_backbone, load_backbone, read_state_dict
 
@@ -125,8 +124,8 @@ def test_load_backbone_of_each_depth(name: str, tensors: int) -> None:
     load_backbone(backbone, state, "resnet.pth")
 
 
-@pytest.mark.parametrize("name", BACKBONES)
-@pytest.mark.parametrize("other", BACKBONES)
+@pytest.mark.parametrize("name", LAYOUTS)
+@pytest.mark.parametrize("other", LAYOUTS)
 def test_load_backbone_rejects_another_depth(name: str, other: str) -> None:
     with torch.device("meta"):
         backbone = ResNet(name)

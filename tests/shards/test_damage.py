@@ -13,7 +13,8 @@ import pytest
 from jobs.training.driver import train
 from jobs.training.recipes import smoke
 from jobs.training.settings import TrainSettings
-from pipeline.batches.training import StreamConfig, TrainingStream
+from pipeline.batches.settings import StreamConfig
+from pipeline.batches.training import TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.features.embed import plan_embedding

@@ -13,7 +13,8 @@ import pytest
 import webdataset
 from PIL import Image
 
-from pipeline.batches.training import StreamConfig, TrainingStream
+from pipeline.batches.settings import StreamConfig
+from pipeline.batches.training import TrainingStream
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.features.embed import embed_gallery
