@@ -58,9 +58,9 @@ class LossWeights:
     """What encoder and classifier minimise beside the adversary's term. The defaults are the
     paper's."""
 
-    location: float = 1.0
+    location_weight: float = 1.0
     "Weight of Eq. 1, the classification of locations [paper]."
-    contrastive: float = 0.0
+    contrastive_weight: float = 0.0
     "Weight of symmetric InfoNCE between the views' embeddings [paper: none; Sample4Geo: 1]."
     temperature: float = 0.05
     "InfoNCE divides cosines by it [chosen]."
@@ -68,10 +68,11 @@ class LossWeights:
     "Share of InfoNCE's target that is spread over all rows [Sample4Geo]."
 
     def __post_init__(self) -> None:
-        if min(self.location, self.contrastive) < 0 or self.location + self.contrastive == 0:
+        weights = (self.location_weight, self.contrastive_weight)
+        if min(weights) < 0 or not any(weights):
             raise ValueError(
-                f"location is {self.location} and contrastive {self.contrastive}, expected weights "
-                "of 0 or more that are not both 0"
+                f"location_weight is {weights[0]} and contrastive_weight {weights[1]}, expected 0 "
+                "or more and not both 0"
             )
         if not (self.temperature > 0 and 0 <= self.label_smoothing < 1):
             raise ValueError(

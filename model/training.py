@@ -119,8 +119,8 @@ class Training:
         )
         location = located_VP.sum()
         metrics = {"location_loss": location} | _by_view("location_loss", located_VP)
-        total = self.losses.location * location
-        if self.losses.contrastive:
+        total = self.losses.location_weight * location
+        if self.losses.contrastive_weight:
             contrastive = info_nce(
                 unit_embedding(drone.g_BPD.float()),
                 unit_embedding(satellite.g_BPD.float()),
@@ -129,7 +129,7 @@ class Training:
                 self.losses.label_smoothing,
             )
             metrics["contrastive_loss"] = contrastive
-            total = total + self.losses.contrastive * contrastive
+            total = total + self.losses.contrastive_weight * contrastive
         if self.discriminator is not None:
             both_BCHW = torch.cat([drone.maps_BCHW, satellite.maps_BCHW])
             metrics |= self.discriminate(both_BCHW.detach(), len(drone.maps_BCHW))

@@ -56,7 +56,7 @@ class Recipe:
         require(self.batch_size >= 2, "batch_size", self.batch_size, few)
         pairs = "unique_pairs, since InfoNCE compares the views row by row"
         require(
-            not self.losses.contrastive or self.sampler == "unique_pairs",
+            not self.losses.contrastive_weight or self.sampler == "unique_pairs",
             "sampler", self.sampler, pairs,
         )  # fmt: skip
         share = "a share of the locations, from 0 to below 1"
@@ -155,7 +155,7 @@ def builtin(epochs: int = 30) -> Recipe:
             ring_divisor="ring", discriminator_channels=64,
         ),
         start="imagenet",
-        losses=LossWeights(contrastive=1.0, location=0.1),
+        losses=LossWeights(contrastive_weight=1.0, location_weight=0.1),
         optimization=Optimization(
             optimizer="adamw", backbone_lr=3e-4, head_lr=1e-3, classifier_lr=1e-3,
             discriminator_lr=1e-3, weight_decay=0.01, frozen_stages=4,
@@ -164,7 +164,7 @@ def builtin(epochs: int = 30) -> Recipe:
             epochs=epochs, lr_schedule="cosine", warmup_epochs=1, alpha=0.1, alpha_step=0.0
         ),
         augmentation=Augmentation(
-            pad=0, rotation=180, mirror=False, free=True, drone_rotation=10, scale=0.2, shift=0.08,
+            pad=0, rotation=180, mirror=False, affine=True, drone_rotation=10, scale=0.2, shift=0.08,
             colour=1.0, blur=0.8, noise=8.0, jpeg=0.3, hide=0.2,
         ),
         sampler="unique_pairs",

@@ -1,4 +1,4 @@
-"""The train transforms per view, on uint8: the paper's geometry, or a free one, and the looks of
+"""The train transforms per view, on uint8: the paper's geometry, or an affine one, and the looks of
 other sensors and days. The network normalises.
 
 In: a decoded image. Out: (size, size, 3). Shapes: H x W pixels.
@@ -25,20 +25,20 @@ class Augmentation:
 
     pad: int = 10
     """Pixels added on each side by repeating the edge; the image is cropped from the result
-    [paper, LPN]. Not with `free`."""
+    [paper, LPN]. Not with `affine`."""
     rotation: float = 90.0
     "Satellite images are turned by a random angle within +- this many degrees [paper, LPN]."
     mirror: bool = True
     "Whether half of the images are mirrored [paper, LPN]."
-    free: bool = False
+    affine: bool = False
     """Turn, scale and shift in one step, interpolated, over mirrored edges; the paper's way takes
     the nearest pixel and leaves black corners in one view only [chosen]."""
     drone_rotation: float = 0.0
-    "UAV images likewise, with `free`: a camera's roll [chosen: none]."
+    "UAV images likewise, with `affine`: a camera's roll [chosen: none]."
     scale: float = 0.0
-    "Images are scaled by a random factor between 1 / (1 + scale) and 1 + scale, with `free`."
+    "Images are scaled by a random factor between 1 / (1 + scale) and 1 + scale, with `affine`."
     shift: float = 0.0
-    "And shifted by up to this share of their side along each axis, with `free`."
+    "And shifted by up to this share of their side along each axis, with `affine`."
     colour: float = 0.0
     "Strength of random brightness, contrast, colour balance, saturation and haze; 1 is strong."
     blur: float = 0.0
@@ -56,9 +56,9 @@ class Augmentation:
         for name in ("pad", "scale", "shift", "colour", "blur", "noise"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
         moves = self.drone_rotation or self.scale or self.shift
-        if moves and not self.free:
+        if moves and not self.affine:
             raise ValueError(
-                "drone_rotation, scale and shift have no effect without free; expected free too"
+                "drone_rotation, scale and shift have no effect without affine; expected that too"
             )
 
 
@@ -72,7 +72,7 @@ def augment(
 ) -> Pixels:
     """Train transform of one image, (size, size, 3): geometry, mirror, then the sensor's look."""
     image_HW3 = resize(image_HW3, size, by)
-    move = _move_freely if settings.free else _move_as_published
+    move = _move_affinely if settings.affine else _move_as_published
     moved_HW3 = move(image_HW3, view, settings, rng)
     if settings.mirror and rng.random() < 0.5:
         moved_HW3 = moved_HW3[:, ::-1]
@@ -95,7 +95,7 @@ def _move_as_published(
     return padded_HW3[top : top + size, left : left + size]
 
 
-def _move_freely(
+def _move_affinely(
     image_HW3: Pixels, view: View, settings: Augmentation, rng: np.random.Generator
 ) -> Pixels:
     """Turn, scale and shift by one affine map; beyond the edge lies the mirror image."""
