@@ -164,8 +164,8 @@ def builtin(epochs: int = 30) -> Recipe:
             epochs=epochs, lr_schedule="cosine", warmup_epochs=1, alpha=0.1, alpha_step=0.0
         ),
         augmentation=Augmentation(
-            pad=0, rotation=180, mirror=False, affine=True, drone_rotation=10, scale=0.2, shift=0.08,
-            colour=1.0, blur=0.8, noise=8.0, jpeg=0.3, hide=0.2,
+            pad=0, rotation=180, mirror=False, affine=True, drone_rotation=10, scale=0.2,
+            shift=0.08, colour=1.0, blur=0.8, noise=8.0, jpeg=0.3, hide=0.2,
         ),
         sampler="unique_pairs",
         batch_size=24,

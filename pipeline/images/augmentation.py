@@ -11,7 +11,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from pipeline.core.arrays import Pixels
-from pipeline.core.errors import require
+from pipeline.core.errors import InputError, require
 from pipeline.core.records import View
 from pipeline.images.transforms import Resizer, resize
 
@@ -57,8 +57,9 @@ class Augmentation:
             require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
         moves = self.drone_rotation or self.scale or self.shift
         if moves and not self.affine:
-            raise ValueError(
-                "drone_rotation, scale and shift have no effect without affine; expected that too"
+            raise InputError(
+                "found one of --drone-rotation, --scale and --shift, expected --affine too, "
+                "without which they have no effect"
             )
 
 

@@ -3,14 +3,16 @@
 Shapes: H x W pixels.
 """
 
+from dataclasses import replace
 from math import atan2, degrees
 
 import numpy as np
 import pytest
 
 from pipeline.core.arrays import Pixels
+from pipeline.core.errors import InputError
 from pipeline.core.records import View
-from pipeline.images.augmentation import Augmentation, augment
+from pipeline.images.augmentation import Augmentation, augment, change_colours, change_look
 from pipeline.images.transforms import resize
 
 
@@ -122,3 +124,78 @@ def test_augment_gives_one_block_of_memory_of_the_size() -> None:
             assert image_HW3.shape == (SIZE, SIZE, 3)
             assert image_HW3.dtype == np.uint8
             assert image_HW3.flags.c_contiguous
+
+
+# The affine geometry and the looks.
+
+AFFINE = Augmentation(pad=0, rotation=180, mirror=False, affine=True, drone_rotation=10)
+
+
+def test_affine_without_moves_changes_nothing() -> None:
+    still = Augmentation(pad=0, rotation=0, mirror=False, affine=True)
+    for view in (View.DRONE, View.SATELLITE):
+        for image_HW3 in augmented(view, still, 3, noise()):
+            assert np.array_equal(image_HW3, resize(noise(), SIZE))
+
+
+def test_affine_turns_satellites_any_way_without_black_corners() -> None:
+    white_HW3 = np.full((SIZE, SIZE, 3), 255, np.uint8)
+    moves = replace(AFFINE, scale=0.3, shift=0.2)
+    assert all((image_HW3 == 255).all() for image_HW3 in
+               augmented(View.SATELLITE, moves, 50, white_HW3))  # fmt: skip
+    # A bright upper half is found on all four sides.
+    half_HW3 = np.zeros((SIZE, SIZE, 3), np.uint8)
+    half_HW3[: SIZE // 2] = 255
+    turned = augmented(View.SATELLITE, AFFINE, 100, half_HW3)
+    sides = [(im[:4].mean(), im[-4:].mean(), im[:, :4].mean(), im[:, -4:].mean()) for im in turned]
+    assert {int(np.argmax(side)) for side in sides} == {0, 1, 2, 3}
+    rolled = augmented(View.DRONE, AFFINE, 100, half_HW3)
+    assert all(int(np.argmax([im[:4].mean(), im[-4:].mean()])) == 0 for im in rolled)
+
+
+def test_affine_scale_is_symmetric_around_one() -> None:
+    dot_HW3 = np.zeros((64, 64, 3), np.uint8)
+    dot_HW3[24:40, 24:40] = 255
+    scaled = [
+        augment(dot_HW3, View.DRONE, 64, Augmentation(pad=0, mirror=False, affine=True, scale=0.5),
+                np.random.default_rng(seed)) for seed in range(200)
+    ]  # fmt: skip
+    areas = np.array([(image_HW3[..., 0] > 127).sum() / 256 for image_HW3 in scaled])
+    assert 1 / 1.5**2 - 0.15 < areas.min() < 0.6
+    assert 1.7 < areas.max() < 1.5**2 + 0.3
+    assert abs(np.log(areas).mean()) < 0.1
+
+
+def test_colours_at_strength_0_stay() -> None:
+    values = noise().astype(np.float32)
+    kept = change_colours(values.copy(), 0.0, np.random.default_rng(0))
+    np.testing.assert_allclose(kept, values, atol=1e-3)
+    changed = [change_colours(values.copy(), 1.0, np.random.default_rng(seed)) for seed in range(9)]
+    assert len({float(one.mean()) for one in changed}) == 9
+
+
+@pytest.mark.parametrize(
+    "look",
+    [Augmentation(blur=3.0), Augmentation(noise=20.0), Augmentation(jpeg=1), Augmentation(hide=1)],
+)
+def test_each_look_changes_an_image_and_keeps_its_size(look: Augmentation) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        found = change_look(noise(), look, rng)
+        assert found.shape == noise().shape
+        assert found.dtype == np.uint8
+    assert not np.array_equal(found, noise())
+    assert np.array_equal(change_look(noise(), Augmentation(), rng), noise())
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"scale": 0.2}, "expected --affine too"),
+        ({"hide": 1.5}, "--hide is 1.5, expected 0 to 1"),
+        ({"blur": -1.0}, "--blur is -1.0, expected 0 or more"),
+    ],
+)
+def test_augmentation_rejects(settings: dict[str, float], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        replace(Augmentation(), **settings)  # type: ignore[arg-type]

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from model.config import Optimization, PVDAConfig
+from model.config import LossWeights, Optimization, PVDAConfig
 from model.schedule import ScheduleState
 from model.training import Training
 
@@ -23,10 +23,15 @@ NOW = ScheduleState(alpha=0.9, lr_scale=1.0)
 
 
 def make(
-    config: PVDAConfig = TINY, optimization: Optimization | None = None, adversary: bool = True
+    config: PVDAConfig = TINY,
+    optimization: Optimization | None = None,
+    adversary: bool = True,
+    losses: LossWeights | None = None,
 ) -> Training:
     torch.manual_seed(0)
-    training = Training(config, optimization or Optimization(), LOCATIONS, adversary=adversary)
+    training = Training(
+        config, optimization or Optimization(), LOCATIONS, losses=losses, adversary=adversary
+    )
     torch.manual_seed(1)  # as the training loop does: dropout does not depend on what was built
     return training
 
