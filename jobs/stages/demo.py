@@ -17,15 +17,15 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from jobs.encoding.encoder import make_encoder_spec
+from jobs.encoding.encoder import make_encoder_spec, read_checkpoint_bytes
 from jobs.stages.calibrate import calibrate_index
 from jobs.stages.evaluation_tables import print_table
 from jobs.stages.locate import locate_photos
 from jobs.stages.settings import CalibrateSettings, DemoSettings, LocateSettings
 from jobs.training.driver import train
-from jobs.training.recipes import smoke
-from jobs.training.settings import RunConfig, TrainSettings
-from jobs.training.state import initial_checkpoint
+from jobs.training.recipes import finetune
+from jobs.training.settings import TrainSettings
+from model.weights.builtin import BUILTIN
 from pipeline.core import cluster, storage
 from pipeline.core.errors import InputError
 from pipeline.core.progress import console, results
@@ -48,7 +48,7 @@ from pipeline.sources.university1652 import University1652
 
 
 def demo(settings: DemoSettings) -> list[dict[str, Any]]:
-    """Run every stage; returns the trained network's metric rows."""
+    """Run every stage; returns the tuned encoder's metric rows."""
     out = storage.absolute(settings.out)
     flights, shards, trained = (storage.join(out, name) for name in ("flights", "shards", "run"))
     seconds: dict[str, float] = {}
@@ -66,55 +66,20 @@ def demo(settings: DemoSettings) -> list[dict[str, Any]]:
         )
     with step(seconds, "2 pack", "images into webdataset shards"):
         pack(University1652(), PackingSettings(root=flights, out=shards))
-    with step(
-        seconds,
-        "3 train",
-        "PVDA from scratch by recipe smoke: small, quick, the same two-step method",
-    ):
-        recipe = replace(smoke(epochs=settings.epochs), hold_out=settings.hold_out)
-        checkpoint = train(TrainSettings(recipe=recipe, shards=shards, out=trained))
-        start = storage.join(out, "untrained.pt")
-        if not storage.exists(start):
-            storage.write_bytes(
-                start, initial_checkpoint(RunConfig(shards=shards, out=trained, recipe=recipe))
-            )
     rows: dict[str, list[dict[str, Any]]] = {}
-    for number, (name, file) in enumerate({"untrained": start, "trained": checkpoint}.items()):
-        table, results = (
-            storage.join(out, f"features-{name}"),
-            storage.join(out, f"evaluation-{name}"),
-        )
-        with step(
-            seconds,
-            f"{4 + 2 * number} embed",
-            f"test images with the {name} network, one Parquet part per shard",
-        ):
-            for split in (Split.QUERY, Split.GALLERY):
-                embedding = EmbeddingSettings(shards=shards, out=table, split=split)
-                embed_gallery(
-                    embedding, make_encoder_spec(storage.read_bytes(file), file, embedding)
-                )
-        with step(
-            seconds,
-            f"{5 + 2 * number} evaluate",
-            f"both directions and multi-query, the {name} network",
-        ):
-            rows[name] = evaluate(
-                EvaluationSettings(
-                    table=table,
-                    out=results,
-                    shards=shards,
-                    run=trained if name == "trained" else None,
-                    beside=storage.join(out, "evaluation-untrained") if name == "trained" else None,
-                    by=("altitude_m",),
-                    title=f"PVDA on simulated flights, {name}",
-                )
-            )
-    with step(seconds, "8 index", "satellite gallery into FAISS, searched with the UAV's images"):
-        index = storage.join(out, "index")
+    folders = DemoFolders(out=out, shards=shards)
+    with step(seconds, "3 built-in encoder", "test images embedded and ranked without training"):
+        rows["built-in"] = embed_and_evaluate(folders, "built-in", BUILTIN)
+    with step(seconds, "4 train", "it is fine-tuned on the demo's own places, by recipe finetune"):
+        recipe = replace(finetune(epochs=settings.epochs), hold_out=settings.hold_out)
+        checkpoint = train(TrainSettings(recipe=recipe, shards=shards, out=trained))
+    with step(seconds, "5 tuned encoder", "the same images again, beside the first evaluation"):
+        rows["tuned"] = embed_and_evaluate(folders, "tuned", checkpoint, trained)
+    with step(seconds, "6 index", "satellite gallery into FAISS, searched with the UAV's images"):
+        index, table = storage.join(out, "index"), folders.table("tuned")
         build_index(IndexSettings(table=table, out=index, split=Split.GALLERY, view=View.SATELLITE))
         console.print(search_index(index, table))
-    with step(seconds, "9 locate", "a few unseen photos: where were they taken?"):
+    with step(seconds, "7 locate", "a few unseen photos: where were they taken?"):
         page = locate_samples(
             DemoPaths(
                 flights=flights,
@@ -126,17 +91,55 @@ def demo(settings: DemoSettings) -> list[dict[str, Any]]:
         )
     console.rule("done")
     console.print("seconds: " + ", ".join(f"{name} {spent:.0f}" for name, spent in seconds.items()))
-    chance = 1 / rows["trained"][0]["gallery"]
+    chance = 1 / rows["tuned"][0]["gallery"]
     console.print(
-        f"locations never seen in training, UAV -> satellite R@1: chance {chance:.2%}, untrained "
-        f"{rows['untrained'][0]['r1']:.2%}, trained {rows['trained'][0]['r1']:.2%}"
+        f"locations never seen in training, UAV -> satellite R@1: chance {chance:.2%}, built-in "
+        f"{rows['built-in'][0]['r1']:.2%}, tuned {rows['tuned'][0]['r1']:.2%}"
     )
-    print_table(rows["trained"])
+    print_table(rows["tuned"])
     print(
-        f"report: {storage.join(out, 'evaluation-trained', 'report.html')}\n"
+        f"report: {storage.join(folders.evaluation('tuned'), 'report.html')}\n"
         f"photos on the map: {page}"
     )
-    return rows["trained"]
+    return rows["tuned"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoFolders:
+    """Where the demo's tables and evaluations are."""
+
+    out: str
+    shards: str
+
+    def table(self, name: str) -> str:
+        return storage.join(self.out, f"features-{name}")
+
+    def evaluation(self, name: str) -> str:
+        return storage.join(self.out, f"evaluation-{name}")
+
+
+def embed_and_evaluate(
+    folders: DemoFolders, name: str, checkpoint: str, run: str | None = None
+) -> list[dict[str, Any]]:
+    """Embed the test images and rank them, both directions; the evaluation's rows.
+
+    `run`: the training that the encoder comes from; its report stands beside the built-in one's.
+    """
+    for split in (Split.QUERY, Split.GALLERY):
+        embedding = EmbeddingSettings(shards=folders.shards, out=folders.table(name), split=split)
+        data = read_checkpoint_bytes(checkpoint)
+        embed_gallery(embedding, make_encoder_spec(data, checkpoint, embedding))
+    return evaluate(
+        EvaluationSettings(
+            table=folders.table(name),
+            out=folders.evaluation(name),
+            shards=folders.shards,
+            run=run,
+            beside=None if run is None else folders.evaluation("built-in"),
+            by=("altitude_m",),
+            title=f"Simulated flights, {name} encoder",
+        )
+    )
 
 
 def search_index(index: str, table: str) -> str:

@@ -231,8 +231,8 @@ class DemoSettings:
     "UAV images per location."
     size: int = 128
     "Side of the images in pixels."
-    epochs: int = 80
-    "Epochs of recipe smoke."
+    epochs: int = 8
+    "Epochs of recipe finetune."
 
 
 @dataclass(frozen=True, kw_only=True)

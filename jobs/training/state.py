@@ -14,7 +14,7 @@ from torch import nn
 from jobs.training.checkpoints import CHECKPOINT_FILE, FoundCheckpoint, find_checkpoint
 from jobs.training.metrics import MetricAccumulator, NotFinite
 from jobs.training.settings import RunConfig
-from model.checkpoint import Checkpoint, dumps
+from model.checkpoint import Checkpoint
 from model.errors import CheckpointError
 from model.training import Training
 from model.weights.start import load_start
@@ -159,11 +159,3 @@ def make_checkpoint(
         network=run.recipe.network, recipe=asdict(run.recipe), locations=list(stream.classes),
         epoch=len(history), history=history, state=training.state_dict(),
     )  # fmt: skip
-
-
-def initial_checkpoint(run: RunConfig) -> bytes:
-    """The checkpoint of a run before its first step, wherever the run is now: to compare with."""
-    context = WorkerContext()
-    stream = open_stream(run, context)
-    training = build_training(run, context, len(stream.classes))
-    return dumps(make_checkpoint(run, training, stream, []))

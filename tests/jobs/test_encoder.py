@@ -17,7 +17,6 @@ from jobs.encoding.probe_images import PROBE_IMAGES, ImageBytes, first_images
 from jobs.encoding.settings import EncoderSettings
 from jobs.training.recipes import smoke
 from jobs.training.settings import RunConfig
-from jobs.training.state import initial_checkpoint
 from model.checkpoint import build_encoder, loads
 from model.inference.embed import embed
 from model.inference.int8 import PrecisionError
@@ -29,6 +28,7 @@ from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table
 from pipeline.images.transforms import Resizer
 from pipeline.shards.shard_set import open_or_scan
+from tests.jobs.tiny_runs import initial_checkpoint
 
 
 @pytest.fixture(scope="module")

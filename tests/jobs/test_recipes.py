@@ -57,6 +57,7 @@ def test_recipes_are_listed_by_their_names() -> None:
         "alpha_zero",
         "smoke",
         "builtin",
+        "finetune",
     ]
     assert all(make().name == name for name, make in RECIPES.items())
     assert all((make.__doc__ or "").splitlines()[0].endswith(".") for make in RECIPES.values())

@@ -15,7 +15,7 @@ from jobs.training.checkpoints import read_checkpoint
 from jobs.training.driver import train
 from jobs.training.recipes import paper
 from jobs.training.settings import RECIPE, RunConfig
-from jobs.training.state import WorkerContext, initial_checkpoint
+from jobs.training.state import WorkerContext
 from jobs.training.worker import train_worker
 from model.checkpoint import build_encoder, loads
 from model.errors import CheckpointError
@@ -23,7 +23,7 @@ from pipeline.core.arrays import Pixels
 from pipeline.core.errors import InputError
 from pipeline.images.decode import DecodeError, decode
 from pipeline.shards.samples import read_samples
-from tests.jobs.tiny_runs import rows, rows_of, settings, tiny, weights
+from tests.jobs.tiny_runs import initial_checkpoint, rows, rows_of, settings, tiny, weights
 
 
 def test_train_writes_checkpoint_curves_and_encoder(tiny_shards: str, tmp_path: Path) -> None:

@@ -8,8 +8,9 @@ import torch
 
 from jobs.training.driver import train
 from jobs.training.recipes import Recipe, smoke
-from jobs.training.settings import TrainSettings
-from model.checkpoint import loads
+from jobs.training.settings import RunConfig, TrainSettings
+from jobs.training.state import WorkerContext, build_training, make_checkpoint, open_stream
+from model.checkpoint import dumps, loads
 
 
 def tiny(epochs: int = 2) -> Recipe:
@@ -30,6 +31,14 @@ def settings(shards: str, out: Path, recipe: Recipe, **changes: object) -> Train
         "checkpoint_minutes": 0.0,
     }
     return TrainSettings(**(given | changes))  # type: ignore[arg-type]
+
+
+def initial_checkpoint(run: RunConfig) -> bytes:
+    """The checkpoint of a run before its first step."""
+    context = WorkerContext()
+    stream = open_stream(run, context)
+    training = build_training(run, context, len(stream.classes))
+    return dumps(make_checkpoint(run, training, stream, []))
 
 
 def rows(out: Path) -> list[dict[str, object]]:
