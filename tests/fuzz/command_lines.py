@@ -166,6 +166,7 @@ JOBS: dict[str, tuple[list[str], list[str], list[str], list[str]]] = {
     "compare": ([], ["out"], [], []),
     "import_features": (["mat"], ["out"], [], ["query-view"]),
     "import_weights": (["torchvision", "lpn"], ["out"], ["image-size"], []),
+    "export_weights": (["checkpoint"], ["out"], [], []),
 }
 SOURCES = {
     "university1652": ["kml", "views"],

@@ -12,14 +12,21 @@ import torch
 
 from jobs.encoding import encoder as encoder_module
 from jobs.encoding import probe_images
-from jobs.encoding.encoder import make_encoder_spec
+from jobs.encoding.encoder import (
+    absolute_checkpoint,
+    make_encoder_spec,
+    read_checkpoint_bytes,
+)
 from jobs.encoding.probe_images import PROBE_IMAGES, ImageBytes, first_images
 from jobs.encoding.settings import EncoderSettings
+from jobs.stages.export_weights import export_weights
+from jobs.stages.settings import ExportWeightsSettings
 from jobs.training.recipes import smoke
 from jobs.training.settings import RunConfig
-from model.checkpoint import build_encoder, loads
+from model.checkpoint import build_encoder, dumps, loads
 from model.inference.embed import embed
 from model.inference.int8 import PrecisionError
+from model.weights.builtin import BUILTIN
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split
 from pipeline.features.embed import embed_gallery
@@ -117,3 +124,35 @@ def test_table_records_the_encoding_and_remarks_are_printed(
     assert table.rows > 0
     assert table.encoding == spec.encoding
     assert spec.encoding == EncodingConfig(mirror=True, resizer="pillow", precision="float32")
+
+
+def test_mirror_images_are_summed_where_training_saw_them(
+    tiny_shards: str, checkpoint: bytes
+) -> None:
+    settings = settings_of(tiny_shards)
+    trained = loads(checkpoint)
+    assert make_encoder_spec(checkpoint, "x.pt", settings).encoding.mirror
+    augmentation = trained.recipe["augmentation"] | {"mirror": False}
+    plain = dumps(replace(trained, recipe=trained.recipe | {"augmentation": augmentation}))
+    assert not make_encoder_spec(plain, "x.pt", settings).encoding.mirror
+    asked = make_encoder_spec(plain, "x.pt", settings, EncoderSettings(mirror=True))
+    assert asked.encoding.mirror
+    unknown = dumps(replace(trained, recipe={}))
+    assert make_encoder_spec(unknown, "x.pt", settings).encoding.mirror
+
+
+def test_builtin_is_a_checkpoint_by_name(tmp_path: Path) -> None:
+    assert loads(read_checkpoint_bytes(BUILTIN)).network.backbone == "efficientnet_lite0"
+    assert absolute_checkpoint(BUILTIN) == BUILTIN
+    assert absolute_checkpoint("run/last.pt") == str(Path("run/last.pt").absolute())
+    with pytest.raises(InputError, match=r"no checkpoint at .*; expected builtin, or a last\.pt"):
+        read_checkpoint_bytes(str(tmp_path / "none.pt"))
+
+
+def test_export_weights_writes_an_encoder_that_jobs_take(checkpoint: bytes, tmp_path: Path) -> None:
+    (tmp_path / "last.pt").write_bytes(checkpoint)
+    out = str(tmp_path / "small.safetensors")
+    export_weights(ExportWeightsSettings(checkpoint=str(tmp_path / "last.pt"), out=out))
+    found, whole = loads(read_checkpoint_bytes(out), out), loads(checkpoint)
+    assert found.network == whole.network
+    assert Path(out).stat().st_size < len(checkpoint) / 2
