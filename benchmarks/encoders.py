@@ -32,7 +32,7 @@ def embed_view(
 ) -> tuple[EmbeddingSet, float]:
     """Embeddings of a split's view, and the images a second of the network alone."""
     opened = loads(read_checkpoint_bytes(checkpoint), checkpoint)
-    encoder = build_encoder(opened).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    encoder = build_encoder(opened)
     mirror = trained_on_mirrors(opened)
     samples = (s for shard in shards.manifest.of(split, view) for s in shards.samples(shard))
     decoded = decode_samples(samples, size or opened.network.image_size, 2, 2 * BATCH)

@@ -12,8 +12,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-import torch
-import torch._inductor.config
 from torch import Tensor, nn
 
 EmbedBatch = Callable[[Tensor], Tensor]
@@ -28,6 +26,9 @@ def compile_frozen(module: nn.Module, images_B3HW: Tensor) -> EmbedBatch:
 
     Raises NotCompiled: no C++ compiler, a driver too old, or another of torch's errors.
     """
+    # Here: its import takes two seconds, which an encoder that is not compiled need not spend.
+    import torch._inductor.config
+
     # One full graph or an error: graph breaks, or the limit of recompilations, would make it slow
     # without a message.
     compiled = torch.compile(module, dynamic=False, fullgraph=True)

@@ -1,11 +1,12 @@
-"""The spiral flight: University-1652's altitudes and turns, looking at the middle."""
+"""The spiral flight: University-1652's altitudes and turns, looking at the middle; free flights."""
 
 import itertools
 from math import cos, radians, sin, sqrt, tan
 
+import numpy as np
 import pytest
 
-from pipeline.simulation.flight import FlightPlan
+from pipeline.simulation.flight import LOWEST_RAY_DEG, FlightPlan, FreeFlight
 
 
 def test_poses_descend_in_three_turns_of_20_degree_steps() -> None:
@@ -62,3 +63,40 @@ def test_fewer_views_spread_over_the_spiral_and_its_headings() -> None:
 def test_plan_that_cannot_be_flown_is_rejected(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="expected"):
         FlightPlan(**wrong)  # type: ignore[arg-type]  # one of several fields
+
+
+def test_free_flight_keeps_within_its_ranges() -> None:
+    flight = FreeFlight(views=300, flattest_deg=45.0)
+    poses = flight.poses(radius_m=20.0, rng=np.random.default_rng(0))
+    assert len({pose.heading_deg // 45 for pose in poses}) == 8
+    downs = [-pose.pitch_deg for pose in poses]
+    assert 45 <= min(downs) < 50
+    assert 85 < max(downs) <= 90
+    for pose in poses:
+        slant = pose.altitude_m / sin(radians(-pose.pitch_deg))
+        half_width = slant * tan(radians(pose.fov_deg / 2)) / 20.0
+        assert 0.9 - 1e-6 <= half_width <= 2.0 + 1e-6
+        assert -pose.pitch_deg - pose.fov_deg / 2 >= LOWEST_RAY_DEG - 1e-6
+        away = slant * cos(radians(-pose.pitch_deg))
+        middle = (pose.x_m + away * sin(radians(pose.heading_deg)),
+                  pose.y_m + away * cos(radians(pose.heading_deg)))  # fmt: skip
+        assert max(map(abs, middle)) <= 0.35 * 20.0 + 1e-6
+
+
+def test_free_flight_depends_on_its_generator_alone() -> None:
+    once, again, other = (
+        FreeFlight(views=4).poses(radius_m=20.0, rng=np.random.default_rng(seed))
+        for seed in (3, 3, 4)
+    )
+    assert once == again != other
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"views": 0}, "views is 0"), ({"views": 1, "flattest_deg": 20.0}, "20.0 to 90.0 degrees")],
+)
+def test_free_flight_that_cannot_be_flown_is_rejected(
+    wrong: dict[str, float], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        FreeFlight(**wrong)  # type: ignore[arg-type]

@@ -168,3 +168,13 @@ def test_camera_that_sees_the_horizon_is_rejected() -> None:
     level = Pose(x_m=0, y_m=-100, altitude_m=50, heading_deg=0, pitch_deg=-10, fov_deg=40)
     with pytest.raises(ValueError, match="look further down"):
         render_perspective(scene(), level, size=32)
+
+
+def test_ground_and_roof_below_the_camera_are_no_walls() -> None:
+    # Rays near the vertical: a step of one map pixel along them would descend without bound.
+    for tower in (None, (0.0, 12.0, 15.0)):
+        pose = Pose(x_m=0, y_m=0, altitude_m=60, heading_deg=30, pitch_deg=-90, fov_deg=20)
+        frame = render_perspective(scene(tower=tower), pose, size=64)
+        middle = frame[24:40, 24:40].reshape(-1, 3)
+        assert (middle == middle[0]).all()
+        assert len(where(frame, BLUE)) == 0

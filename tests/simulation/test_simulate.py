@@ -4,7 +4,7 @@ import csv
 import hashlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from pipeline.core import cluster
 from pipeline.core.errors import InputError
 from pipeline.simulation.layout import write_location
 from pipeline.simulation.location import LocationSpec, render_location
-from pipeline.simulation.settings import SimulationSettings
+from pipeline.simulation.settings import Flight, SimulationSettings
 from pipeline.simulation.simulate import plan_jobs, simulate
 
 
@@ -178,6 +178,24 @@ def test_textures_are_used_once_each_and_too_few_rejected(
     ).exists()
     with pytest.raises(InputError, match="6 usable images for 13 locations; expected one each"):
         simulate(settings(tmp_path / "more", textures=str(folder), train_locations=10))
+    filled = settings(
+        tmp_path / "filled", textures=str(folder), train_locations=10, fill_with_towns=True
+    )
+    used = [job.spec.texture for job in plan_jobs(filled, "root", names)]
+    assert sorted(filter(None, used)) == names
+    assert used.count(None) == 13 - 6
+
+
+def test_free_flight_has_other_views_of_the_same_place() -> None:
+    spiral, free = (
+        render_location(LocationSpec(seed=4, location=2, views=3, size=64, flight=flight))
+        for flight in get_args(Flight)
+    )
+    assert spiral.satellite == free.satellite
+    assert spiral.drone != free.drone
+    assert len({round(pose.pitch_deg) for pose in free.poses}) > 1
+    again = render_location(LocationSpec(seed=4, location=2, views=3, size=64, flight="free"))
+    assert again.drone == free.drone
 
 
 @pytest.mark.parametrize(
