@@ -43,6 +43,10 @@ CASES: dict[str, tuple[str, str]] = {
         "--batch-size 10",
         r"gallery: 20 of 20, \d+ crops/s, [\d.]+ x the encoder alone",
     ),
+    "encoders": (
+        "--shards {trained}/shards {trained}/run/last.pt builtin",
+        r"builtin: R@1 .* [\d.]+ x the first encoder's",
+    ),
     "evaluate": ("--scale 0.01", r"satellite->drone .* [\d.]+ x the float32 products"),
     "index": (
         "--rows 2000 --dimension 32 --rounds 1 --factories planned",
