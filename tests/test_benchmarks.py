@@ -52,6 +52,10 @@ CASES: dict[str, tuple[str, str]] = {
         "--rows 2000 --dimension 32 --rounds 1 --factories planned",
         r"Flat \(the planner\) .* [\d.]+ x \|",
     ),
+    "own_map": (
+        "--imagery {images} --out {out} --tiles 3 --photos 3",
+        r"built-in: .* of 3 photos within 25 m, [\d.]+ x ImageNet's weights alone",
+    ),
     "serve": (
         "--checkpoint {trained}/run/last.pt --index {trained}/index "
         "--photos {trained}/flights/test/query_drone --clients 2 --seconds 0.2 --rounds 1",
