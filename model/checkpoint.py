@@ -19,7 +19,7 @@ import safetensors.torch
 import torch
 
 from model.config import PVDAConfig
-from model.errors import CheckpointError
+from model.errors import CheckpointError, MissingLibrary
 from model.pvda import FeatureEncoder
 from model.weights import torch_files
 
@@ -112,6 +112,8 @@ def _loads_encoder(data: bytes, name: str) -> Checkpoint:
             state={"modules": {"encoder": weights}},
         )
         _check_fields(checkpoint)
+    except MissingLibrary:
+        raise
     except Exception as error:  # safetensors raises its own kinds over a damaged file
         raise CheckpointError(
             f"{name} is no encoder of format {FORMAT} ({type(error).__name__}); expected a "
@@ -148,6 +150,8 @@ def loads(data: bytes, name: str = "the checkpoint") -> Checkpoint:
             checkpoint = Checkpoint(network=network, recipe=recipe, history=history, **plain)
             _check_fields(checkpoint)
             return checkpoint
+    except MissingLibrary:
+        raise
     # torch raises many kinds over a damaged file, struct.error and IndexError among them
     except Exception as error:
         raise CheckpointError(

@@ -16,7 +16,7 @@ class PVDAConfig:
     """Sizes of the networks. The defaults are the paper's at 256 px."""
 
     backbone: str = "resnet50"
-    "Name in BACKBONES: resnet18, resnet34, resnet50 or resnet101 [paper: resnet50]."
+    "Name in BACKBONES, such as resnet50 [paper], efficientnet_lite0 or dinov2_small."
     width: float = 1.0
     "Channels of the backbone as a multiple of the published ones [paper: 1]."
     image_size: int = 256

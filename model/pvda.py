@@ -20,8 +20,8 @@ class FeatureEncoder(nn.Module):
     std_31: Tensor
 
     def __init__(self, config: PVDAConfig) -> None:
-        """Raises ValueError where the backbone cannot have that width, or the images are too small
-        for the rings."""
+        """Raises ValueError where the backbone cannot have that width or take images of that size,
+        or the images are too small for the rings."""
         super().__init__()
         self.parts, self.divisor = config.parts, config.ring_divisor
         self.backbone = build_backbone(config.backbone, config.width)
@@ -31,6 +31,7 @@ class FeatureEncoder(nn.Module):
                 f"image_size is {config.image_size}, expected at least {least} pixels for "
                 f"{config.parts} parts; use larger images or fewer parts"
             )
+        self.backbone.check_size(config.image_size, config.image_size)
         self.refine = nn.ModuleList(
             refinement(self.backbone.channels, config.part_dim) for _ in range(config.parts)
         )

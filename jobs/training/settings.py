@@ -10,6 +10,7 @@ import tyro
 
 from jobs.command_line.config import Choice
 from jobs.training.recipes import RECIPES, Recipe
+from model.backbones import HUB_PREFIX
 from pipeline.core import storage
 from pipeline.core.errors import require
 
@@ -67,7 +68,7 @@ class RunConfig(RunOptions):
     "Folder or URI of the run, likewise."
     recipe: Recipe
     weights: str | None = None
-    "File of weights to start from, in place of the recipe's `start`."
+    "Weights to start from, in place of the recipe's `start`: a file, a folder or hf:OWNER/NAME."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +82,8 @@ class TrainSettings(RunOptions):
     "Folder or URI of the run."
     weights: str | None = None
     """File to start from (.pt, .pth, .safetensors), in place of the recipe's `start`: a checkpoint
-    of ours, or public weights of the backbone."""
+    of ours, or public weights of the backbone. For backbones of transformers a folder of
+    `save_pretrained`, or hf:OWNER/NAME from the Hugging Face hub."""
     workers: int = 1
     "Ray Train workers; 0 trains in this process."
     gpus_per_worker: float | None = None
@@ -104,6 +106,10 @@ class TrainSettings(RunOptions):
             shards=storage.absolute(self.shards),
             out=storage.absolute(self.out),
             recipe=self.recipe,
-            weights=self.weights and storage.absolute(self.weights),
+            weights=self.weights and _absolute_weights(self.weights),
             **options,
         )
+
+
+def _absolute_weights(weights: str) -> str:
+    return weights if weights.startswith(HUB_PREFIX) else storage.absolute(weights)

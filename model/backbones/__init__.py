@@ -13,6 +13,15 @@ BACKBONES: dict[str, str] = {
     "resnet101": "model.backbones.resnet:ResNet",
     "efficientnet_lite0": "model.backbones.efficientnet_lite:EfficientNetLite",
     "efficientnet_lite2": "model.backbones.efficientnet_lite:EfficientNetLite",
+    "vit_small": "model.backbones.huggingface:ViT",
+    "vit_base": "model.backbones.huggingface:ViT",
+    "dinov2_small": "model.backbones.huggingface:DINOv2",
+    "dinov2_base": "model.backbones.huggingface:DINOv2",
+    "dinov3_small": "model.backbones.huggingface:DINOv3",
+    "convnext_tiny": "model.backbones.huggingface:ConvNeXt",
+    "swin_tiny": "model.backbones.huggingface:Swin",
 }
 """Module and class by the backbone's name. A name and not the class: command lines list the
 backbones without loading torch."""
+HUB_PREFIX = "hf:"
+"Before OWNER/NAME of weights on the Hugging Face hub, where a path could stand."

@@ -30,6 +30,10 @@ class Backbone(nn.Module):
     "Patterns of this module's tensor names -> the names in public weights; empty where they agree."
     foreign_extra: ClassVar[tuple[str, ...]]
     "Beginnings of names in public weights that this module has no use for, such as a classifier's."
+    loads_folders: ClassVar[bool] = False
+    "Public weights come as a folder or by the hub's name (`load_pretrained`), not as one file."
+    quantizable: ClassVar[bool] = True
+    "Its layers are those that 8-bit integers have been measured on: convolutions and BatchNorm."
     channels: int
     "C, the channels of the maps."
     frozen_stages = 0
@@ -50,6 +54,16 @@ class Backbone(nn.Module):
         Raises ValueError that says how the state dict differs from all of this class.
         """
         raise NotImplementedError
+
+    def load_pretrained(self, source: str) -> None:
+        """Load the public weights in a folder, or of a name on the hub (`hf:OWNER/NAME`).
+
+        Raises CheckpointError. Only for classes with `loads_folders`.
+        """
+        raise NotImplementedError
+
+    def check_size(self, height: int, width: int) -> None:
+        """Raise ValueError for images of a size that this backbone cannot take; most take any."""
 
     def stages(self) -> Sequence[Sequence[nn.Module]]:
         """The layers in the order of `forward`, in the groups that `freeze` counts."""

@@ -7,15 +7,13 @@ refinement stay in float32: they are a thousandth of the products.
 """
 
 import hashlib
-import logging
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from importlib import import_module
 
 import torch
 from torch import Tensor
 
-from model.inference.compile import ignore_deprecations
+from model.inference.torchao_logs import filter_torchao_logs
 from model.pvda import FeatureEncoder
 
 QUANTIZE_MODULE = "torchao.quantization.pt2e.quantize_pt2e"
@@ -49,7 +47,7 @@ def require_int8(device: str) -> None:
             "float32; choose --precision float32"
         )
     try:
-        with _filter_torchao_logs():
+        with filter_torchao_logs():
             import_module(QUANTIZER_MODULE)
     except ImportError as error:
         raise PrecisionError(
@@ -57,6 +55,15 @@ def require_int8(device: str) -> None:
             "'pvda[int8]', or choose "
             "--precision float32"
         ) from error
+
+
+def require_quantizable(encoder: FeatureEncoder) -> None:
+    """Raise PrecisionError where int8 has not been measured on this kind of backbone."""
+    if not encoder.backbone.quantizable:
+        raise PrecisionError(
+            f"int8 is for convolutions with BatchNorm and the backbone is "
+            f"{type(encoder.backbone).__name__}; choose --precision float32"
+        )
 
 
 def quantise(encoder: FeatureEncoder, size: int, calibrate: Callable[[], None]) -> None:
@@ -68,7 +75,7 @@ def quantise(encoder: FeatureEncoder, size: int, calibrate: Callable[[], None]) 
     digit, and workers would round differently.
     """
     threads = torch.get_num_threads()
-    with _filter_torchao_logs(), torch.no_grad():
+    with filter_torchao_logs(), torch.no_grad():
         pt2e, x86 = import_module(QUANTIZE_MODULE), import_module(QUANTIZER_MODULE)
         example_B3HW = torch.zeros(CALIBRATION_BATCH, 3, size, size).to(
             memory_format=torch.channels_last
@@ -94,26 +101,3 @@ def calibration_digest(images_B3HW: Tensor) -> str:
     """16 hexadecimal digits of a hash over the calibration images (B, 3, H, W), in their order."""
     shape = str(tuple(images_B3HW.shape)).encode()
     return hashlib.sha256(shape + images_B3HW.cpu().contiguous().numpy().tobytes()).hexdigest()[:16]
-
-
-@contextmanager
-def _filter_torchao_logs() -> Iterator[None]:
-    """Filter torchao 0.18's log messages about missing CUDA libraries and about its own
-    deprecations; show all others.
-    """
-
-    def wanted(record: logging.LogRecord) -> bool:
-        message = record.getMessage()
-        return "register_constant() on Enum" not in message and not (
-            "Failed to load" in message and "/torchao/_C_" in message
-        )
-
-    loggers = [logging.getLogger(name) for name in ("torchao", "torch.utils._pytree")]
-    for logger in loggers:
-        logger.addFilter(wanted)
-    try:
-        with ignore_deprecations():
-            yield
-    finally:
-        for logger in loggers:
-            logger.removeFilter(wanted)

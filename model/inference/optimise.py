@@ -17,7 +17,13 @@ from torch import Tensor
 from model.inference.compile import NotCompiled, compile_frozen
 from model.inference.embed import EncoderKind, FastEncoder, MirroredEncoder, embed
 from model.inference.fuse_batchnorm import fuse_batchnorm
-from model.inference.int8 import CALIBRATION_BATCH, PrecisionError, quantise, require_int8
+from model.inference.int8 import (
+    CALIBRATION_BATCH,
+    PrecisionError,
+    quantise,
+    require_int8,
+    require_quantizable,
+)
 from model.inference.precision import EffectivePrecision, Precision, effective_precision
 from model.pvda import FeatureEncoder
 
@@ -58,6 +64,7 @@ def optimise_encoder(
     device = encoder.mean_31.device
     wanted = effective_precision(precision, device.type)
     if wanted == "int8":
+        require_quantizable(encoder)
         require_int8(device.type)
     check = _AgreementCheck(
         probe_B3HW=probe_B3HW,

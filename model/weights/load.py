@@ -98,12 +98,12 @@ def infer_backbone(state: dict[str, Tensor], name: str) -> tuple[str, float]:
     Raises CheckpointError when it is none of BACKBONES.
     """
     for variant in prefix_variants(state):
-        reasons = list[str]()
+        reasons = dict[str, None]()  # a set in order: classes may give the same
         for family in backbone_classes():
             try:
                 return family.infer(variant)
             except ValueError as error:
-                reasons.append(str(error))
+                reasons[str(error)] = None
     raise CheckpointError(
         f"{name} is of no backbone that we build: {'; '.join(reasons)}, and the names begin with "
         f"{', '.join(list(state)[:3]) or 'nothing'}; expected torchvision's names and one of "

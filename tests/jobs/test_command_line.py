@@ -22,7 +22,10 @@ from pipeline.core.errors import InputError
 from pipeline.sources.photos import Photos
 
 ROOT = Path(__file__).parents[2]
-HEAVY = ("torch", "ray", "pyarrow", "faiss", "rasterio", "pandas", "matplotlib", "scipy", "aiohttp")
+HEAVY = (
+    "torch", "ray", "pyarrow", "faiss", "rasterio", "pandas", "matplotlib", "scipy", "aiohttp",
+    "transformers",
+)  # fmt: skip
 HELP_OF_ALL = f"""
 import contextlib, io, json, runpy, sys
 found = {{}}
@@ -70,6 +73,13 @@ def test_help_shows_flags_that_change_a_finished_output(
 
 def train_arguments(*words: str) -> dict[str, Any] | None:
     return parse(jobs.train.main, words, RECIPE, RUN_CONFIG_FILE)
+
+
+def test_weights_of_the_hub_are_no_path() -> None:
+    for given, expected in (("hf:owner/name", "hf:owner/name"), ("w.pt", str(Path.cwd() / "w.pt"))):
+        arguments = train_arguments("smoke", "--shards", "s", "--out", "o", "--weights", given)
+        assert arguments is not None
+        assert arguments["settings"].run.weights == expected
 
 
 def test_print_config_is_read_back_by_config(
