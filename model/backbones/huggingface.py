@@ -104,7 +104,8 @@ class HuggingFaceBackbone(Backbone):
             return found
         rows, columns = height // self.stride, width // self.stride
         patches_BNC = found[:, found.shape[1] - rows * columns :]  # after class and registers
-        return patches_BNC.unflatten(1, (rows, columns)).permute(0, 3, 1, 2)
+        cells_BHWC = patches_BNC.reshape(patches_BNC.shape[0], rows, columns, self.channels)
+        return cells_BHWC.permute(0, 3, 1, 2)
 
     def load_pretrained(self, source: str) -> None:
         """Load a folder of `save_pretrained`, or `hf:OWNER/NAME` from the hub.

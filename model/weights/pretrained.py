@@ -42,6 +42,7 @@ def read_pretrained(
     """
     remedy = f"give weights like {example}, or choose another --backbone"
     where = _locate(source, remedy)
+    kind: Any = type(network)
     expected: Any = network.config
     safe = {"trust_remote_code": False, "local_files_only": where == source}
     with _quiet():
@@ -51,7 +52,7 @@ def read_pretrained(
             raise _unreadable(source, error, remedy) from error
         _require_same_network(source, found, expected, settings, remedy)
         try:
-            given, report = type(network).from_pretrained(  # type: ignore[operator]
+            given, report = kind.from_pretrained(
                 where, config=expected, use_safetensors=True, dtype=torch.float32,
                 output_loading_info=True, **options, **safe,
             )  # fmt: skip

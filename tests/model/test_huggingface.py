@@ -116,7 +116,8 @@ def test_training_step_and_checkpoint(small: str) -> None:
     config = network_config(small)
     training = make(config, Optimization(frozen_stages=1, optimizer="adamw"))
     side = config.image_size
-    drone_B3HW, satellite_B3HW = torch.randint(0, 256, (2, 3, 3, side, side), dtype=torch.uint8)
+    both_2B3HW = torch.randint(0, 256, (2, 3, 3, side, side), dtype=torch.uint8)
+    drone_B3HW, satellite_B3HW = both_2B3HW.unbind()
     location_B = torch.arange(3) % LOCATIONS
     before = {n: t.clone() for n, t in training.model.encoder.state_dict().items()}
     metrics = training.step(drone_B3HW, location_B, satellite_B3HW, location_B, NOW)

@@ -38,7 +38,7 @@ def test_folder_gives_the_outputs_of_transformers(small: str, tmp_path: Path) ->
     load_start(encoder, small, "random", str(folder))
     backbone, side = encoder.backbone, config.image_size + SMALL[small][0].stride
     images_B3HW = torch.randn(2, 3, config.image_size, side)
-    kind = getattr(import_transformers(), SMALL[small][0].model_class)
+    kind: Any = getattr(import_transformers(), SMALL[small][0].model_class)
     public = kind.from_pretrained(folder).eval()
     options = {"interpolate_pos_encoding": True} if small == "vit_small" else {}
     expected = public(images_B3HW, **options).last_hidden_state
@@ -115,7 +115,7 @@ def test_hub_is_asked_for_safetensors_and_no_code(
 ) -> None:
     folder = saved(small_vit, tmp_path / "saved")
     encoder = FeatureEncoder(network_config(small_vit))
-    kind = type(encoder.backbone.network)
+    kind: Any = type(encoder.backbone.network)
     read, read_config = kind.from_pretrained, kind.config_class.get_config_dict
     asked: dict[str, Any] = {}
 
