@@ -17,6 +17,7 @@ from torch import Tensor
 from model.inference.compile import NotCompiled, compile_frozen
 from model.inference.embed import EncoderKind, FastEncoder, MirroredEncoder, embed
 from model.inference.fuse_batchnorm import fuse_batchnorm
+from model.inference.fuse_padding import fuse_padding
 from model.inference.int8 import (
     CALIBRATION_BATCH,
     PrecisionError,
@@ -78,7 +79,10 @@ def optimise_encoder(
         batch_size=batch_size,
         device=device,
     )
-    module = MirroredEncoder(fuse_batchnorm(encoder), mirror, wanted == "bfloat16")
+    fused = fuse_batchnorm(encoder)
+    if device.type == "cpu":  # measured there; cuDNN may prefer the narrower kernels
+        fuse_padding(fused, probe_B3HW.shape[2])
+    module = MirroredEncoder(fused, mirror, wanted == "bfloat16")
     module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if wanted == "int8":
         return _int8(module, check, calibration_B3HW, log)
