@@ -10,9 +10,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-import torch.nn.functional as F
+from embedding_worker import recipe_of, soft_noise
 from torch import Tensor, nn
 
+from jobs.encoding.encoder import trained_on_mirrors
+from model.backbones import BACKBONES
 from model.checkpoint import build_encoder, loads
 from model.config import PVDAConfig
 from model.inference.embed import FastEncoder, embed
@@ -30,16 +32,6 @@ CHOICES: dict[str, tuple[Precision, bool]] = {
 "Name -> precision, and whether it is compiled."
 
 
-def soft_noise(count: int, size: int, seed: int) -> Tensor:
-    """Bytes (count, 3, size, size) of noise at several scales, channels last as in embedding."""
-    generator = torch.Generator().manual_seed(seed)
-    image = torch.zeros(count, 3, size, size)
-    for cells, weight in ((3, 0.5), (12, 0.3), (size, 0.2)):
-        coarse = torch.rand(count, 3, cells, cells, generator=generator)
-        image += F.interpolate(coarse, (size, size), mode="bicubic") * 255 * weight
-    return image.clamp(0, 255).to(torch.uint8).to(memory_format=torch.channels_last)
-
-
 @torch.no_grad()
 def random_encoder(config: PVDAConfig) -> FeatureEncoder:
     """Random weights with usable features: BatchNorms of random scale, fitted to their input.
@@ -50,7 +42,7 @@ def random_encoder(config: PVDAConfig) -> FeatureEncoder:
     """
     torch.manual_seed(0)
     encoder = FeatureEncoder(config)
-    last = "bn2" if config.backbone in ("resnet18", "resnet34") else "bn3"
+    last = "bn2" if config.backbone in ("resnet18", "resnet34") else ("bn3", "project.norm")
     for name, module in encoder.named_modules():
         if isinstance(module, nn.modules.batchnorm._BatchNorm):
             module.momentum = None  # the statistics become the mean over all input
@@ -69,9 +61,11 @@ def pass_seconds(encode: Callable[[Tensor], Tensor], images_B3HW: Tensor, device
     return clock() - begin
 
 
-def compare_encoders(encoder: FeatureEncoder, size: int, args: argparse.Namespace) -> None:
+def compare_encoders(
+    encoder: FeatureEncoder, size: int, mirror: bool, args: argparse.Namespace
+) -> None:
     """Print one line per optimised encoder, on a batch in memory."""
-    batch, mirror, device = args.batch_size, not args.no_mirror, args.device
+    batch, device = args.batch_size, args.device
     images_B3HW = soft_noise(batch, size, seed=2)
     probe_B3HW = soft_noise(args.probes, size, seed=3)
     plain = encoder.to(device, memory_format=torch.contiguous_format)  # type: ignore[call-overload]
@@ -125,8 +119,8 @@ def compare_encoders(encoder: FeatureEncoder, size: int, args: argparse.Namespac
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     add = parser.add_argument
-    add("--checkpoint", help="a last.pt; by default a ResNet with random weights")
-    add("--depth", type=int, default=50, help="layers of the random ResNet")
+    add("--checkpoint", help="a last.pt; by default random weights")
+    add("--backbone", default="resnet50", choices=BACKBONES, help="with its recipe's rings")
     add("--width", type=float, default=1.0, help="its channels, as a multiple")
     add("--size", type=int, default=256, help="side of its images, pixels")
     add("--encoders", nargs="*", choices=CHOICES, default=["folded", "compiled", "int8"])
@@ -134,17 +128,19 @@ def main() -> None:
     add("--rounds", type=int, default=3, help="alternating rounds, of which the best counts")
     add("--probes", type=int, default=16, help="images that the agreement is measured on")
     add("--calibration", type=int, default=32, help="images that int8 is calibrated by")
-    add("--no-mirror", action="store_true")
+    add("--no-mirror", action="store_true", help="where training mirrored images as well")
     args = parser.parse_args()
     args.device = "cuda" if torch.cuda.is_available() else "cpu"
     if args.checkpoint:
         checkpoint = loads(Path(args.checkpoint).read_bytes(), args.checkpoint)
         config, encoder = checkpoint.network, build_encoder(checkpoint)
+        mirror = trained_on_mirrors(checkpoint)
     else:
-        config = PVDAConfig(backbone=f"resnet{args.depth}", width=args.width, image_size=args.size)
-        encoder = random_encoder(config)
+        recipe = recipe_of(args.backbone, args.width, args.size)
+        config, encoder = recipe.network, random_encoder(recipe.network)
+        mirror = recipe.augmentation.mirror
     print(f"{args.device}, torch {torch.__version__}, {torch.get_num_threads()} threads")
-    compare_encoders(encoder, config.image_size, args)
+    compare_encoders(encoder, config.image_size, mirror and not args.no_mirror, args)
 
 
 if __name__ == "__main__":

@@ -6,136 +6,37 @@ worker's peak memory over many images as a ratio to a quarter of them (goal: 1).
 """
 
 import argparse
-import hashlib
-import io
-import json
 import os
-import resource
-import sys
-import tarfile
 import tempfile
 import time
 from collections import Counter
-from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-import numpy as np
 import ray
+from embedding_worker import (
+    SOURCE_SIDE,
+    MeasuredEmbedder,
+    checkpoint,
+    embed_job,
+    encoder_spec,
+    recipe_of,
+    write_shard,
+)
 from synthetic import jpegs
 
-from jobs.encoding.encoder import make_encoder_spec
-from jobs.encoding.probe_images import CALIBRATION_IMAGES, PROBE_IMAGES
-from jobs.encoding.settings import EncoderSettings
-from model.checkpoint import Checkpoint, dumps
-from model.config import PVDAConfig
-from model.pvda import FeatureEncoder
+from jobs.encoding.settings import Compiling, EncoderSettings
+from model.backbones import BACKBONES
 from pipeline.core import cluster
-from pipeline.core.records import Split, View
-from pipeline.features.embed_worker import IN_FLIGHT, EmbedJob, EncoderSpec, ShardEmbedder
-from pipeline.features.settings import EmbeddingSettings
-from pipeline.shards.external import EXTERNAL
-from pipeline.shards.manifest import Manifest, Shard
-from pipeline.shards.shard_set import ShardSet
+from pipeline.features.embed_worker import IN_FLIGHT, EncoderSpec
+from pipeline.shards.manifest import Shard
 
-SOURCE_SIDE = 512
-"Side of the images in the tars, pixels: University-1652's."
 SHARDS = 6
 "Tars of a measured run."
 
 
-class MeasuredEmbedder(ShardEmbedder):
-    """The worker, plus measurements of its encoder and its memory."""
-
-    def resident(self, images: int) -> float:
-        """Images per second of the encoder alone."""
-        return self._device.submit(self._resident, images).result()
-
-    def _resident(self, images: int) -> float:
-        size, batch = self._spec.image_size, self._job.batch_size
-        bytes_BHW3 = np.random.default_rng(0).integers(0, 256, (batch, size, size, 3), np.uint8)
-        begin = time.perf_counter()
-        for start in range(0, images, batch):
-            self._encoder(bytes_BHW3[: images - start].transpose(0, 3, 1, 2))
-        return images / (time.perf_counter() - begin)
-
-    def peak(self) -> float:
-        """Peak memory in MB."""
-        scale = 1e6 if sys.platform == "darwin" else 1e3  # bytes there, kilobytes elsewhere
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale
-
-
-def write_shard(folder: str, number: int, images: list[bytes], count: int) -> Shard:
-    """Write a tar of `count` images like those of jobs/make_shards.py; its manifest entry."""
-    name = f"gallery-drone-{number:06d}"
-    path = Path(folder) / f"{name}.tar"
-    with tarfile.open(path, "w") as tar:
-        for position in range(count):
-            key = f"{name}-{position:06d}"
-            metadata = {"key": key, "location": key, "view": "drone", "split": "gallery"}
-            members = {
-                "jpg": images[position % len(images)],
-                "json": json.dumps(metadata | {"geotag": None}).encode(),
-            }
-            for suffix, data in members.items():
-                member = tarfile.TarInfo(f"{key}.{suffix}")
-                member.size = len(data)
-                tar.addfile(member, io.BytesIO(data))
-    data = path.read_bytes()
-    return Shard(
-        name=name,
-        split=Split.GALLERY,
-        view=View.DRONE,
-        samples=count,
-        bytes=len(data),
-        sha256=hashlib.sha256(data).hexdigest(),
-    )
-
-
-def checkpoint(depth: Any, size: int, **config: Any) -> bytes:
-    """A checkpoint of random weights; `config` overrides the network's other settings."""
-    network = PVDAConfig(backbone=f"resnet{depth}", image_size=size, **config)
-    weights = {"modules": {"encoder": FeatureEncoder(network).state_dict()}}
-    return dumps(
-        Checkpoint(network=network, recipe={}, locations=[], epoch=0, history=[], state=weights)
-    )
-
-
-def encoder_spec(
-    weights: bytes,
-    batch: int,
-    folder: str,
-    images: list[bytes],
-    settings: EncoderSettings | None = None,
-) -> EncoderSpec:
-    """The encoder as a worker builds it; its probe images come from a separate shard."""
-    probe_folder = Path(folder) / "probe"
-    probe_folder.mkdir(exist_ok=True)
-    write_shard(str(probe_folder), 0, images, PROBE_IMAGES + CALIBRATION_IMAGES)
-    embedding = EmbeddingSettings(
-        shards=str(probe_folder),
-        out="none",
-        split=Split.GALLERY,
-        view=View.DRONE,
-        batch_size=batch,
-    )
-    return make_encoder_spec(weights, "the benchmark's", embedding, settings)
-
-
 def start_worker(folder: str, spec: EncoderSpec, batch: int, threads: int, decoders: int) -> Any:
     """A worker that has built its encoder; it writes its parts to `folder`/table."""
-    job = EmbedJob(
-        shards=ShardSet(
-            path=folder,
-            manifest=Manifest(
-                shards=(), classes=(), packing={"source": EXTERNAL, "scattered": []}, rejected=0
-            ),
-        ),
-        out=f"{folder}/table",
-        batch_size=batch,
-        dtype="float32",
-        threads=threads,
-        decode_threads=decoders,
-    )
+    job = embed_job(folder, batch, threads, decoders)
     actor: Any = (
         ray.remote(num_cpus=threads)(MeasuredEmbedder)
         .options(max_concurrency=IN_FLIGHT)
@@ -160,7 +61,11 @@ def measure_speed(args: argparse.Namespace, images: list[bytes]) -> None:
     threads = args.threads or os.cpu_count() or 1
     with tempfile.TemporaryDirectory() as folder:
         spec = encoder_spec(
-            checkpoint(args.depth, args.size, width=args.width), args.batch, folder, images
+            checkpoint(recipe_of(args.backbone, args.width, args.size)),
+            args.batch,
+            folder,
+            images,
+            EncoderSettings(compiling=args.compiling),
         )
         actor = start_worker(folder, spec, args.batch, threads, args.decoders)
         ray.get(actor.resident.remote(2 * args.batch))
@@ -180,7 +85,7 @@ def measure_speed(args: argparse.Namespace, images: list[bytes]) -> None:
             )
         # Other work on the machine can only slow a round down: compare the best of each.
         print(
-            f"tar -> Parquet, ResNet-{args.depth} at {args.size} px, batches of {args.batch}, "
+            f"tar -> Parquet, {args.backbone} at {args.size} px, batches of {args.batch}, "
             f"{threads} threads, {args.decoders} decoding: {max(stage) / max(resident):.3f} x the "
             f"encoder alone (best of {args.rounds} rounds)"
         )
@@ -192,7 +97,7 @@ def measure_memory(args: argparse.Namespace, images: list[bytes]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         shards = [write_shard(folder, number, images, args.few // 2) for number in range(8)]
         peaks = []
-        spec = encoder_spec(checkpoint(18, 128), 32, folder, images)
+        spec = encoder_spec(checkpoint(recipe_of("resnet18", 1.0, 128)), 32, folder, images)
         for count in (2, 8):
             actor = start_worker(folder, spec, 32, os.cpu_count() or 1, args.decoders)
             end_to_end(actor, shards[:count])
@@ -208,10 +113,11 @@ def measure_memory(args: argparse.Namespace, images: list[bytes]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     add = parser.add_argument
-    add("--depth", type=int, default=50, choices=(18, 34, 50, 101), help="layers of the ResNet")
+    add("--backbone", default="resnet50", choices=BACKBONES, help="with its recipe's rings")
     add("--width", type=float, default=1.0, help="its channels, as a multiple")
     add("--size", type=int, default=256, help="side of its images, pixels")
     add("--batch", type=int, default=8, help="images of a batch")
+    add("--compiling", default="auto", choices=get_args(Compiling), help="of the encoder")
     add("--threads", type=int, help="threads of the encoder; all cores by default")
     add("--decoders", type=int, default=1, help="threads that decode")
     add("--seconds", type=float, default=8.0, help="length of a measured run, roughly")

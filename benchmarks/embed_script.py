@@ -21,23 +21,20 @@ import numpy as np
 import pyarrow.parquet as pq
 import ray
 import torch
-from embed_pipeline import (
-    SOURCE_SIDE,
-    checkpoint,
-    encoder_spec,
-    end_to_end,
-    start_worker,
-    write_shard,
-)
+from embed_pipeline import end_to_end, start_worker
+from embedding_worker import SOURCE_SIDE, checkpoint, encoder_spec, recipe_of, write_shard
 from PIL import Image
 from synthetic import jpegs
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from jobs.encoding.settings import EncoderSettings
+from model.backbones import BACKBONES
 from model.checkpoint import build_encoder, loads
 from pipeline.core import cluster
 from pipeline.core.arrays import Floats
+
+RESNETS = [name for name in BACKBONES if name.startswith("resnet")]
 
 
 class Files(Dataset[Tensor]):
@@ -123,7 +120,7 @@ def compare(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     add = parser.add_argument
-    add("--depth", type=int, default=50, choices=(18, 34, 50, 101), help="layers of the ResNet")
+    add("--backbone", default="resnet50", choices=RESNETS, help="the script embeds mirror images")
     add("--width", type=float, default=1.0, help="its channels, as a multiple")
     add("--size", type=int, default=256, help="side of its images, pixels")
     add("--batch", type=int, default=16, help="images of a batch")
@@ -138,14 +135,14 @@ def main() -> None:
     torch.set_num_threads(args.threads)
     distinct = jpegs(min(args.distinct, args.images), SOURCE_SIDE, SOURCE_SIDE)
     images = [distinct[number % len(distinct)] for number in range(args.images)]
-    weights = checkpoint(args.depth, args.size, width=args.width)
+    weights = checkpoint(recipe_of(args.backbone, args.width, args.size))
     with tempfile.TemporaryDirectory() as folder:
         paths = []
         for number, data in enumerate(images):
             paths.append(Path(folder) / f"{number:05d}.jpg")
             paths[-1].write_bytes(data)
         for precision in args.precisions:  # one worker at a time: two would share the cores
-            name = f"ResNet-{args.depth} at {args.size} px, mirrored"
+            name = f"{args.backbone} at {args.size} px, mirrored"
             print(f"tar -> Parquet in {precision}, {name}:", flush=True)
             scratch = str(Path(folder) / precision)
             print(compare(precision, weights, images, paths, scratch, args), flush=True)

@@ -10,19 +10,24 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from synthetic import jpegs
+from torch import Tensor
 
 from jobs.training.loop import BatchTensors, load_batches
-from jobs.training.recipes import Recipe, paper, smoke
+from jobs.training.recipes import Recipe, builtin, paper, smoke
 from jobs.training.settings import RunConfig
 from jobs.training.state import TrainingState, WorkerContext
+from model.inference.embed import unit_embedding
+from model.losses.contrastive import info_nce
 from model.losses.pvda import adversarial_terms, location_terms
 from model.schedule import ScheduleState
+from model.training import Training
+from model.two_views import ViewOutput
 from pipeline.core import json_files, storage
 from pipeline.core.records import ImageRecord, Split, View
 from pipeline.shards.manifest import MANIFEST, Manifest
@@ -35,14 +40,30 @@ ROUNDS = 3
 "Streamed and resident steps alternate, so that other work on the machine slows both."
 
 
-def write_shards(folder: str, side: int, images: int) -> str:
-    """Write a set of so many UAV images and as many satellite images of `side` pixels."""
+@dataclass(frozen=True, kw_only=True)
+class StepSeconds:
+    """Seconds of a step; medians over the rounds."""
+
+    streamed: float
+    waiting: float
+    "Part of `streamed` spent waiting for the batch."
+    resident: float
+    ratios: tuple[float, ...]
+    "Streamed over resident, by round."
+    parts: dict[str, float]
+
+
+def write_shards(folder: str, side: int, images: int, distinct: int | None = None) -> str:
+    """Write a set of so many UAV images and as many satellite images of `side` pixels, `distinct`
+    of which differ.
+    """
     written = []
     for seed, view in enumerate((View.DRONE, View.SATELLITE)):
         records = []
-        for number, data in enumerate(jpegs(images, side, side, seed)):
+        data = jpegs(min(images, distinct or images), side, side, seed)
+        for number in range(images):
             path = Path(folder) / f"{view}-{number:04d}.jpg"
-            path.write_bytes(data)
+            path.write_bytes(data[number % len(data)])
             records.append(
                 ImageRecord(path=str(path), split=Split.TRAIN, view=view, location=f"{number:04d}")
             )
@@ -106,32 +127,59 @@ def parts(worker: TrainingState, batch: BatchTensors, steps: int) -> dict[str, f
     discriminator = training.discriminator
     assert discriminator is not None
     for _ in range(steps):
-        with part("encoder"), autocast():
-            maps1_BCHW, maps2_BCHW, logits1_BPL, logits2_BPL = training.model(*images)
-            located = location_terms(logits1_BPL, labels[0], logits2_BPL, labels[1]).sum()
-            both_BCHW = torch.cat([maps1_BCHW, maps2_BCHW])
+        with part("encoder"):
+            with autocast():
+                drone, satellite = training.model(*images)
+            fitted = fit_loss(training, drone, satellite, labels)
+            both_BCHW = torch.cat([drone.maps_BCHW, satellite.maps_BCHW])
+            count = len(drone.maps_BCHW)
         with part("D step"):
-            training.discriminate(both_BCHW.detach(), len(maps1_BCHW))
+            training.discriminate(both_BCHW.detach(), count)
         with part("adversarial step"), autocast():
             discriminator.requires_grad_(False)
             verdict_B2 = discriminator(both_BCHW)
             discriminator.requires_grad_(True)
-            loss = adversarial_terms(*verdict_B2.tensor_split([len(maps1_BCHW)])).sum()
+            loss = adversarial_terms(*verdict_B2.tensor_split([count])).sum()
             [gradient_BCHW] = torch.autograd.grad(loss, both_BCHW, retain_graph=True)
         with part("encoder"):
             training.optimizers[0].zero_grad(set_to_none=True)
-            torch.autograd.backward([located, both_BCHW], [None, NOW.alpha * gradient_BCHW])
+            torch.autograd.backward([fitted, both_BCHW], [None, NOW.alpha * gradient_BCHW])
         with part("optimiser"):
             training.optimizers[0].step()
     return spent
 
 
-def measure(
-    name: str, recipe: Recipe, side: int, steps: int, rounds: int, device: str, compiled: bool
-) -> None:
+def fit_loss(
+    training: Training, drone: ViewOutput, satellite: ViewOutput, labels: list[Tensor]
+) -> Tensor:
+    """Encoder's and classifier's loss without the adversary's term, as `Training.step` has it."""
+    weights = training.losses
+    located_VP = location_terms(drone.logits_BPL, labels[0], satellite.logits_BPL, labels[1])
+    loss = weights.location_weight * located_VP.sum()
+    if weights.contrastive_weight:
+        loss = loss + weights.contrastive_weight * info_nce(
+            unit_embedding(drone.g_BPD.float()),
+            unit_embedding(satellite.g_BPD.float()),
+            labels[0],
+            weights.temperature,
+            weights.label_smoothing,
+        )
+    return loss
+
+
+def time_steps(
+    recipe: Recipe,
+    side: int,
+    steps: int,
+    rounds: int,
+    device: str,
+    compiled: bool,
+    distinct: int | None = None,
+) -> StepSeconds:
+    """Streamed and resident steps of a recipe, alternating; sources of `side` pixels."""
     images = recipe.batch_size * (steps + 2)
     with tempfile.TemporaryDirectory() as folder:
-        shards = write_shards(folder, side, images)
+        shards = write_shards(folder, side, images, distinct)
         run = RunConfig(shards=shards, out=folder, recipe=recipe, compile=compiled)
         worker = TrainingState(run, WorkerContext(device=device), lambda row: print(row["note"]))
         batch = next(iter(load_batches(worker, 0)))
@@ -142,22 +190,41 @@ def measure(
         ]
         spent = parts(worker, batch, steps)
     fed, waited, in_memory = (float(np.median(column)) for column in zip(*seconds, strict=True))
-    ratios = ", ".join(f"{one / other:.3f}" for one, _, other in seconds)
+    return StepSeconds(
+        streamed=fed,
+        waiting=waited,
+        resident=in_memory,
+        ratios=tuple(one / other for one, _, other in seconds),
+        parts=spent,
+    )
+
+
+def measure(
+    name: str, recipe: Recipe, side: int, steps: int, rounds: int, device: str, compiled: bool
+) -> None:
+    """Print the figures of one case."""
+    found = time_steps(recipe, side, steps, rounds, device, compiled)
+    ratios = ", ".join(f"{ratio:.3f}" for ratio in found.ratios)
     print(
-        f"{name}: streamed step {1000 * fed:.1f} ms, {fed / in_memory:.3f} x the resident step "
-        f"(rounds: {ratios})"
+        f"{name}: streamed step {1000 * found.streamed:.1f} ms, "
+        f"{found.streamed / found.resident:.3f} x the resident step (rounds: {ratios})"
     )
     print(
-        f"{name}: {2 * recipe.batch_size / fed:.1f} images/s, waits for data "
-        f"{100 * waited / fed:.1f} % of the step"
+        f"{name}: {2 * recipe.batch_size / found.streamed:.1f} images/s, waits for data "
+        f"{100 * found.waiting / found.streamed:.1f} % of the step"
     )
-    total = sum(spent.values())
-    shares = [f"{part} {100 * seconds_ / total:.0f} %" for part, seconds_ in spent.items()]
+    total = sum(found.parts.values())
+    shares = [f"{part} {100 * seconds / total:.0f} %" for part, seconds in found.parts.items()]
     print(f"{name}: " + ", ".join(shares))
 
 
 CASES: dict[str, Callable[[], tuple[Recipe, int, int]]] = {
     "smoke, 16 + 16 images of 64 px": lambda: (smoke(), 128, 40),
+    "builtin, 8 + 8 images of 128 px": lambda: (
+        replace(builtin(), batch_size=8, start="random"),
+        256,
+        3,
+    ),
     "ResNet-50, 4 + 4 images of 128 px": lambda: (
         replace(paper(), batch_size=4, network=replace(paper().network, image_size=128)),
         512,
@@ -167,6 +234,16 @@ CASES: dict[str, Callable[[], tuple[Recipe, int, int]]] = {
 "Case -> recipe, side of the source images, and steps of a round."
 ON_CUDA: dict[str, Callable[[], tuple[Recipe, int, int]]] = {
     "paper, 8 + 8 images of 256 px": lambda: (paper(), 512, 100),
+    "builtin, 64 + 64 images of 256 px": lambda: (
+        replace(
+            builtin(),
+            batch_size=64,
+            start="random",
+            network=replace(builtin().network, image_size=256),
+        ),
+        512,
+        30,
+    ),
     "paper, 64 + 64 images of 256 px": lambda: (replace(paper(), batch_size=64), 512, 30),
 }
 

@@ -1,5 +1,6 @@
 """Every script of benchmarks/ runs at its smallest size and prints its ratio to a baseline."""
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -10,9 +11,9 @@ import ray
 from tests.launcher import ROOT, Launcher
 
 FOLDER = ROOT / "benchmarks"
-HELPERS = {"synthetic", "ablation_data"}
+HELPERS = {"synthetic", "ablation_data", "embedding_worker", "gpu_measurements"}
 "Modules that other benchmarks import."
-RESNET = "--depth 18 --width 0.25 --size 128"
+RESNET = "--backbone resnet18 --width 0.25 --size 128"
 "The smallest network of the embedding benchmarks."
 ONE_ROUND = f"{RESNET} --rounds 1"
 
@@ -48,6 +49,12 @@ CASES: dict[str, tuple[str, str]] = {
         r"builtin: R@1 .* [\d.]+ x the first encoder's",
     ),
     "evaluate": ("--scale 0.01", r"satellite->drone .* [\d.]+ x the float32 products"),
+    "gpu": (
+        "--out {out} --width 0.25 --size 128 --batch 2 --train-batch 2 --steps 1 --rounds 1 "
+        "--seconds 0.01 --compiling never --minutes 4",
+        r"training, built-in: [\d.]+ images/s, [\d.]+ x the resident loop's(.|\n)*"
+        r"\| embedding, built-in, float32, folded.* \| 1\.0000",
+    ),
     "index": (
         "--rows 2000 --dimension 32 --rounds 1 --factories planned",
         r"Flat \(the planner\) .* [\d.]+ x \|",
@@ -139,3 +146,33 @@ def test_script_prints_a_ratio(
         folders["trained"] = request.getfixturevalue("trained")[0]
     output = run(prepared, name, arguments, **folders)
     assert re.search(expected, output), output[-3000:]
+
+
+def test_gpu_keeps_finished_measurements_and_stops_in_time(
+    prepared: Launcher, tmp_path: Path
+) -> None:
+    """With no time left, kept figures are printed and the others are named; nothing is measured."""
+    settings: dict[str, object] = {
+        "width": 1.0,
+        "size": 256,
+        "rounds": 3,
+        "seconds": 4.0,
+        "compiling": "always",
+    }
+    settings |= dict.fromkeys(("batch", "train_batch", "steps", "decoders"))
+    settings |= {"compile_training": False}
+    figures = {
+        "how": "8 + 8", "images_per_second": 90.0, "resident_images_per_second": 120.0,
+        "peak_memory_mb": 5.0, "memory_of": "the process's",
+    }  # fmt: skip
+    kept = {"settings": settings, "hardware": "a GPU", "date": "2026-01-02", "figures": figures}
+    names = ("training, ResNet-50", "training, built-in")
+    other = kept | {"settings": settings | {"size": 128}}
+    (tmp_path / "gpu.json").write_text(json.dumps(dict(zip(names, (kept, other), strict=True))))
+    words = ["--out", str(tmp_path), "--minutes", "0"]
+    result = prepared.start("gpu", words, folder="benchmarks").end()
+    assert result.code == 1, result.output
+    assert "training, ResNet-50: 90.0 images/s, 0.750 x the resident loop's 120.0" in result.output
+    assert "| training, ResNet-50, 8 + 8 | 90.0 | 120.0 | 0.750 |" in result.output
+    assert "training, built-in: not measured: stopped by --minutes" in result.output
+    assert "| training, built-in" not in result.output

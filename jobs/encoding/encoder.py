@@ -63,7 +63,7 @@ class WorkerEncoder:
             device, memory_format=torch.channels_last
         )  # type: ignore[call-overload]
         calibration = recipe.calibration_B3HW
-        self._fast = optimise_encoder(
+        self.fast = optimise_encoder(
             encoder,
             probe_B3HW=torch.from_numpy(recipe.probe_B3HW),
             batch_size=recipe.batch_size,
@@ -76,7 +76,7 @@ class WorkerEncoder:
         )
 
     def __call__(self, images_B3HW: ImageBytes) -> Floats:
-        embeddings_BD: Floats = self._fast(torch.from_numpy(images_B3HW)).cpu().numpy()
+        embeddings_BD: Floats = self.fast(torch.from_numpy(images_B3HW)).cpu().numpy()
         return embeddings_BD
 
 
