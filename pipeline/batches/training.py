@@ -110,7 +110,12 @@ class TrainingStream:
         groups = group_distinct(drones, lambda sample: sample.metadata["location"], size)
         rows = enumerate(chain.from_iterable(islice(groups, skip, self.steps)), start=skip * size)
         for group in wds.batched(size, collation_fn=None)(
-            prefetch_map(partial(self._prepare_pair, epoch), rows, self.config.threads, 4 * size)
+            prefetch_map(
+                partial(self._prepare_pair, self._satellites, epoch),
+                rows,
+                self.config.threads,
+                4 * size,
+            )
         ):
             yield self._collate_pairs(group)
 
@@ -119,13 +124,13 @@ class TrainingStream:
         take more of them than they keep."""
         config = self.config
         wanted = self.steps * config.batch_size
-        numpy_rng = np.random.default_rng([config.seed, epoch, 0])
+        plan_rng = np.random.default_rng([config.seed, epoch, list(View).index(View.DRONE)])
         rng = random.Random(repr((config.seed, epoch, View.DRONE.value, self.rank)))
 
         def spans() -> Iterator[Span]:
             while True:
                 yield from plan_pass(
-                    self._shards[View.DRONE], wanted, self.rank, self.world, numpy_rng
+                    self._shards[View.DRONE], wanted, self.rank, self.world, plan_rng
                 )
 
         buffer = min(config.shuffle_buffer, sum(s.samples for s in self._shards[View.DRONE]))
@@ -137,10 +142,12 @@ class TrainingStream:
     def _satellites(self) -> SatelliteImages:
         return SatelliteImages(self.shards, self._shards[View.SATELLITE], self.held_out)
 
-    def _prepare_pair(self, epoch: int, numbered: tuple[int, Sample]) -> tuple[Decoded, Decoded]:
+    def _prepare_pair(
+        self, satellites: SatelliteImages, epoch: int, numbered: tuple[int, Sample]
+    ) -> tuple[Decoded, Decoded]:
         number, drone = numbered
-        rng = np.random.default_rng([self.config.seed, epoch, 2, self.rank, number])
-        satellite = self._satellites.one_of(drone.metadata["location"], rng)
+        rng = np.random.default_rng([self.config.seed, epoch, len(View), self.rank, number])
+        satellite = satellites.one_of(drone.metadata["location"], rng)
         return (
             self._prepare(View.DRONE, epoch, number, drone),
             self._prepare(View.SATELLITE, epoch, number, satellite),
