@@ -125,25 +125,27 @@ def parts(worker: TrainingState, batch: BatchTensors, steps: int) -> dict[str, f
 
     images, labels, _ = batch
     discriminator = training.discriminator
-    assert discriminator is not None
     for _ in range(steps):
         with part("encoder"):
             with autocast():
                 drone, satellite = training.model(*images)
             fitted = fit_loss(training, drone, satellite, labels)
+        losses, gradients = [fitted], [torch.ones_like(fitted)]
+        if discriminator is not None:
             both_BCHW = torch.cat([drone.maps_BCHW, satellite.maps_BCHW])
             count = len(drone.maps_BCHW)
-        with part("D step"):
-            training.discriminate(both_BCHW.detach(), count)
-        with part("adversarial step"), autocast():
-            discriminator.requires_grad_(False)
-            verdict_B2 = discriminator(both_BCHW)
-            discriminator.requires_grad_(True)
-            loss = adversarial_terms(*verdict_B2.tensor_split([count])).sum()
-            [gradient_BCHW] = torch.autograd.grad(loss, both_BCHW, retain_graph=True)
+            with part("D step"):
+                training.discriminate(both_BCHW.detach(), count)
+            with part("adversarial step"), autocast():
+                discriminator.requires_grad_(False)
+                verdict_B2 = discriminator(both_BCHW)
+                discriminator.requires_grad_(True)
+                loss = adversarial_terms(*verdict_B2.tensor_split([count])).sum()
+                [gradient_BCHW] = torch.autograd.grad(loss, both_BCHW, retain_graph=True)
+            losses, gradients = [*losses, both_BCHW], [*gradients, NOW.alpha * gradient_BCHW]
         with part("encoder"):
             training.optimizers[0].zero_grad(set_to_none=True)
-            torch.autograd.backward([fitted, both_BCHW], [None, NOW.alpha * gradient_BCHW])
+            torch.autograd.backward(losses, gradients)
         with part("optimiser"):
             training.optimizers[0].step()
     return spent
