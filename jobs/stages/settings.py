@@ -231,7 +231,7 @@ class DemoSettings:
     "UAV images per location."
     size: int = 128
     "Side of the images in pixels."
-    epochs: int = 8
+    epochs: int = 4
     "Epochs of recipe finetune."
 
 
