@@ -15,10 +15,10 @@ install: .venv/installed  ## install the project and its pinned dependencies int
 demo: .venv/installed  ## the complete road on simulated flights: at most six minutes on two cores
 	$(BIN)/python jobs/demo.py --out runs/demo
 
-test: .venv/installed  ## all tests: ten minutes on two quiet cores
+test: .venv/installed  ## all tests: 22 minutes on two quiet cores
 	$(BIN)/pytest -n $(TEST_PROCESSES) --dist loadscope --no-loadscope-reorder
 
-test-fast: .venv/installed  ## the tests without Ray, training and browsers: under a minute
+test-fast: .venv/installed  ## the tests without Ray, training and browsers: some minutes
 	$(BIN)/pytest -m "not slow"
 
 check: .venv/installed  ## formatting, lint and types
