@@ -85,14 +85,17 @@ def read_checkpoint_bytes(path: str) -> bytes:
 
     Raises InputError when there is none.
     """
-    if path == BUILTIN:
-        return read_builtin()
-    if not storage.is_file(path):
+    require_checkpoint(path)
+    return read_builtin() if path == BUILTIN else storage.read_bytes(path)
+
+
+def require_checkpoint(path: str) -> None:
+    """Raise InputError where there is neither a file at `path` nor the built-in encoder meant."""
+    if path != BUILTIN and not storage.is_file(path):
         raise InputError(
             f"no checkpoint at {path}; expected {BUILTIN}, or a last.pt of jobs/train.py; check "
             "--checkpoint"
         )
-    return storage.read_bytes(path)
 
 
 def absolute_checkpoint(path: str) -> str:

@@ -125,9 +125,9 @@ def embed_and_evaluate(
 
     `run`: the training that the encoder comes from; its report stands beside the built-in one's.
     """
+    data = read_checkpoint_bytes(checkpoint)
     for split in (Split.QUERY, Split.GALLERY):
         embedding = EmbeddingSettings(shards=folders.shards, out=folders.table(name), split=split)
-        data = read_checkpoint_bytes(checkpoint)
         embed_gallery(embedding, make_encoder_spec(data, checkpoint, embedding))
     return evaluate(
         EvaluationSettings(

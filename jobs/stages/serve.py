@@ -10,7 +10,11 @@ from functools import partial
 import torch
 from aiohttp import web
 
-from jobs.encoding.encoder import absolute_checkpoint, read_checkpoint_bytes
+from jobs.encoding.encoder import (
+    absolute_checkpoint,
+    read_checkpoint_bytes,
+    require_checkpoint,
+)
 from jobs.encoding.photo_encoder import PhotoEncoder
 from jobs.stages.settings import ServeSettings
 from model.errors import CheckpointError
@@ -43,7 +47,7 @@ def load_predictor(checkpoint: str, index: str, shards: str | None, threads: int
 
 def serve(settings: ServeSettings) -> None:
     """Answer over HTTP where photos were taken, until Ctrl-C or SIGTERM."""
-    read_checkpoint_bytes(settings.checkpoint)
+    require_checkpoint(settings.checkpoint)
     path = storage.join(settings.index, METADATA_FILE)
     if not storage.is_file(path):
         raise InputError(

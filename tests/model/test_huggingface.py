@@ -19,21 +19,10 @@ from model.inference.int8 import PrecisionError
 from model.inference.optimise import optimise_encoder
 from model.pvda import FeatureEncoder
 from model.weights.load import infer_backbone
-from tests.model.small_transformers import SMALL, built, network_config, use_small
+from tests.model.small_transformers import built, network_config
 from tests.model.tiny_training import LOCATIONS, NOW, make
 
 NAMES = [name for name, where in BACKBONES.items() if "huggingface" in where]
-
-
-@pytest.fixture(params=SMALL)
-def small(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Each class once, by a name that stands for a small network in this test."""
-    return use_small(request.param, monkeypatch)
-
-
-@pytest.fixture
-def small_vit(monkeypatch: pytest.MonkeyPatch) -> str:
-    return use_small("vit_small", monkeypatch)
 
 
 @pytest.mark.parametrize(

@@ -16,18 +16,7 @@ from model.config import PVDAConfig
 from model.errors import CheckpointError
 from model.pvda import FeatureEncoder
 from model.weights.start import load_start
-from tests.model.small_transformers import SMALL, network_config, saved, use_small
-
-
-@pytest.fixture(params=SMALL)
-def small(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Each class once, by a name that stands for a small network in this test."""
-    return use_small(request.param, monkeypatch)
-
-
-@pytest.fixture
-def small_vit(monkeypatch: pytest.MonkeyPatch) -> str:
-    return use_small("vit_small", monkeypatch)
+from tests.model.small_transformers import SMALL, network_config, saved
 
 
 @torch.no_grad()
