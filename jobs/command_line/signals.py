@@ -2,17 +2,23 @@
 
 An exception from a signal handler is raised wherever the program is at that moment. In a callback
 within an import, or in C code of a library that clears errors, it is lost: one Ctrl-C in some
-twenty while pyarrow looks for pandas.
+twenty while pyarrow looks for pandas. Between the taking of a lock and its `with` block, it leaves
+the lock taken for good: a thread of an executor then waits for it forever, and so does the program
+for that thread.
 """
 
+import queue
 import signal
 import sys
 import threading
+from concurrent.futures import _base, thread
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType
+from types import CodeType, FrameType
 
 SECONDS_TO_REPEAT = 0.25
+LOCKING = frozenset(str(module.__file__) for module in (_base, queue, thread, threading))
+"Files of the standard library whose functions take locks, most of them for a moment."
 
 
 @contextmanager
@@ -30,8 +36,10 @@ def interruptible() -> Iterator[list[int]]:
         return
 
     stopped = False
+    locking_at: tuple[CodeType, int] | None = None
 
     def stop(number: int, frame: FrameType | None) -> None:
+        nonlocal locking_at
         # A pending alarm when the timer was stopped: set again it would outlive this handler.
         if stopped:
             return
@@ -40,18 +48,21 @@ def interruptible() -> Iterator[list[int]]:
             received.append(number)
         elif _is_raising():
             return
-        raise KeyboardInterrupt
+        before, locking_at = locking_at, _locking_at(frame)
+        # Still there at the alarm: it waits, which an exception does not harm.
+        if locking_at is None or locking_at == before:
+            raise KeyboardInterrupt
 
     handled = [signal.SIGALRM, signal.SIGTERM]
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         handled.append(signal.SIGINT)
-    before = {number: signal.signal(number, stop) for number in handled}
+    replaced = {number: signal.signal(number, stop) for number in handled}
     try:
         yield received
     finally:
         stopped = True
         signal.setitimer(signal.ITIMER_REAL, 0)
-        for number, handler in before.items():
+        for number, handler in replaced.items():
             signal.signal(number, handler)
 
 
@@ -61,3 +72,10 @@ def _is_raising() -> bool:
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__context__
     return error is not None
+
+
+def _locking_at(frame: FrameType | None) -> tuple[CodeType, int] | None:
+    """The instruction of the standard library that may be taking a lock just now."""
+    while frame is not None and frame.f_code.co_filename not in LOCKING:
+        frame = frame.f_back
+    return None if frame is None else (frame.f_code, frame.f_lasti)
