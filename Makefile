@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 # Processes that share the tests, each with a Ray of its own; 0: this one alone.
-TEST_PROCESSES ?= 0
+TEST_PROCESSES ?= 2
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-fast check format bench chaos
@@ -16,7 +16,7 @@ demo: .venv/installed  ## the complete road on simulated flights: at most six mi
 	$(BIN)/python jobs/demo.py --out runs/demo
 
 test: .venv/installed  ## all tests: 22 minutes on two quiet cores
-	$(BIN)/pytest -n $(TEST_PROCESSES) --dist loadscope --no-loadscope-reorder
+	$(BIN)/pytest -n $(TEST_PROCESSES) --no-loadscope-reorder
 
 test-fast: .venv/installed  ## the tests without Ray, training and browsers: some minutes
 	$(BIN)/pytest -m "not slow"

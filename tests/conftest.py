@@ -1,14 +1,18 @@
 """Fixtures of several tests: one Ray for all, a tiny simulated data set, a small encoder."""
 
 import os
+import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import hypothesis
 import pytest
+from xdist.scheduler import LoadScopeScheduling
 
 from tests.launcher import Launcher
+from tests.processes import one_start_of_ray
 
 if TYPE_CHECKING:
     from model.pvda import FeatureEncoder
@@ -36,16 +40,31 @@ hypothesis.settings.load_profile("house")
 
 SLOW_FIXTURES = {"ray_cluster", "prepared", "browser", "workspace"}
 "Tests that use one of them start Ray, jobs or Chromium: `make test-fast` leaves them out."
-LONGEST = (
-    "tests/chaos/test_chaos.py",
-    "tests/test_benchmarks.py",
-    "tests/jobs/test_submit.py",
-    "tests/jobs/test_checkpoints.py",
-    "tests/jobs/test_ray_group.py",
-    "tests/jobs/test_jobs.py",
-    "tests/service/test_serve.py",
+USES_RAY = re.compile(
+    r"\b(ray_cluster|ray_address|prepared|workspace|start_cluster|ray job|ray\.init)\b"
 )
-"Files that several test processes (pytest -n) begin with, so that none ends with one of them."
+"""In a file of tests: it starts a cluster of Ray, or jobs that do. Other files may not: each
+process that runs some would start one of its own."""
+RAY_UNITS = (
+    ("tests/chaos/", "tests/core/", "tests/service/", "tests/test_benchmarks.py",
+     "tests/jobs/test_signals.py", "tests/jobs/test_submit.py"),
+    ("tests/",),
+)  # fmt: skip
+"""Beginnings of such files' names: of several test processes (pytest -n) each runs one of these
+units to its end, then single files of the others."""
+
+
+@cache
+def uses_ray(file: str) -> bool:
+    return bool(USES_RAY.search((Path(__file__).parents[1] / file).read_text()))
+
+
+def unit_of(node: str) -> int:
+    """The number of a test's unit; beyond the last one for tests that do not use Ray."""
+    file = node.partition("::")[0]
+    if not uses_ray(file):
+        return len(RAY_UNITS)
+    return next(number for number, starts in enumerate(RAY_UNITS) if file.startswith(starts))
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -53,8 +72,33 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
     if hasattr(config, "workerinput"):  # a process of pytest-xdist
-        order = {file: number for number, file in enumerate(LONGEST)}
-        items.sort(key=lambda item: order.get(item.nodeid.partition("::")[0], len(order)))
+        items.sort(key=lambda item: unit_of(item.nodeid))
+
+
+class RayUnitScheduling(LoadScopeScheduling):  # type: ignore[misc]
+    """A unit of RAY_UNITS is one piece of work, of the other tests each file is one.
+
+    `--dist loadgroup` would do, but xdist 3.8 finds no groups with pytest 9.2.
+    """
+
+    def _split_scope(self, nodeid: str) -> str:
+        unit = unit_of(nodeid)
+        file: str = nodeid.partition("::")[0]
+        return f"Ray {unit}" if unit < len(RAY_UNITS) else file
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadScopeScheduling:
+    return RayUnitScheduling(config, log)
+
+
+@pytest.fixture(autouse=True)
+def _no_ray_in_other_files(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not uses_ray(request.node.nodeid.partition("::")[0]):
+        monkeypatch.setattr(
+            "pipeline.core.cluster.connect",
+            lambda: pytest.fail("starts Ray: ask for the fixture ray_cluster"),
+        )
 
 
 @pytest.fixture(scope="session")
@@ -68,20 +112,21 @@ def ray_cluster() -> Iterator[None]:
     from pipeline.core import cluster
     from pipeline.core.errors import Incomplete
 
-    for attempt in (1, 2, 3):
-        try:
-            cluster.connect()
-            break
-        except Incomplete:
-            ray.shutdown()
-            if attempt == 3:
-                raise
+    with one_start_of_ray():
+        for attempt in (1, 2, 3):
+            try:
+                cluster.connect()
+                break
+            except Incomplete:
+                ray.shutdown()
+                if attempt == 3:
+                    raise
     yield
     ray.shutdown()
 
 
 @pytest.fixture(scope="session")
-def tiny_world(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) -> Path:
+def tiny_world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """University-1652's layout: 6 training and 3 test locations, 2 distractors, 3 views each."""
     from pipeline.simulation.settings import SimulationSettings
     from pipeline.simulation.simulate import simulate
@@ -89,7 +134,13 @@ def tiny_world(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) -> P
     out = tmp_path_factory.mktemp("world")
     return simulate(
         SimulationSettings(
-            out=str(out), train_locations=6, test_locations=3, distractors=2, views=3, size=64
+            out=str(out),
+            train_locations=6,
+            test_locations=3,
+            distractors=2,
+            views=3,
+            size=64,
+            workers=0,
         )
     )
 
@@ -102,7 +153,8 @@ def tiny_shards(tmp_path_factory: pytest.TempPathFactory, tiny_world: Path) -> s
     from pipeline.sources.university1652 import University1652
 
     out = str(tmp_path_factory.mktemp("shards"))
-    pack(University1652(), PackingSettings(root=str(tiny_world), out=out, samples_per_shard=8))
+    settings = PackingSettings(root=str(tiny_world), out=out, samples_per_shard=8, workers=0)
+    pack(University1652(), settings)
     return out
 
 

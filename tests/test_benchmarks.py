@@ -59,6 +59,11 @@ CASES: dict[str, tuple[str, str]] = {
         "--rows 2000 --dimension 32 --rounds 1 --factories planned",
         r"Flat \(the planner\) .* [\d.]+ x \|",
     ),
+    "ingredients": (
+        "--shards {trained}/shards --held places={trained}/shards --out {out} --epochs 1 "
+        "--batch-size 2 --only without_turns",
+        r"without_turns \| [\d.]+% .*% \| [+-][\d.]+% \[",
+    ),
     "own_map": (
         "--imagery {images} --out {out} --tiles 3 --photos 3",
         r"built-in: .* of 3 photos within 25 m, [\d.]+ x ImageNet's weights alone",

@@ -11,8 +11,8 @@ import queue
 import signal
 import sys
 import threading
-from concurrent.futures import _base, thread
 from collections.abc import Iterator
+from concurrent.futures import _base, thread
 from contextlib import contextmanager
 from types import CodeType, FrameType
 

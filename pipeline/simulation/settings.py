@@ -42,10 +42,15 @@ class SimulationSettings:
     "Locations beyond those images are procedural towns, in place of an error."
     texture_metres_per_pixel: float = 0.3
     "Resolution of those images."
+    workers: int | None = None
+    """Locations rendered at once, each by a Ray task; None for as many as there are cores, 0 for
+    one after the other in this process."""
 
     def __post_init__(self) -> None:
         for name in ("train_locations", "test_locations", "distractors", "seed"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
+        this = "0 (this process) or more"
+        require(self.workers is None or self.workers >= 0, "workers", self.workers, this)
         total = self.train_locations + self.test_locations + self.distractors
         if total > MAX_LOCATIONS:
             raise InputError(

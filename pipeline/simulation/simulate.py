@@ -8,14 +8,15 @@
     simulation.json                            the settings; written last, so its presence means
                                                that the data set is complete
 
-Each location is one Ray task. The task writes `.parts/<id>.json` after all images of its location,
-so a rerun resumes with the missing locations. The output is a local or mounted path, because the
-galleries hold hard links to the queries' files.
+Each location is one task, of Ray or in this process. The task writes `.parts/<id>.json` after all
+images of its location, so a rerun resumes with the missing locations. The output is a local or
+mounted path, because the galleries hold hard links to the queries' files.
 """
 
 import hashlib
 import shutil
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,7 @@ def simulate(settings: SimulationSettings) -> Path:
     (root / ".parts").mkdir(parents=True, exist_ok=True)
     json_files.write_checksummed(str(root / ".parts" / "settings.json"), metadata)
     missing = [job for job in jobs if not part_path(job).exists()]
-    seconds = _run_jobs(missing, len(jobs), settings.views + 1)
+    seconds = _run_jobs(missing, len(jobs), settings)
     write_tables(root, jobs)
     json_files.write_checksummed(str(root / "simulation.json"), metadata)
     shutil.rmtree(root / ".parts")
@@ -104,27 +105,36 @@ def plan_jobs(settings: SimulationSettings, root: str, textures: list[str]) -> l
     ]
 
 
-def _run_jobs(missing: list[LocationJob], total: int, images: int) -> Counter[str]:
-    """Run the jobs on the cluster; seconds spent per step, summed over all jobs."""
+def _run_jobs(missing: list[LocationJob], total: int, settings: SimulationSettings) -> Counter[str]:
+    """Run the jobs; seconds spent per step, summed over all jobs."""
     spent: Counter[str] = Counter()
     if not missing:
         return spent
-    cluster.connect()
-    task = ray.remote(num_cpus=1)(write_location)
+    images = settings.views + 1
     with progress(len(missing) * images, "simulate", "images") as meter:
         if len(missing) < total:
             meter.note(f"{total - len(missing)} of {total} locations exist already")
-        for _, seconds in cluster.bounded_map(task.remote, missing, window=2 * cluster.cpus()):
+        for seconds in _write_locations(missing, settings.workers):
             spent.update(seconds)
             meter.advance(images)
     return spent
 
 
+def _write_locations(jobs: list[LocationJob], workers: int | None) -> Iterator[dict[str, float]]:
+    """Seconds per step of each job, as they finish."""
+    if workers == 0:
+        yield from map(write_location, jobs)
+        return
+    cluster.connect()
+    task, window = ray.remote(num_cpus=1)(write_location), workers or 2 * cluster.cpus()
+    for _, seconds in cluster.bounded_map(task.remote, jobs, window):
+        yield seconds
+
+
 def _settings_metadata(settings: SimulationSettings, textures: list[str]) -> dict[str, Any]:
-    """The settings that determine the data set's content: without its and the textures' folder."""
-    metadata = {
-        name: value for name, value in asdict(settings).items() if name not in ("out", "textures")
-    }
+    """The settings that determine the data set's content: without folders and workers."""
+    others = ("out", "textures", "workers")
+    metadata = {name: value for name, value in asdict(settings).items() if name not in others}
     if settings.textures:
         folder = storage.absolute(settings.textures)
         names = "\n".join(str(Path(path).relative_to(folder)) for path in textures)

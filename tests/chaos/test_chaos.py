@@ -12,7 +12,7 @@ from tests.chaos.campaign import Case, TrialResult, cases, run_trial
 from tests.chaos.stages import STAGES, Stage
 from tests.chaos.workspace import Workspace, open_workspace
 
-FAULTS = 10
+FAULTS = 5
 "Faults per stage, besides those of FOUND."
 FOUND = {
     ("pack", "read ends early"): 0,  # the image was rejected for good
