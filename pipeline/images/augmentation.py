@@ -1,10 +1,11 @@
 """The train transforms per view, on uint8: the paper's geometry, or an affine one, and the looks of
-other sensors and days. The network normalises.
+other sensors and days; or the chain of another method. The network normalises.
 
 In: a decoded image. Out: (size, size, 3). Shapes: H x W pixels.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -13,10 +14,19 @@ from PIL import Image
 from pipeline.core.arrays import Pixels
 from pipeline.core.errors import InputError, require
 from pipeline.core.records import View
+from pipeline.images.chains import compress, erase, mccg_colours, sample4geo_chain
 from pipeline.images.transforms import Resizer, resize
+
+Chain = Literal["own", "sample4geo", "dac", "mccg"]
+"""`own`: what the other settings say. `sample4geo`: that method's steps in place of them, resized
+bilinearly; `dac`: the same with the wider colour jitter of DAC, CAMP and QDFL. `mccg`: AutoAugment
+(UAV images only) and a colour jitter before the other settings' steps, a rectangle erased from half
+of the UAV images after them."""
 
 LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)
 "Weights of red, green and blue in a pixel's grey (ITU-R BT.601)."
+MCCG_ERASED = 0.5
+"Share of the UAV images that MCCG erases a rectangle of."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,9 +59,18 @@ class Augmentation:
     "Share of the images that are compressed again, as JPEG of quality 20 to 90."
     hide: float = 0.0
     "Share of the images of which a rectangle is covered."
+    chain: Chain = "own"
+    """Whose steps the images go through: those of the other settings (own), another method's in
+    place of them (sample4geo, dac), or around them (mccg) [paper: own]."""
+    pair_mirror: bool = False
+    """Whether half of the pairs are mirrored, both images together, before all other steps; only
+    with a sampler of pairs [Sample4Geo, DAC, CAMP: yes; QDFL: no]."""
+    erase: float = 0.0
+    """Share of the images of which a rectangle is erased: ImageNet's mean colour, after all other
+    steps [chosen: none; LCM: 0.5]."""
 
     def __post_init__(self) -> None:
-        for name in ("jpeg", "hide"):
+        for name in ("jpeg", "hide", "erase"):
             require(0 <= getattr(self, name) <= 1, name, getattr(self, name), "0 to 1")
         for name in ("pad", "scale", "shift", "colour", "blur", "noise"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
@@ -61,6 +80,23 @@ class Augmentation:
                 "found one of --drone-rotation, --scale and --shift, expected --affine too, "
                 "without which they have no effect"
             )
+        if self.chain == "mccg" and self.erase:
+            raise InputError(
+                "found --erase with --chain mccg, which erases half of the UAV images itself, "
+                "expected one of the two"
+            )
+        if self.chain in ("sample4geo", "dac"):
+            self._require_own_steps_unchanged()
+
+    def _require_own_steps_unchanged(self) -> None:
+        for setting in fields(self):
+            value, default = getattr(self, setting.name), setting.default
+            if setting.name not in ("chain", "pair_mirror", "erase") and value not in (0, default):
+                flag = setting.name.replace("_", "-")
+                raise InputError(
+                    f"found --{flag} {value} with --chain {self.chain}, where it has no effect, "
+                    f"expected its default {default}; leave it out, or take --chain own"
+                )
 
 
 def augment(
@@ -71,7 +107,32 @@ def augment(
     rng: np.random.Generator,
     by: Resizer = "torch",
 ) -> Pixels:
-    """Train transform of one image, (size, size, 3): geometry, mirror, then the sensor's look."""
+    """Train transform of one image, (size, size, 3): geometry, mirror, then the sensor's look; or
+    the steps of another method's chain.
+
+    `by` resizes, except in the chains `sample4geo` and `dac`.
+    """
+    share = settings.erase
+    if settings.chain in ("sample4geo", "dac"):
+        image_HW3 = sample4geo_chain(image_HW3, view, size, settings.chain == "dac", rng)
+    else:
+        if settings.chain == "mccg":
+            image_HW3 = mccg_colours(image_HW3, view, rng)
+            share = MCCG_ERASED if view == View.DRONE else 0.0
+        image_HW3 = _augment_as_set(image_HW3, view, size, settings, rng, by)
+    if share and rng.random() < share:
+        image_HW3 = erase(image_HW3, rng)
+    return image_HW3
+
+
+def _augment_as_set(
+    image_HW3: Pixels,
+    view: View,
+    size: int,
+    settings: Augmentation,
+    rng: np.random.Generator,
+    by: Resizer,
+) -> Pixels:
     image_HW3 = resize(image_HW3, size, by)
     move = _move_affinely if settings.affine else _move_as_published
     moved_HW3 = move(image_HW3, view, settings, rng)
@@ -132,7 +193,7 @@ def change_look(image_HW3: Pixels, settings: Augmentation, rng: np.random.Genera
     if settings.hide and rng.random() < settings.hide:
         image_HW3 = _hide(image_HW3, rng)
     if settings.jpeg and rng.random() < settings.jpeg:
-        image_HW3 = _compress(image_HW3, int(rng.integers(20, 90)))
+        image_HW3 = compress(image_HW3, int(rng.integers(20, 90)))
     return image_HW3
 
 
@@ -168,11 +229,3 @@ def _hide(image_HW3: Pixels, rng: np.random.Generator) -> Pixels:
     hidden_HW3 = image_HW3.copy()
     hidden_HW3[top : top + height, left : left + width] = rng.integers(0, 256, 3, np.uint8)
     return hidden_HW3
-
-
-def _compress(image_HW3: Pixels, quality: int) -> Pixels:
-    import simplejpeg
-
-    data = simplejpeg.encode_jpeg(np.ascontiguousarray(image_HW3), quality, colorsubsampling="420")
-    decoded_HW3: Pixels = simplejpeg.decode_jpeg(data)
-    return decoded_HW3
