@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from model.config import LossWeights, Optimization, Precision, PVDAConfig, Start
 from model.schedule import Schedule
-from pipeline.batches.settings import Sampler
+from pipeline.batches.settings import Sampler, check_sampler
 from pipeline.core.errors import require
 from pipeline.images.augmentation import Augmentation
 from pipeline.images.transforms import Resizer
@@ -31,8 +31,10 @@ class Recipe:
     adversary: bool = True
     "Train with a view discriminator; without it PVDA is LPN."
     sampler: Sampler = "independent"
-    """How a step's images are drawn: each view by itself, or as pairs of distinct locations
-    [LPN lineage: independent]."""
+    """How a step's images are drawn: each view by itself, as pairs of distinct locations, or as
+    pairs of which an epoch has each location `pair_repeats` times [LPN lineage: independent]."""
+    pair_repeats: int = 1
+    "Pairs of each location in an epoch of the sampler `paired` [FSRA: 1 or 3]."
     batch_size: int = 8
     "Images of each view per step and worker [LPN lineage: 8]."
     seed: int = 0
@@ -55,10 +57,14 @@ class Recipe:
         few = "at least 2: BatchNorm needs two images of a view"
         require(self.batch_size >= 2, "batch_size", self.batch_size, few)
         pairs = "unique_pairs, since InfoNCE compares the views row by row"
+        distinct = self.sampler == "unique_pairs" or (
+            self.sampler == "paired" and self.pair_repeats == 1
+        )
         require(
-            not self.losses.contrastive_weight or self.sampler == "unique_pairs",
+            not self.losses.contrastive_weight or distinct,
             "sampler", self.sampler, pairs,
         )  # fmt: skip
+        check_sampler(self.sampler, self.pair_repeats, self.augmentation)
         share = "a share of the locations, from 0 to below 1"
         require(0 <= self.hold_out < 1, "hold_out", self.hold_out, share)
 

@@ -126,6 +126,7 @@ def open_stream(run: RunConfig, context: WorkerContext) -> TrainingStream:
         threads=max(1, torch.get_num_threads()),
         hold_out=recipe.hold_out,
         sampler=recipe.sampler,
+        pair_repeats=recipe.pair_repeats,
     )
     return TrainingStream(open_shards(run.shards), config, context.rank, context.world_size)
 

@@ -4,6 +4,6 @@ In: a `ShardSet` (room `shards`). Out: shuffled pairs of batches of both views f
 samples of a shard decoded in their order for embedding; images as bytes (B, 3, H, W).
 Begin in `training.py`: `TrainingStream.epoch`, and `TrainingStream.pipeline`, the webdataset
 pipeline behind it, to which you can add stages of your own.
-`sampler.py` plans which samples a rank reads in an epoch; `ordered.py` decodes; `holdout.py`
-chooses the locations that are held out of training.
+`sampler.py` plans which samples a rank reads in an epoch; `pairs.py` chooses those of pairs;
+`ordered.py` decodes; `holdout.py` chooses the locations that are held out of training.
 """

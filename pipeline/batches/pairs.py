@@ -1,12 +1,13 @@
 """Pairs of a UAV image and a satellite image of one location, for losses that compare the two.
 
 In: a shuffled stream of UAV samples, and the set's satellite samples. Out: groups of pairs in which
-each location comes once: any other row of the batch then shows another place. Pure functions of
-the stream's order.
+each location comes once, so that any other row of the batch shows another place; or pairs of which
+an epoch has a planned number of each location. Pure functions of the stream's order.
 """
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from typing import TypeVar
 
 import numpy as np
@@ -19,8 +20,13 @@ from pipeline.shards.shard_set import ShardSet
 Item = TypeVar("Item")
 
 
+def location_of(sample: Sample) -> str:
+    """The location that a sample's metadata names."""
+    return str(sample.metadata["location"])
+
+
 def group_distinct(
-    items: Iterable[Item], location_of: Callable[[Item], str], size: int
+    items: Iterable[Item], name_of: Callable[[Item], str], size: int
 ) -> Iterator[list[Item]]:
     """Groups of `size` items of distinct locations, in the order in which they come; an item whose
     location is in the group already waits for the next one.
@@ -35,12 +41,59 @@ def group_distinct(
             item = waiting.popleft() if waiting else next(source, None)
             if item is None:
                 return
-            if location_of(item) in group:
+            if name_of(item) in group:
                 postponed.append(item)
             else:
-                group[location_of(item)] = item
+                group[name_of(item)] = item
         waiting = postponed + waiting
         yield list(group.values())
+
+
+def plan_locations(
+    locations: Sequence[str],
+    repeats: int,
+    rows: int,
+    rank: int,
+    world: int,
+    rng: np.random.Generator,
+) -> dict[str, int]:
+    """How many rows of an epoch each location of a rank gets, `rows` in all.
+
+    The locations in random order, the same on every rank, are cut into `world` equal stretches; a
+    rank takes its own. Each of its locations gets `repeats` rows until there are `rows` of them, so
+    the locations that are dropped differ from epoch to epoch.
+    """
+    share = len(locations) // world
+    order = rng.permutation(len(locations))[rank * share : (rank + 1) * share]
+    named = (locations[number] for number in order for _ in range(repeats))
+    return Counter(islice(named, rows))
+
+
+def take_planned(
+    items: Iterable[Item], name_of: Callable[[Item], str], planned: Mapping[str, int], path: str
+) -> Iterator[Item]:
+    """As many items of each location as are planned, those of one location in a row, in the order
+    in which the last of them comes. Other items are passed over. No item is read after the last
+    planned one.
+
+    Raises InputError where the items end before that; `path` names the set.
+    """
+    missing: dict[str, list[Item]] = {location: [] for location in planned}
+    for item in items if missing else ():
+        location = name_of(item)
+        if location not in missing:
+            continue
+        missing[location].append(item)
+        if len(missing[location]) == planned[location]:
+            yield from missing.pop(location)
+            if not missing:
+                return
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(planned)} training locations of {path} have too few UAV "
+            f"images ({min(missing)!r} and on), expected at least one of each to train on pairs; "
+            "train with --sampler independent, or pack again"
+        )
 
 
 class SatelliteImages:
@@ -55,7 +108,7 @@ class SatelliteImages:
         self._path, self._by_location = shards.path, dict[str, list[Sample]]()
         for shard in satellite:
             for sample in shards.samples(shard):
-                location = sample.metadata["location"]
+                location = location_of(sample)
                 if location not in left_out:
                     self._by_location.setdefault(location, []).append(sample)
 

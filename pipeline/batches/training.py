@@ -8,7 +8,7 @@ import random
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import chain, islice
+from itertools import chain, count, islice
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,13 @@ from pipeline.batches.ordered import (
     split_failed,
     stack,
 )
-from pipeline.batches.pairs import SatelliteImages, group_distinct
+from pipeline.batches.pairs import (
+    SatelliteImages,
+    group_distinct,
+    location_of,
+    plan_locations,
+    take_planned,
+)
 from pipeline.batches.sampler import Span, plan_pass, read_spans
 from pipeline.batches.settings import StreamConfig
 from pipeline.core.errors import InputError
@@ -54,7 +60,8 @@ class TrainingStream:
 
     An epoch is one pass over the satellite view; its last partial batch is dropped, other images
     each time. The UAV view gives as many images, drawn anew each epoch. With `unique_pairs` the UAV
-    view is drawn so, and each image brings its location's satellite image along.
+    view is drawn so, and each image brings its location's satellite image along. With `paired` an
+    epoch is `pair_repeats` pairs of each location.
 
     Raises InputError when the set cannot be trained on.
     """
@@ -77,6 +84,9 @@ class TrainingStream:
         together = config.batch_size * world
         self.steps = counts[View.SATELLITE] // together
         "Steps of an epoch, the same for every rank."
+        if config.sampler == "paired":
+            self._require_locations(-(-config.batch_size // config.pair_repeats) * world)
+            self.steps = len(kept) // world * config.pair_repeats // config.batch_size
         if self.steps == 0 or counts[View.DRONE] == 0:
             raise InputError(
                 f"{shards.path} has {counts[View.SATELLITE]} satellite and {counts[View.DRONE]} "
@@ -91,7 +101,7 @@ class TrainingStream:
         The first `skip` batches are skipped without decoding them; the others are those of a full
         epoch.
         """
-        if self.config.sampler == "unique_pairs":
+        if self.config.sampler != "independent":
             return self._paired_epoch(epoch, skip)
         return zip(
             self.pipeline(View.DRONE, epoch, skip),
@@ -99,16 +109,17 @@ class TrainingStream:
             strict=True,
         )
 
-    def _paired_epoch(self, epoch: int, skip: int) -> Iterator[tuple[Batch, Batch]]:
-        size = self.config.batch_size
-        if len(self.classes) < size:
+    def _require_locations(self, fewest: int) -> None:
+        if len(self.classes) < fewest:
             raise InputError(
                 f"{self.shards.path} has {len(self.classes)} training locations, expected at least "
-                f"{size}, one for each pair of a batch; train with a smaller batch"
+                f"{fewest} for one batch of pairs; train with a smaller batch"
             )
-        drones = self._endless_drones(epoch)
-        groups = group_distinct(drones, lambda sample: sample.metadata["location"], size)
-        rows = enumerate(chain.from_iterable(islice(groups, skip, self.steps)), start=skip * size)
+
+    def _paired_epoch(self, epoch: int, skip: int) -> Iterator[tuple[Batch, Batch]]:
+        size = self.config.batch_size
+        drones = self._drones_of_pairs(epoch)
+        rows = enumerate(islice(drones, skip * size, self.steps * size), start=skip * size)
         for group in wds.batched(size, collation_fn=None)(
             prefetch_map(
                 partial(self._prepare_pair, self._satellites, epoch),
@@ -119,23 +130,35 @@ class TrainingStream:
         ):
             yield self._collate_pairs(group)
 
-    def _endless_drones(self, epoch: int) -> Iterator[Sample]:
-        """The UAV samples of an epoch, shuffled, over and over: groups of distinct locations may
-        take more of them than they keep."""
+    def _drones_of_pairs(self, epoch: int) -> Iterator[Sample]:
+        """The UAV samples of an epoch's pairs in their order, and with `unique_pairs` more."""
+        config, rows = self.config, self.steps * self.config.batch_size
+        shards, view = self._shards[View.DRONE], list(View).index(View.DRONE)
+        if config.sampler == "unique_pairs":
+            self._require_locations(config.batch_size)
+            # Over and over: groups of distinct locations may take more samples than they keep.
+            rng = np.random.default_rng([config.seed, epoch, view])
+            passes = (plan_pass(shards, rows, self.rank, self.world, rng) for _ in count())
+            drones = self._shuffled_drones(epoch, chain.from_iterable(passes))
+            groups = group_distinct(drones, location_of, config.batch_size)
+            return chain.from_iterable(groups)
+        # Each pass is over all samples: as many passes as repeats are enough for any location that
+        # has one, and the stream ends if a location has none.
+        repeats, every = config.pair_repeats, sum(shard.samples for shard in shards)
+        rng = np.random.default_rng([config.seed, epoch, view, self.rank])
+        passes = (plan_pass(shards, every, 0, 1, rng) for _ in range(repeats))
+        drones = self._shuffled_drones(epoch, chain.from_iterable(passes))
+        names, order = list(self.classes), np.random.default_rng([config.seed, epoch, len(View)])
+        planned = plan_locations(names, repeats, rows, self.rank, self.world, order)
+        return take_planned(drones, location_of, planned, self.shards.path)
+
+    def _shuffled_drones(self, epoch: int, spans: Iterator[Span]) -> Iterator[Sample]:
+        """The UAV samples of these spans, shuffled."""
         config = self.config
-        wanted = self.steps * config.batch_size
-        plan_rng = np.random.default_rng([config.seed, epoch, list(View).index(View.DRONE)])
         rng = random.Random(repr((config.seed, epoch, View.DRONE.value, self.rank)))
-
-        def spans() -> Iterator[Span]:
-            while True:
-                yield from plan_pass(
-                    self._shards[View.DRONE], wanted, self.rank, self.world, plan_rng
-                )
-
         buffer = min(config.shuffle_buffer, sum(s.samples for s in self._shards[View.DRONE]))
         shuffled = wds.shuffle(buffer, initial=buffer, rng=rng)
-        samples: Iterator[Sample] = shuffled(read_spans(self.shards, self.held_out, spans()))
+        samples: Iterator[Sample] = shuffled(read_spans(self.shards, self.held_out, spans))
         return samples
 
     @cached_property
@@ -147,10 +170,11 @@ class TrainingStream:
     ) -> tuple[Decoded, Decoded]:
         number, drone = numbered
         rng = np.random.default_rng([self.config.seed, epoch, len(View), self.rank, number])
-        satellite = satellites.one_of(drone.metadata["location"], rng)
+        satellite = satellites.one_of(location_of(drone), rng)
+        mirrored = self.config.augmentation.pair_mirror and rng.random() < 0.5
         return (
-            self._prepare(View.DRONE, epoch, number, drone),
-            self._prepare(View.SATELLITE, epoch, number, satellite),
+            self._prepare(View.DRONE, epoch, number, drone, mirrored),
+            self._prepare(View.SATELLITE, epoch, number, satellite, mirrored),
         )
 
     def _collate_pairs(self, group: list[tuple[Decoded, Decoded]]) -> tuple[Batch, Batch]:
@@ -219,8 +243,10 @@ class TrainingStream:
             4 * self.config.batch_size,
         )
 
-    def _prepare(self, view: View, epoch: int, number: int, sample: Sample) -> Decoded:
-        """One image, decoded and augmented."""
+    def _prepare(
+        self, view: View, epoch: int, number: int, sample: Sample, mirrored: bool = False
+    ) -> Decoded:
+        """One image, decoded, mirrored along with its pair's other image, and augmented."""
         config = self.config
         # A generator for each image, so that its augmentation does not depend on the thread.
         seed = [config.seed, epoch, list(View).index(view), self.rank, number]
@@ -230,7 +256,7 @@ class TrainingStream:
         except DecodeError as error:
             return sample, error
         return sample, augment(
-            image_HW3,
+            image_HW3[:, ::-1] if mirrored else image_HW3,
             view,
             config.image_size,
             config.augmentation,

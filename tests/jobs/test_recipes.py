@@ -26,9 +26,10 @@ from jobs.training.recipes import (
 )
 from model.backbones.resnet import ResNet
 from model.checkpoint import loads
-from model.config import PVDAConfig
+from model.config import LossWeights, PVDAConfig
 from model.schedule import schedule_at
 from model.training import Training
+from pipeline.core.errors import InputError
 from tests.launcher import Launcher
 
 
@@ -215,3 +216,18 @@ def test_recipe_paper_starts_from_torchvision_resnet50(
         assert (
             torch.cosine_similarity(now.flatten(), before.flatten(), dim=0) > 0.9
         )  # it started from there
+
+
+def test_recipe_repeats_pairs_only_where_they_are_paired() -> None:
+    recipe = replace(paper(), sampler="paired", pair_repeats=3)
+    with pytest.raises(InputError, match="--pair-repeats 3 with --sampler independent"):
+        replace(recipe, sampler="independent")
+    with pytest.raises(InputError, match="--pair-repeats is 0, expected 1 or more"):
+        replace(recipe, pair_repeats=0)
+
+
+def test_recipe_with_info_nce_needs_distinct_locations() -> None:
+    recipe = replace(paper(), sampler="paired", losses=LossWeights(contrastive_weight=1.0))
+    assert recipe.pair_repeats == 1
+    with pytest.raises(InputError, match="--sampler is 'paired', expected unique_pairs"):
+        replace(recipe, pair_repeats=2)
