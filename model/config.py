@@ -5,10 +5,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 from model.backbones import BACKBONES
+from model.parts import POOLINGS
 
 MAX_IMAGE_SIZE, MAX_PART_DIM = 16_384, 65_536
 "Beyond any use; a checkpoint from elsewhere may name any size."
 Divisor = Literal["box", "ring"]
+Neck = Literal["linear", "linear_ones", "norm"]
+"""From a part to its embedding: Linear and BatchNorm as LPN initialises them, with BatchNorm's
+weights at one [FSRA, MCCG], or LayerNorm alone [Sample4Geo]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,12 +25,16 @@ class PVDAConfig:
     "Channels of the backbone as a multiple of the published ones [paper: 1]."
     image_size: int = 256
     "Side of the square images in pixels [paper: 256, 384]."
+    pooling: str = "rings"
+    "Name in POOLINGS: how maps become the parts of an image [paper: rings]."
     parts: int = 4
-    "Square rings P [paper: 4]."
+    "Parts P of an image: its square rings, as a rule [paper: 4]."
     ring_divisor: Divisor = "box"
     "What a ring's sum is divided by: the area of its `box` [LPN] or of the `ring`."
+    neck: Neck = "linear"
+    "From a part to its numbers [paper: linear]."
     part_dim: int = 512
-    "Numbers D per ring after refinement [paper: 512]."
+    "Numbers D per part after its neck [paper: 512]."
     dropout: float = 0.75
     "Before the location classifier [paper, LPN]."
     discriminator_channels: int = 1024
@@ -37,6 +45,8 @@ class PVDAConfig:
             raise ValueError(
                 f"backbone is {self.backbone!r}, expected one of {', '.join(BACKBONES)}"
             )
+        if self.pooling not in POOLINGS:
+            raise ValueError(f"pooling is {self.pooling!r}, expected one of {', '.join(POOLINGS)}")
         for name, most in (
             ("image_size", MAX_IMAGE_SIZE),
             ("part_dim", MAX_PART_DIM),

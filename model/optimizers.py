@@ -25,7 +25,7 @@ def build_optimizers(
 
     groups = [
         group("backbone", model.encoder.backbone, config.backbone_lr),
-        group("head", model.encoder.refine, config.head_lr),
+        group("head", nn.ModuleList([model.encoder.pooling, model.encoder.refine]), config.head_lr),
         group("classifier", model.classifier, config.classifier_lr),
     ]
     optimizers: list[Optimizer] = [

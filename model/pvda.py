@@ -1,8 +1,8 @@
 """The networks of PVDA: feature encoder, location classifier, view discriminator.
 
-In: images as bytes (B, 3, H, W). Out: maps for the discriminator, one embedding per ring for the
-classifier. Shapes: B images, H x W pixels or cells, C channels of the maps, P rings, D numbers per
-ring, L locations.
+In: images as bytes (B, 3, H, W). Out: maps for the discriminator, one embedding per part for the
+classifier. Shapes: B images, H x W pixels or cells, C channels of the maps, P parts, D numbers per
+part, L locations.
 """
 
 import torch
@@ -10,22 +10,28 @@ from torch import Tensor, nn
 
 from model.backbones.base import build_backbone
 from model.config import PVDAConfig
-from model.parts.ring_pooling import ring_average
+from model.parts.base import build_pooling
+from model.parts.necks import build_neck
 
 
 class FeatureEncoder(nn.Module):
-    """Backbone, square rings and refinement; shared by both views."""
+    """Backbone, part pooling and necks; shared by both views."""
 
     mean_31: Tensor
     std_31: Tensor
 
     def __init__(self, config: PVDAConfig) -> None:
         """Raises ValueError where the backbone cannot have that width or take images of that size,
-        or the images are too small for the rings."""
+        the images are too small for the parts, or these cannot be made of this backbone's maps."""
         super().__init__()
-        self.parts, self.divisor = config.parts, config.ring_divisor
         self.backbone = build_backbone(config.backbone, config.width)
-        least = max(2 * config.parts, 4) * self.backbone.stride  # D halves the maps twice
+        self.pooling = build_pooling(config, self.backbone.channels)
+        if self.pooling.needs_token and not self.backbone.has_token:
+            raise ValueError(
+                f"pooling {config.pooling} takes a class token, which {config.backbone} does not "
+                "have, expected a vision transformer; set --backbone or --pooling"
+            )
+        least = max(self.pooling.least_cells, 4) * self.backbone.stride  # D halves the maps twice
         if config.image_size < least:
             raise ValueError(
                 f"image_size is {config.image_size}, expected at least {least} pixels for "
@@ -33,35 +39,26 @@ class FeatureEncoder(nn.Module):
             )
         self.backbone.check_size(config.image_size, config.image_size)
         self.refine = nn.ModuleList(
-            refinement(self.backbone.channels, config.part_dim) for _ in range(config.parts)
+            build_neck(config.neck, channels, config.part_dim) for channels in self.pooling.channels
         )
         for name, values in (("mean_31", self.backbone.mean), ("std_31", self.backbone.std)):
             self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
 
     def forward(self, images_B3HW: Tensor) -> tuple[Tensor, Tensor]:
-        """Bytes (B, 3, H, W) -> maps (B, C, H/stride, W/stride), one embedding g per ring (B, P,
+        """Bytes (B, 3, H, W) -> maps (B, C, H/stride, W/stride), one embedding g per part (B, P,
         D).
         """
         normalised = (images_B3HW.to(self.mean_31.dtype) / 255 - self.mean_31) / self.std_31
-        maps_BCHW = self.backbone(normalised)
-        rings_BPC = ring_average(maps_BCHW, self.parts, self.divisor)
+        maps_BCHW, token_BC = self.backbone.features(normalised)
+        parts = self.pooling(maps_BCHW, token_BC)
         g_BPD = torch.stack(
-            [refine(rings_BPC[:, part]) for part, refine in enumerate(self.refine)], dim=1
+            [refine(part_BC) for refine, part_BC in zip(self.refine, parts, strict=True)], dim=1
         )
         return maps_BCHW, g_BPD
 
 
-def refinement(channels: int, part_dim: int) -> nn.Sequential:
-    """Linear and BatchNorm of one ring, initialised as LPN's."""
-    linear, norm = nn.Linear(channels, part_dim), nn.BatchNorm1d(part_dim)
-    nn.init.kaiming_normal_(linear.weight, mode="fan_out")
-    nn.init.zeros_(linear.bias)
-    nn.init.normal_(norm.weight, 1.0, 0.02)
-    return nn.Sequential(linear, norm)
-
-
 class LocationClassifier(nn.Module):
-    """One linear classifier of locations per ring, shared by both views."""
+    """One linear classifier of locations per part, shared by both views."""
 
     def __init__(self, config: PVDAConfig, locations: int) -> None:
         super().__init__()

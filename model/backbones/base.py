@@ -6,7 +6,7 @@ table of foreign names.
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import ClassVar, Self
+from typing import ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -15,6 +15,14 @@ from model.backbones import BACKBONES
 
 MAX_CHANNELS = 65_536
 "Beyond any use; a checkpoint from elsewhere may name any width."
+
+
+class Features(NamedTuple):
+    """What a backbone makes of images."""
+
+    maps_BCHW: Tensor
+    token_BC: Tensor | None
+    "The class token, of backbones that have one."
 
 
 class Backbone(nn.Module):
@@ -32,6 +40,8 @@ class Backbone(nn.Module):
     "Beginnings of names in public weights that this module has no use for, such as a classifier's."
     loads_folders: ClassVar[bool] = False
     "Public weights come as a folder or by the hub's name (`load_pretrained`), not as one file."
+    has_token: ClassVar[bool] = False
+    "It has a class token beside the maps."
     quantizable: ClassVar[bool] = True
     "Its layers are those that 8-bit integers have been measured on: convolutions and BatchNorm."
     channels: int
@@ -78,6 +88,10 @@ class Backbone(nn.Module):
         with torch.no_grad():
             maps_BCHW = _run(stages[: self.frozen_stages], images_B3HW)
         return _run(stages[self.frozen_stages :], maps_BCHW)
+
+    def features(self, images_B3HW: Tensor) -> Features:
+        """Normalised images (B, 3, H, W) -> maps, and the class token where there is one."""
+        return Features(self(images_B3HW), None)
 
     def freeze(self, count: int) -> None:
         """Keep the weights and BatchNorm statistics of the first `count` stages in training.

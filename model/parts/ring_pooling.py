@@ -6,7 +6,21 @@ Shapes: B images, C channels, H x W cells, P rings.
 import torch
 from torch import Tensor
 
-from model.config import Divisor
+from model.config import Divisor, PVDAConfig
+from model.parts.base import PartPooling
+
+
+class Rings(PartPooling):
+    """The mean of each square ring [LPN]."""
+
+    def __init__(self, config: PVDAConfig, channels: int) -> None:
+        super().__init__(config, channels)
+        self.parts, self.divisor = config.parts, config.ring_divisor
+        self.channels, self.least_cells = (channels,) * config.parts, 2 * config.parts
+
+    def forward(self, maps_BCHW: Tensor, token_BC: Tensor | None) -> list[Tensor]:
+        """P rings, (B, C) each, centre first."""
+        return list(ring_average(maps_BCHW, self.parts, self.divisor).unbind(1))
 
 
 def ring_masks(height: int, width: int, parts: int) -> Tensor:

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 
 from model.config import PVDAConfig
 from model.inference.embed import embed, unit_embedding
-from model.pvda import FeatureEncoder, LocationClassifier, ViewDiscriminator, refinement
+from model.parts.necks import build_neck
+from model.pvda import FeatureEncoder, LocationClassifier, ViewDiscriminator
 
 PAPER = PVDAConfig()
 TINY = PVDAConfig(
@@ -74,9 +75,9 @@ def test_discriminator_gives_one_verdict_per_image(cells: int, left: int) -> Non
 
 
 @torch.no_grad()
-def test_refinement_is_initialised_as_lpns() -> None:
+def test_linear_neck_is_initialised_as_lpns() -> None:
     torch.manual_seed(0)
-    linear, norm = refinement(2048, 512)
+    linear, norm = build_neck("linear", 2048, 512)
     assert isinstance(linear, nn.Linear)
     assert isinstance(norm, nn.BatchNorm1d)
     assert float(linear.weight.std()) == pytest.approx(
