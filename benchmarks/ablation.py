@@ -26,7 +26,9 @@ import torch
 from ablation_data import IMAGE_SIZE, TestSet, make_shards
 from torch import Tensor
 
-from jobs.training.recipes import RECIPES, Recipe, smoke
+from jobs.training.recipes import RECIPES
+from jobs.training.recipes.pvda import smoke
+from jobs.training.recipes.recipe import Recipe
 from model.config import Optimization
 from model.schedule import schedule_at
 from model.training import Training

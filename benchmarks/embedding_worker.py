@@ -22,7 +22,9 @@ from torch import Tensor
 from jobs.encoding.encoder import WorkerEncoder, make_encoder_spec
 from jobs.encoding.probe_images import CALIBRATION_IMAGES, PROBE_IMAGES
 from jobs.encoding.settings import EncoderSettings
-from jobs.training.recipes import Recipe, builtin, paper
+from jobs.training.recipes.builtin import builtin
+from jobs.training.recipes.pvda import paper
+from jobs.training.recipes.recipe import Recipe
 from model.checkpoint import Checkpoint, dumps
 from model.inference.embed import FastEncoder
 from model.pvda import FeatureEncoder

@@ -29,7 +29,9 @@ from synthetic import jpegs
 from train_step import time_steps
 
 from jobs.encoding.settings import EncoderSettings
-from jobs.training.recipes import Recipe, builtin, paper
+from jobs.training.recipes.builtin import builtin
+from jobs.training.recipes.pvda import paper
+from jobs.training.recipes.recipe import Recipe
 from model.errors import CheckpointError
 from model.inference.embed import embed
 from model.inference.optimise import MIN_COSINE

@@ -19,7 +19,8 @@ import numpy as np
 from encoders import embed_view
 
 from jobs.training.driver import train
-from jobs.training.recipes import Recipe, builtin
+from jobs.training.recipes.builtin import builtin
+from jobs.training.recipes.recipe import Recipe
 from jobs.training.settings import TrainSettings
 from model.config import LossWeights
 from pipeline.core.arrays import Doubles, Strings

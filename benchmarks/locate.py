@@ -24,7 +24,7 @@ from jobs.encoding.encoder import make_encoder_spec
 from jobs.stages.calibrate import calibrate_index
 from jobs.stages.settings import CalibrateSettings
 from jobs.training.driver import train
-from jobs.training.recipes import smoke
+from jobs.training.recipes.pvda import smoke
 from jobs.training.settings import TrainSettings
 from pipeline.core import cluster, storage
 from pipeline.core.arrays import Doubles

@@ -23,7 +23,7 @@ from rasterio.warp import transform as transform_points
 from jobs.encoding.encoder import make_encoder_spec, read_checkpoint_bytes
 from jobs.stages.locate import locate_photos
 from jobs.stages.settings import LocateSettings
-from jobs.training.recipes import builtin
+from jobs.training.recipes.builtin import builtin
 from model.checkpoint import Checkpoint, dumps
 from model.pvda import FeatureEncoder
 from model.weights.builtin import BUILTIN

@@ -16,18 +16,15 @@ from pathlib import Path
 import numpy as np
 import torch
 from synthetic import jpegs
-from torch import Tensor
 
 from jobs.training.loop import BatchTensors, load_batches
-from jobs.training.recipes import Recipe, builtin, paper, smoke
+from jobs.training.recipes.builtin import builtin
+from jobs.training.recipes.pvda import paper, smoke
+from jobs.training.recipes.recipe import Recipe
 from jobs.training.settings import RunConfig
 from jobs.training.state import TrainingState, WorkerContext
-from model.inference.embed import unit_embedding
-from model.losses.contrastive import info_nce
-from model.losses.pvda import adversarial_terms, location_terms
+from model.losses.pvda import adversarial_terms
 from model.schedule import ScheduleState
-from model.training import Training
-from model.two_views import ViewOutput
 from pipeline.core import json_files, storage
 from pipeline.core.records import ImageRecord, Split, View
 from pipeline.shards.manifest import MANIFEST, Manifest
@@ -129,7 +126,7 @@ def parts(worker: TrainingState, batch: BatchTensors, steps: int) -> dict[str, f
         with part("encoder"):
             with autocast():
                 drone, satellite = training.model(*images)
-            fitted = fit_loss(training, drone, satellite, labels)
+            fitted = training.objective(drone, labels[0], satellite, labels[1])[0]
         losses, gradients = [fitted], [torch.ones_like(fitted)]
         if discriminator is not None:
             both_BCHW = torch.cat([drone.maps_BCHW, satellite.maps_BCHW])
@@ -149,24 +146,6 @@ def parts(worker: TrainingState, batch: BatchTensors, steps: int) -> dict[str, f
         with part("optimiser"):
             training.optimizers[0].step()
     return spent
-
-
-def fit_loss(
-    training: Training, drone: ViewOutput, satellite: ViewOutput, labels: list[Tensor]
-) -> Tensor:
-    """Encoder's and classifier's loss without the adversary's term, as `Training.step` has it."""
-    weights = training.losses
-    located_VP = location_terms(drone.logits_BPL, labels[0], satellite.logits_BPL, labels[1])
-    loss = weights.location_weight * located_VP.sum()
-    if weights.contrastive_weight:
-        loss = loss + weights.contrastive_weight * info_nce(
-            unit_embedding(drone.g_BPD.float()),
-            unit_embedding(satellite.g_BPD.float()),
-            labels[0],
-            weights.temperature,
-            weights.label_smoothing,
-        )
-    return loss
 
 
 def time_steps(

@@ -1,7 +1,7 @@
 """The settings of the networks and of their optimisation. Imports nothing heavy: the command line
 offers them before torch is loaded, and a checkpoint carries them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 from model.backbones import BACKBONES
@@ -65,30 +65,67 @@ class PVDAConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LossWeights:
-    """What encoder and classifier minimise beside the adversary's term. The defaults are the
-    paper's."""
+    """What encoder and classifier minimise beside the adversary's term, as a weighted sum. The
+    defaults are the paper's. A loss of weight 0 is not computed."""
 
     location_weight: float = 1.0
     "Weight of Eq. 1, the classification of locations [paper]."
+    location_mean: bool = False
+    "Average that loss over the parts [FSRA, MCCG, QDFL], in place of their sum [paper, LPN]."
     contrastive_weight: float = 0.0
     "Weight of symmetric InfoNCE between the views' embeddings [paper: none; Sample4Geo: 1]."
     temperature: float = 0.05
     "InfoNCE divides cosines by it [chosen]."
+    learn_temperature: bool = False
+    "Learn it, from that value on [Sample4Geo: from 0.07]."
     label_smoothing: float = 0.1
     "Share of InfoNCE's target that is spread over all rows [Sample4Geo]."
+    triplet_weight: float = 0.0
+    "Weight of the cross-view triplet loss [FSRA, MCCG: 1]."
+    triplet_margin: float = 0.3
+    "Its margin, of distances between vectors of length 1 [FSRA]."
+    similarity_weight: float = 0.0
+    "Weight of the multi-similarity loss on the last part [QDFL: 2]."
+    kl_weight: float = 0.0
+    "Weight of the Kullback-Leibler divergence between the views' locations [FSRA's option: 1]."
+    js_weight: float = 0.0
+    "Weight of QDFL's divergence of the views' locations from their mean [QDFL: 1]."
+    alignment_weight: float = 0.0
+    "Weight of the dense alignment of the views' maps [DAC: 0.6]."
+    gates_weight: float = 0.0
+    "Weight of the location loss of three more heads, MCCG's, that only training has [DAC: 0.1]."
+    regions_weight: float = 0.0
+    "Weight of the contrast of heat regions within each view [CAMP: 1]."
 
     def __post_init__(self) -> None:
-        weights = (self.location_weight, self.contrastive_weight)
-        if min(weights) < 0 or not any(weights):
+        weights = {
+            field.name: getattr(self, field.name)
+            for field in fields(self)
+            if field.name.endswith("_weight")
+        }
+        for name, weight in weights.items():
+            if weight < 0:
+                raise ValueError(f"{name} is {weight}, expected 0 (without this loss) or more")
+        if not any(weights.values()):
             raise ValueError(
-                f"location_weight is {weights[0]} and contrastive_weight {weights[1]}, expected 0 "
-                "or more and not both 0"
+                "the weights of all losses are 0, expected one above 0; set --location-weight or "
+                "--contrastive-weight"
             )
         if not (self.temperature > 0 and 0 <= self.label_smoothing < 1):
             raise ValueError(
                 f"temperature is {self.temperature} and label_smoothing {self.label_smoothing}, "
                 "expected more than 0, and a share below 1"
             )
+
+    @property
+    def needs_pairs(self) -> bool:
+        """Whether a loss compares the views row by row: both rows then show one location."""
+        return any(
+            (
+                self.contrastive_weight, self.kl_weight, self.js_weight, self.alignment_weight,
+                self.regions_weight,
+            )
+        )  # fmt: skip
 
 
 Precision = Literal["auto", "float32", "bfloat16"]
@@ -115,6 +152,8 @@ class Optimization:
     "Of SGD [LPN]."
     weight_decay: float = 5e-4
     "Of encoder and classifier [LPN]; D has none [chosen]."
+    clip_value: float = 0.0
+    "Largest value of a gradient's number, beyond which it is clipped [Sample4Geo: 100]; 0: none."
     frozen_stages: int = 0
     """Stages of the backbone, counted from the image, that keep their weights and BatchNorm
     statistics [paper: none]."""

@@ -15,7 +15,10 @@ from model.two_views import EncoderWithClassifier
 
 
 def build_optimizers(
-    model: EncoderWithClassifier, discriminator: ViewDiscriminator | None, config: Optimization
+    model: EncoderWithClassifier,
+    objective: nn.Module,
+    discriminator: ViewDiscriminator | None,
+    config: Optimization,
 ) -> list[Optimizer]:
     """`start` of a parameter group is its initial learning rate. Frozen weights are in none."""
 
@@ -28,6 +31,8 @@ def build_optimizers(
         group("head", nn.ModuleList([model.encoder.pooling, model.encoder.refine]), config.head_lr),
         group("classifier", model.classifier, config.classifier_lr),
     ]
+    if any(True for _ in objective.parameters()):
+        groups.append(group("objective", objective, config.head_lr))
     optimizers: list[Optimizer] = [
         SGD(
             groups, lr=0.0, momentum=config.momentum, nesterov=True,

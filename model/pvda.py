@@ -72,8 +72,11 @@ class LocationClassifier(nn.Module):
             nn.init.zeros_(branch.bias)
 
     def forward(self, g_BPD: Tensor) -> Tensor:
-        """Embeddings (B, P, D) -> logits (B, P, L)."""
-        dropped_BPD = self.dropout(g_BPD)
+        """Embeddings (B, P, D) -> logits (B, P, L), in training of embeddings with dropout."""
+        return self.classify(self.dropout(g_BPD))
+
+    def classify(self, dropped_BPD: Tensor) -> Tensor:
+        """Embeddings after dropout (B, P, D) -> logits (B, P, L)."""
         return torch.stack(
             [branch(dropped_BPD[:, part]) for part, branch in enumerate(self.branches)], dim=1
         )

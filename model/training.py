@@ -10,19 +10,17 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils import get_total_norm
+from torch.nn.utils import clip_grad_value_, get_total_norm
 
 from model.config import LossWeights, Optimization, Precision, PVDAConfig
-from model.inference.embed import unit_embedding
-from model.losses.contrastive import info_nce
-from model.losses.pvda import adversarial_terms, feature_loss, location_terms, view_terms
+from model.losses.objective import Objective, by_view
+from model.losses.pvda import adversarial_terms, feature_loss, view_terms
 from model.optimizers import build_optimizers
 from model.pvda import ViewDiscriminator
 from model.schedule import ScheduleState
 from model.two_views import EncoderWithClassifier
 
 Module = TypeVar("Module", bound=nn.Module)
-VIEWS = ("drone", "satellite")
 
 
 class Training:
@@ -51,27 +49,41 @@ class Training:
         compile_for: int | None = None,
         wrap_ddp: Callable[[nn.Module], nn.Module] = lambda module: module,
     ) -> None:
-        self.device, self.losses = torch.device(device), losses or LossWeights()
+        self.device = torch.device(device)
         self.bfloat16 = precision == "bfloat16" or (
             precision == "auto" and self.device.type == "cuda"
         )
         self.model = _to_device(
             EncoderWithClassifier(config, locations, joint_bn), self.device, sync_bn
         )
+        backbone = self.model.encoder.backbone
+        self.objective = _to_device(
+            Objective(
+                losses or LossWeights(), config, backbone.channels, backbone.stride, locations
+            ),
+            self.device,
+            sync_bn,
+        )
         self.discriminator: ViewDiscriminator | None = None
         if adversary:
-            discriminator = ViewDiscriminator(config, self.model.encoder.backbone.channels)
+            discriminator = ViewDiscriminator(config, backbone.channels)
             self.discriminator = _to_device(discriminator, self.device, sync_bn)
         for module in self.modules.values():
             module.train()
-        self.model.encoder.backbone.freeze(optimization.frozen_stages)
+        backbone.freeze(optimization.frozen_stages)
         self.compile_error = (
             None if compile_for is None else self._compile(config.image_size, compile_for)
         )
         "Why the networks are not compiled though compilation was requested."
         self._wrapped = wrap_ddp(self.model)
         self._discriminator = None if self.discriminator is None else wrap_ddp(self.discriminator)
-        self.optimizers = build_optimizers(self.model, self.discriminator, optimization)
+        learns = any(True for _ in self.objective.parameters())
+        self._objective = wrap_ddp(self.objective) if learns else self.objective
+        self.clip_value = optimization.clip_value
+        self._fitted = [*self.model.parameters(), *self.objective.parameters()]
+        self.optimizers = build_optimizers(
+            self.model, self.objective, self.discriminator, optimization
+        )
 
     @property
     def modules(self) -> dict[str, nn.Module]:
@@ -80,9 +92,11 @@ class Training:
             "encoder": self.model.encoder,
             "classifier": self.model.classifier,
         }
-        return named | (
-            {"discriminator": self.discriminator} if self.discriminator is not None else {}
-        )
+        if any(True for _ in self.objective.parameters()):
+            named["objective"] = self.objective
+        if self.discriminator is not None:
+            named["discriminator"] = self.discriminator
+        return named
 
     @property
     def learning_rates(self) -> dict[str, float]:
@@ -101,8 +115,9 @@ class Training:
         location2_B: Tensor,
         schedule: ScheduleState,
     ) -> dict[str, Tensor]:
-        """One iteration: D takes a step on Eq. 2, then encoder and classifier one on Eq. 4, to
-        which InfoNCE is added where `losses` says so: row i of both views is then one location.
+        """One iteration: D takes a step on Eq. 2, then encoder and classifier one on Eq. 4, where
+        the recipe's objective stands for Eq. 1. Where its losses compare the views row by row, row
+        i of both is one location.
 
         One encoder pass serves both steps; D gets both views in one batch, since BatchNorm over
         separate batches would erase the shift between the views that D learns from. Returns the
@@ -114,22 +129,7 @@ class Training:
                 group["lr"] = group["start"] * schedule.lr_scale
         with self._autocast():
             drone, satellite = self._wrapped(images1_B3HW, images2_B3HW)
-        located_VP = location_terms(
-            drone.logits_BPL, location1_B, satellite.logits_BPL, location2_B
-        )
-        location = located_VP.sum()
-        metrics = {"location_loss": location} | _by_view("location_loss", located_VP)
-        total = self.losses.location_weight * location
-        if self.losses.contrastive_weight:
-            contrastive = info_nce(
-                unit_embedding(drone.g_BPD.float()),
-                unit_embedding(satellite.g_BPD.float()),
-                location1_B,
-                self.losses.temperature,
-                self.losses.label_smoothing,
-            )
-            metrics["contrastive_loss"] = contrastive
-            total = total + self.losses.contrastive_weight * contrastive
+        total, metrics = self._objective(drone, location1_B, satellite, location2_B)
         if self.discriminator is not None:
             both_BCHW = torch.cat([drone.maps_BCHW, satellite.maps_BCHW])
             metrics |= self.discriminate(both_BCHW.detach(), len(drone.maps_BCHW))
@@ -141,16 +141,18 @@ class Training:
             adversarial_V = adversarial_terms(*verdict_B2.tensor_split([len(drone.maps_BCHW)]))
             adversarial = adversarial_V.sum()
             total = feature_loss(total, adversarial, schedule.alpha)
-            metrics |= {"adversarial_loss": adversarial} | _by_view(
+            metrics |= {"adversarial_loss": adversarial} | by_view(
                 "adversarial_loss", adversarial_V
             )
         self.optimizers[0].zero_grad(set_to_none=True)
-        total.backward()  # type: ignore[no-untyped-call]
+        total.backward()
         for name, module in (
             ("encoder", self.model.encoder),
             ("classifier", self.model.classifier),
         ):
             metrics[f"gradient_norm/{name}"] = gradient_norm(module)
+        if self.clip_value:
+            clip_grad_value_(self._fitted, self.clip_value)
         self.optimizers[0].step()
         return {name: metric.detach() for name, metric in metrics.items()}
 
@@ -172,8 +174,8 @@ class Training:
         return (
             {"view_loss": loss, "discriminator_accuracy": torch.cat(right_V).mean()}
             | {"gradient_norm/discriminator": norm}
-            | _by_view("view_loss", terms_V)
-            | _by_view(
+            | by_view("view_loss", terms_V)
+            | by_view(
                 "discriminator_accuracy", torch.stack([right_B.mean() for right_B in right_V])
             )
         )
@@ -246,15 +248,3 @@ def _to_device(module: Module, device: torch.device, sync_bn: bool) -> Module:
         device, memory_format=torch.channels_last
     )
     return placed
-
-
-def _by_view(name: str, terms: Tensor) -> dict[str, Tensor]:
-    """The terms of a metric by view (V,), and by ring where it has any (V, P)."""
-    if terms.dim() == 1:
-        return {f"{name}/{view}": term for view, term in zip(VIEWS, terms.unbind(), strict=True)}
-    rings = {
-        f"{name}/{view}/ring{ring}": term
-        for view, terms_P in zip(VIEWS, terms.unbind(), strict=True)
-        for ring, term in enumerate(terms_P.unbind(), start=1)
-    }
-    return _by_view(name, terms.sum(1)) | rings

@@ -19,6 +19,8 @@ class ViewOutput(NamedTuple):
 
     maps_BCHW: Tensor
     g_BPD: Tensor
+    dropped_BPD: Tensor
+    "After the dropout that the classifier draws: what metric losses compare [FSRA]."
     logits_BPL: Tensor
 
 
@@ -41,13 +43,15 @@ class EncoderWithClassifier(nn.Module):
         if self.joint_bn:
             count = len(images1_B3HW)
             maps_BCHW, g_BPD = self.encoder(torch.cat([images1_B3HW, images2_B3HW]))
-            both = ViewOutput(maps_BCHW, g_BPD, self.classifier(g_BPD))
+            both = self._classify(maps_BCHW, g_BPD)
             return (
                 ViewOutput(*(tensor[:count] for tensor in both)),
                 ViewOutput(*(tensor[count:] for tensor in both)),
             )
         outputs = [self.encoder(images_B3HW) for images_B3HW in (images1_B3HW, images2_B3HW)]
-        first, second = (
-            ViewOutput(maps_BCHW, g_BPD, self.classifier(g_BPD)) for maps_BCHW, g_BPD in outputs
-        )
+        first, second = (self._classify(maps_BCHW, g_BPD) for maps_BCHW, g_BPD in outputs)
         return first, second
+
+    def _classify(self, maps_BCHW: Tensor, g_BPD: Tensor) -> ViewOutput:
+        dropped_BPD = self.classifier.dropout(g_BPD)
+        return ViewOutput(maps_BCHW, g_BPD, dropped_BPD, self.classifier.classify(dropped_BPD))

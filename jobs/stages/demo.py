@@ -23,7 +23,7 @@ from jobs.stages.evaluation_tables import print_table
 from jobs.stages.locate import locate_photos
 from jobs.stages.settings import CalibrateSettings, DemoSettings, LocateSettings
 from jobs.training.driver import train
-from jobs.training.recipes import finetune
+from jobs.training.recipes.builtin import finetune
 from jobs.training.settings import TrainSettings
 from model.weights.builtin import BUILTIN
 from pipeline.core import cluster, storage

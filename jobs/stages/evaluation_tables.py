@@ -8,8 +8,8 @@ from rich import box
 from rich.table import Table
 
 from pipeline.core.progress import results
-from pipeline.evaluation.compare import PUBLISHED_ABLATION, PUBLISHED_TABLE
 from pipeline.evaluation.evaluate import evaluate
+from pipeline.evaluation.published import PUBLISHED_ABLATION, PUBLISHED_TABLE
 from pipeline.evaluation.settings import EvaluationSettings
 from pipeline.report.inputs import read_extras
 from pipeline.report.tasks import METRIC_LABELS

@@ -9,7 +9,8 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from jobs.training.recipes import RECIPES, Recipe
+from jobs.training.recipes import RECIPES
+from jobs.training.recipes.recipe import Recipe
 from pipeline.core.progress import console
 
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import tyro
 
 from jobs.command_line.config import Choice
-from jobs.training.recipes import RECIPES, Recipe
+from jobs.training.recipes import RECIPES
+from jobs.training.recipes.recipe import Recipe
 from model.backbones import HUB_PREFIX
 from pipeline.core import storage
 from pipeline.core.errors import require

@@ -11,6 +11,8 @@ BACKBONES: dict[str, str] = {
     "resnet34": "model.backbones.resnet:ResNet",
     "resnet50": "model.backbones.resnet:ResNet",
     "resnet101": "model.backbones.resnet:ResNet",
+    "resnet18_usam": "model.backbones.usam:ResNetUSAM",
+    "resnet50_usam": "model.backbones.usam:ResNetUSAM",
     "efficientnet_lite0": "model.backbones.efficientnet_lite:EfficientNetLite",
     "efficientnet_lite2": "model.backbones.efficientnet_lite:EfficientNetLite",
     "vit_small": "model.backbones.huggingface:ViT",
@@ -18,7 +20,9 @@ BACKBONES: dict[str, str] = {
     "dinov2_small": "model.backbones.huggingface:DINOv2",
     "dinov2_base": "model.backbones.huggingface:DINOv2",
     "dinov3_small": "model.backbones.huggingface:DINOv3",
+    "vit_small_fsra": "model.backbones.vit:FSRAViT",
     "convnext_tiny": "model.backbones.huggingface:ConvNeXt",
+    "convnext_base": "model.backbones.huggingface:ConvNeXt",
     "swin_tiny": "model.backbones.huggingface:Swin",
 }
 """Module and class by the backbone's name. A name and not the class: command lines list the

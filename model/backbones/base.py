@@ -38,6 +38,8 @@ class Backbone(nn.Module):
     "Patterns of this module's tensor names -> the names in public weights; empty where they agree."
     foreign_extra: ClassVar[tuple[str, ...]]
     "Beginnings of names in public weights that this module has no use for, such as a classifier's."
+    added: ClassVar[tuple[str, ...]] = ()
+    "Beginnings of its own names that public weights lack: they keep their values at the start."
     loads_folders: ClassVar[bool] = False
     "Public weights come as a folder or by the hub's name (`load_pretrained`), not as one file."
     has_token: ClassVar[bool] = False
@@ -71,6 +73,10 @@ class Backbone(nn.Module):
         Raises CheckpointError. Only for classes with `loads_folders`.
         """
         raise NotImplementedError
+
+    def adapt(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """A public state dict with the shapes of this backbone; as it is, for most."""
+        return state
 
     def check_size(self, height: int, width: int) -> None:
         """Raise ValueError for images of a size that this backbone cannot take; most take any."""

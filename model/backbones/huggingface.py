@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self
 from torch import Tensor, nn
 
 from model.backbones import HUB_PREFIX
-from model.backbones.base import Backbone
+from model.backbones.base import Backbone, Features
 from model.errors import MissingLibrary
 from model.inference.torchao_logs import filter_torchao_logs
 from model.weights.pretrained import read_pretrained
@@ -97,15 +97,20 @@ class HuggingFaceBackbone(Backbone):
         No gradient reaches frozen stages: nothing before them or in them asks for one. Raises
         ValueError as `check_size` does.
         """
+        return self.features(images_B3HW).maps_BCHW
+
+    def features(self, images_B3HW: Tensor) -> Features:
+        """Maps as `forward`'s, and the class token of networks that have one."""
         height, width = images_B3HW.shape[2:]
         self.check_size(height, width)
         found: Tensor = self.network(images_B3HW, **self.call_options).last_hidden_state
         if found.dim() == 4:
-            return found
+            return Features(found, None)
         rows, columns = height // self.stride, width // self.stride
         patches_BNC = found[:, found.shape[1] - rows * columns :]  # after class and registers
         cells_BHWC = patches_BNC.reshape(patches_BNC.shape[0], rows, columns, self.channels)
-        return cells_BHWC.permute(0, 3, 1, 2)
+        token_BC = found[:, 0] if self.has_token else None
+        return Features(cells_BHWC.permute(0, 3, 1, 2), token_BC)
 
     def load_pretrained(self, source: str) -> None:
         """Load a folder of `save_pretrained`, or `hf:OWNER/NAME` from the hub.
@@ -124,6 +129,7 @@ class ViT(HuggingFaceBackbone):
     """Vision Transformer with patches of 16 pixels (Dosovitskiy, arXiv 2010.11929)."""
 
     stride = 16
+    has_token = True
     mean, std = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)  # as its public weights were trained
     model_class = "ViTModel"
     model_options: ClassVar[dict[str, Any]] = {"add_pooling_layer": False}
@@ -149,6 +155,7 @@ class DINOv2(HuggingFaceBackbone):
     """ViT with patches of 14 pixels, trained without labels (Oquab, arXiv 2304.07193)."""
 
     stride = 14
+    has_token = True
     mean, std = IMAGENET
     model_class = "Dinov2Model"
     sizes: ClassVar[dict[str, dict[str, Any]]] = {
@@ -176,6 +183,7 @@ class DINOv3(HuggingFaceBackbone):
     """
 
     stride = 16
+    has_token = True
     mean, std = IMAGENET
     model_class = "DINOv3ViTModel"
     sizes: ClassVar[dict[str, dict[str, Any]]] = {
@@ -201,8 +209,14 @@ class ConvNeXt(HuggingFaceBackbone):
         "convnext_tiny": {
             "hidden_sizes": [96, 192, 384, 768], "depths": [3, 3, 9, 3], "patch_size": 4,
         },
+        "convnext_base": {
+            "hidden_sizes": [128, 256, 512, 1024], "depths": [3, 3, 27, 3], "patch_size": 4,
+        },
     }  # fmt: skip
-    hub_names: ClassVar[dict[str, str]] = {"convnext_tiny": "facebook/convnext-tiny-224"}
+    hub_names: ClassVar[dict[str, str]] = {
+        "convnext_tiny": "facebook/convnext-tiny-224",
+        "convnext_base": "facebook/convnext-base-384-22k-1k",
+    }
     parts = (("embeddings",), "encoder.stages", ())
     unused = ("layernorm.weight", "layernorm.bias")
 

@@ -124,6 +124,12 @@ class ResNet(Backbone):
     @classmethod
     def build(cls, name: str, width: float) -> Self:
         """One of `LAYOUTS`. Raises ValueError for a width with too few or too many channels."""
+        cls.require_width(name, width)
+        return cls(name, width)
+
+    @staticmethod
+    def require_width(name: str, width: float) -> None:
+        """Raise ValueError for a width with too few or too many channels."""
         # Channels that leave layer1 and enter the first strided shortcut.
         channels = round(64 * width) * LAYOUTS[name][0].expansion
         if channels < MIN_CHANNELS:
@@ -136,7 +142,6 @@ class ResNet(Backbone):
                 f"width is {width}, which gives layer1 of {name} {channels} channels; expected at "
                 f"most {MAX_CHANNELS}; use a smaller width"
             )
-        return cls(name, width)
 
     @classmethod
     def infer(cls, state: dict[str, Tensor]) -> tuple[str, float]:

@@ -11,7 +11,7 @@ def info_nce(
     drone_BE: Tensor,
     satellite_BE: Tensor,
     location_B: Tensor,
-    temperature: float,
+    temperature: float | Tensor,
     label_smoothing: float,
 ) -> Tensor:
     """Symmetric InfoNCE: the mean of the cross-entropies of picking a row's partner among all rows

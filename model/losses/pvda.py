@@ -25,7 +25,9 @@ def location_terms(
     logits1_BPL: Tensor, location1_B: Tensor, logits2_BPL: Tensor, location2_B: Tensor
 ) -> Tensor:
     """The terms of Eq. 1 (V, P): cross-entropy by view and ring, mean over the view's images."""
-    return torch.stack([_by_ring(logits1_BPL, location1_B), _by_ring(logits2_BPL, location2_B)])
+    return torch.stack(
+        [location_by_part(logits1_BPL, location1_B), location_by_part(logits2_BPL, location2_B)]
+    )
 
 
 def view_loss(verdict1_B2: Tensor, verdict2_B2: Tensor) -> Tensor:
@@ -55,7 +57,8 @@ def feature_loss(location: Tensor, adversarial: Tensor, alpha: float) -> Tensor:
     return location + alpha * adversarial
 
 
-def _by_ring(logits_BPL: Tensor, location_B: Tensor) -> Tensor:
+def location_by_part(logits_BPL: Tensor, location_B: Tensor) -> Tensor:
+    """Cross-entropy of one view's locations by part, the mean over its images (P,)."""
     # In float32 whatever precision the networks computed in: a softmax over many locations needs
     # all of its bits.
     parts = logits_BPL.shape[1]

@@ -9,5 +9,10 @@ compared. Begin with `base.py`, then read `ring_pooling.py`.
 
 POOLINGS: dict[str, str] = {
     "rings": "model.parts.ring_pooling:Rings",
+    "mean": "model.parts.global_pooling:Mean",
+    "gem": "model.parts.global_pooling:GeM",
+    "heat_regions": "model.parts.heat_regions:HeatRegions",
+    "cross_gates": "model.parts.cross_gates:CrossGates",
+    "attended_rings": "model.parts.ring_attention:AttendedRings",
 }
 "Module and class by name: command lines list them without loading torch."

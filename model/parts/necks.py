@@ -9,7 +9,7 @@ from torch import nn
 from model.config import Neck
 
 
-def build_neck(kind: Neck, channels: int, part_dim: int) -> nn.Module:
+def build_neck(kind: Neck, channels: int, part_dim: int) -> nn.Sequential | nn.LayerNorm:
     """A neck, initialised as published. Raises ValueError where it cannot change C to D."""
     if kind == "norm":
         if part_dim != channels:

@@ -124,10 +124,11 @@ def load_backbone(backbone: Backbone, state: dict[str, Tensor], name: str) -> No
     }
     load_renamed(
         backbone,
-        given,
+        backbone.adapt(given),
         f"{name} does not fit this backbone",
         "choose the --backbone that it was made for",
         backbone.foreign_names,
+        backbone.added,
     )
 
 
@@ -144,20 +145,23 @@ def load_renamed(
     complaint: str,
     remedy: str,
     foreign_names: Mapping[str, str],
+    added: tuple[str, ...] = (),
 ) -> None:
     """Load `given` where its names and shapes are exactly the module's, each renamed by
     `foreign_names`.
 
-    Only BatchNorm's count of its batches may be missing: files from before it was counted have
-    none, and nothing that we compute depends on it. Raises CheckpointError that lists everything
-    else, by its foreign name.
+    What may be missing: names that begin with one of `added`, and BatchNorm's count of its batches:
+    files from before it was counted have none, and nothing that we compute depends on it. Raises
+    CheckpointError that lists everything else, by its foreign name.
     """
     state = module.state_dict()
     own = {rename(key, foreign_names): tensor for key, tensor in state.items()}
     wrong = [
         f"{key} is missing"
         for key in own
-        if key not in given and not key.endswith("num_batches_tracked")
+        if key not in given
+        and not key.endswith("num_batches_tracked")
+        and not key.startswith(added)
     ]
     wrong += [f"{key} is unexpected" for key in given if key not in own]
     wrong += [

@@ -6,7 +6,7 @@ The first run is the baseline. Runs are compared on the same queries, resampled 
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,12 @@ import pyarrow as pa
 
 from pipeline.core.arrays import Doubles
 from pipeline.core.errors import InputError
+from pipeline.evaluation.published import (
+    PUBLISHED_ABLATION,
+    PUBLISHED_MULTI_QUERY,
+    PUBLISHED_TABLE,
+    impossible_ap,
+)
 from pipeline.report.inputs import EvaluationResults, task_key
 from pipeline.retrieval.bootstrap import paired_difference
 from pipeline.retrieval.metrics import hits_at
@@ -21,55 +27,6 @@ from pipeline.retrieval.metrics import hits_at
 COMPARED_METRICS = ("r1", "ap")
 MAIN_TASKS = ("drone->satellite", "satellite->drone")
 TASK_HEADINGS = {"drone->satellite": "UAV to satellite", "satellite->drone": "satellite to UAV"}
-
-
-@dataclass(frozen=True, kw_only=True)
-class PublishedResult:
-    """One row of the paper's tables; R@1 and AP in percent."""
-
-    method: str
-    pixels: int
-    drone_to_satellite: tuple[float, float]
-    satellite_to_drone: tuple[float, float]
-
-    def for_task(self, task: str) -> tuple[float, float] | None:
-        """R@1 and AP of a task by its name; None if the paper has none."""
-        figures = {
-            "drone->satellite": self.drone_to_satellite,
-            "satellite->drone": self.satellite_to_drone,
-        }
-        return figures.get(task)
-
-
-def _published(method: str, pixels: int, *figures: float) -> PublishedResult:
-    a, b, c, d = figures
-    return PublishedResult(
-        method=method, pixels=pixels, drone_to_satellite=(a, b), satellite_to_drone=(c, d)
-    )
-
-
-PUBLISHED_TABLE = (
-    _published("Instance loss", 256, 58.49, 63.31, 71.18, 58.74),
-    _published("LPN", 256, 75.93, 79.14, 86.45, 74.79),
-    _published("USAM", 256, 77.60, 80.55, 86.59, 75.96),
-    _published("PCL", 256, 79.47, 83.63, 87.69, 78.51),
-    _published("FSRA", 256, 82.25, 84.82, 87.87, 81.53),
-    _published("MSBA", 256, 82.33, 84.78, 90.58, 81.61),
-    _published("PVDA", 256, 82.73, 85.19, 92.30, 82.48),
-    _published("Instance loss", 384, 62.99, 67.69, 75.75, 62.09),
-    _published("LCM", 384, 66.65, 70.82, 79.89, 65.38),
-    _published("LPN", 384, 78.02, 80.99, 86.16, 76.56),
-    _published("PCL", 384, 81.63, 85.46, 89.73, 80.84),
-    _published("FSRA", 384, 84.82, 87.03, 87.59, 83.37),
-    _published("MSBA", 384, 86.61, 88.55, 92.15, 84.45),
-    _published("PVDA", 384, 87.34, 89.26, 93.72, 86.04),
-)
-PUBLISHED_ABLATION = (
-    _published("PVDA, constant alpha", 256, 82.00, 84.55, 91.73, 81.96),
-    _published("PVDA, no restart", 256, 81.54, 84.09, 92.30, 81.05),
-)
-PUBLISHED_MULTI_QUERY = {256: (92.01, 98.00, 93.30), 384: (95.29, 98.43, 95.99)}
-"PVDA, drone->satellite with a location's images as one query: R@1, R@5, AP by image size."
 
 
 def compare(runs: Sequence[EvaluationResults]) -> list[dict[str, Any]]:
@@ -203,7 +160,9 @@ def _tables(
     for line in (*PUBLISHED_TABLE, *PUBLISHED_ABLATION) if published else ():
         figures = [line.for_task(task) or (None, None) for task in tasks]
         cells = ["-" if value is None else f"{value:.2f}" for pair in figures for value in pair]
-        lines.append([f"{line.method}, {line.pixels} px (published)", *cells])
+        gallery = ", gallery without distractors" if line.protocol == "queried-only" else ""
+        wrong = ", impossible" if impossible_ap(*line.drone_to_satellite) else ""
+        lines.append([f"{line.method}, {line.pixels} px (published{gallery}{wrong})", *cells])
     tables = [(f"Both directions, percent, {protocols}", heading, lines)]
     merged = {
         row["run"]: row for row in rows if row["multi_query"] and row["task"] == MAIN_TASKS[0]

@@ -19,7 +19,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from jobs.training.checkpoints import CheckpointWriter, list_archived
 from jobs.training.driver import train
-from jobs.training.recipes import Recipe, smoke
+from jobs.training.recipes.pvda import smoke
+from jobs.training.recipes.recipe import Recipe
 from jobs.training.settings import TrainSettings
 from model.checkpoint import Checkpoint, loads
 from model.training import Training

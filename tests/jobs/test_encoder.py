@@ -21,7 +21,7 @@ from jobs.encoding.probe_images import PROBE_IMAGES, ImageBytes, first_images
 from jobs.encoding.settings import EncoderSettings
 from jobs.stages.export_weights import export_weights
 from jobs.stages.settings import ExportWeightsSettings
-from jobs.training.recipes import smoke
+from jobs.training.recipes.pvda import smoke
 from jobs.training.settings import RunConfig
 from model.checkpoint import build_encoder, dumps, loads
 from model.inference.embed import embed

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from jobs.training.probes import embed_view, probe, view_gap
-from jobs.training.recipes import smoke
+from jobs.training.recipes.pvda import smoke
 from model.pvda import FeatureEncoder
 from pipeline.batches.settings import StreamConfig
 from pipeline.batches.training import TrainingStream

@@ -13,17 +13,17 @@ import torch
 from rich.console import Console
 
 from jobs.training.config_table import config_table, print_config
-from jobs.training.recipes import (
-    RECIPES,
-    Recipe,
+from jobs.training.recipes import RECIPES
+from jobs.training.recipes.lpn import lpn, lpn_pvda_rates
+from jobs.training.recipes.pvda import (
     alpha_zero,
     constant_alpha,
-    lpn,
     no_restart,
     paper,
     paper_384,
     smoke,
 )
+from jobs.training.recipes.recipe import Recipe
 from model.backbones.resnet import ResNet
 from model.checkpoint import loads
 from model.config import LossWeights, PVDAConfig
@@ -52,13 +52,25 @@ def test_recipes_are_listed_by_their_names() -> None:
     assert list(RECIPES) == [
         "paper",
         "paper_384",
-        "lpn",
         "constant_alpha",
         "no_restart",
         "alpha_zero",
         "smoke",
         "builtin",
         "finetune",
+        "instance_loss",
+        "lcm_style",
+        "lpn",
+        "lpn_pvda_rates",
+        "usam",
+        "usam_lpn",
+        "msba_style",
+        "fsra",
+        "fsra_3",
+        "mccg",
+        "sample4geo",
+        "dac",
+        "camp",
     ]
     assert all(make().name == name for name, make in RECIPES.items())
     assert all((make.__doc__ or "").splitlines()[0].endswith(".") for make in RECIPES.values())
@@ -78,14 +90,15 @@ def test_recipe_lpn_has_no_discriminator_and_120_epochs() -> None:
     rates = recipe.optimization
     assert (rates.optimizer, rates.backbone_lr, rates.head_lr, rates.classifier_lr) == (
         "sgd",
+        0.0001,
         0.001,
-        0.01,
-        0.01,
+        0.001,
     )
     assert recipe.schedule.epochs == 120
     scales = [schedule_at(recipe.schedule, epoch).lr_scale for epoch in range(120)]
     assert scales == pytest.approx([1.0] * 80 + [0.1] * 40)
-    assert differing(recipe) == {"schedule", "adversary"}
+    assert differing(recipe) == {"schedule", "adversary", "optimization"}
+    assert differing(lpn_pvda_rates()) == {"schedule", "adversary"}
 
 
 def test_recipe_constant_alpha_keeps_alpha_and_restarts() -> None:

@@ -9,7 +9,8 @@ import torch
 
 from jobs.training.checkpoints import CheckpointWriter, find_checkpoint
 from jobs.training.metrics import MetricAccumulator, NotFinite
-from jobs.training.recipes import Recipe, smoke
+from jobs.training.recipes.pvda import smoke
+from jobs.training.recipes.recipe import Recipe
 from jobs.training.settings import RunConfig, RunOptions
 from model.checkpoint import Checkpoint
 from model.errors import CheckpointError

@@ -19,7 +19,7 @@ import torch
 from PIL import Image
 
 from jobs import STOPPED
-from jobs.training.recipes import smoke
+from jobs.training.recipes.pvda import smoke
 from model.checkpoint import Checkpoint, dumps
 from model.pvda import FeatureEncoder
 from tests.launcher import Launcher

@@ -13,7 +13,7 @@ from jobs.command_line.cli import expand
 from jobs.train import main
 from jobs.training.checkpoints import read_checkpoint
 from jobs.training.driver import train
-from jobs.training.recipes import paper
+from jobs.training.recipes.pvda import paper
 from jobs.training.settings import RECIPE, RunConfig
 from jobs.training.state import WorkerContext
 from jobs.training.worker import train_worker

@@ -7,7 +7,8 @@ from pathlib import Path
 import torch
 
 from jobs.training.driver import train
-from jobs.training.recipes import Recipe, smoke
+from jobs.training.recipes.pvda import smoke
+from jobs.training.recipes.recipe import Recipe
 from jobs.training.settings import RunConfig, TrainSettings
 from jobs.training.state import WorkerContext, build_training, make_checkpoint, open_stream
 from model.checkpoint import dumps, loads

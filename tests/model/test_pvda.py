@@ -77,7 +77,9 @@ def test_discriminator_gives_one_verdict_per_image(cells: int, left: int) -> Non
 @torch.no_grad()
 def test_linear_neck_is_initialised_as_lpns() -> None:
     torch.manual_seed(0)
-    linear, norm = build_neck("linear", 2048, 512)
+    neck = build_neck("linear", 2048, 512)
+    assert isinstance(neck, nn.Sequential)
+    linear, norm = neck
     assert isinstance(linear, nn.Linear)
     assert isinstance(norm, nn.BatchNorm1d)
     assert float(linear.weight.std()) == pytest.approx(

@@ -100,7 +100,7 @@ def test_joint_bn_encodes_both_views_in_one_batch() -> None:
     torch.manual_seed(0)
     learner = EncoderWithClassifier(TINY, 3, joint_bn=True)
     images_B3HW = torch.randint(0, 256, (5, 3, 64, 64), dtype=torch.uint8)
-    (maps1, g1, logits1), (maps2, g2, logits2) = learner(images_B3HW[:2], images_B3HW[2:])
+    (maps1, g1, _, logits1), (maps2, g2, _, logits2) = learner(images_B3HW[:2], images_B3HW[2:])
     maps_BCHW, g_BPD = learner.encoder(images_B3HW)
     assert torch.equal(torch.cat([maps1, maps2]), maps_BCHW)
     assert torch.equal(torch.cat([g1, g2]), g_BPD)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jobs.training.driver import train
-from jobs.training.recipes import smoke
+from jobs.training.recipes.pvda import smoke
 from jobs.training.settings import TrainSettings
 from pipeline.batches.settings import StreamConfig
 from pipeline.batches.training import TrainingStream
