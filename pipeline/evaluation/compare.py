@@ -64,7 +64,7 @@ def compare(runs: Sequence[EvaluationResults]) -> list[dict[str, Any]]:
 def _differences(
     run: EvaluationResults, baseline: EvaluationResults, base: dict[str, Any]
 ) -> dict[str, Any]:
-    own, other = (_by_query(each, base) for each in (run, baseline))
+    own, other = (rows_by_query(each, base) for each in (run, baseline))
     if own["query"].to_pylist() != other["query"].to_pylist():
         raise InputError(
             f"{run.name} and {baseline.name} ranked different queries for {base['task']}; "
@@ -73,18 +73,22 @@ def _differences(
     locations_Q = np.asarray(other["location"].to_pylist(), np.str_)
     found: dict[str, Any] = {}
     for name in COMPARED_METRICS:
-        difference = paired_difference(_values(own, name), _values(other, name), locations_Q)
+        difference = paired_difference(
+            metric_by_query(own, name), metric_by_query(other, name), locations_Q
+        )
         found |= {f"{name}_difference_{key}": value for key, value in asdict(difference).items()}
     return found
 
 
-def _by_query(run: EvaluationResults, base: dict[str, Any]) -> pa.Table:
+def rows_by_query(run: EvaluationResults, base: dict[str, Any]) -> pa.Table:
+    """The queries of a metric row's task, sorted by key: query, location, first_match_rank, ap."""
     columns = ("query", "location", "first_match_rank", "ap")
     rows = [{name: row[name] for name in columns} for row in run.rows_for(base)]
     return pa.Table.from_pylist(sorted(rows, key=lambda row: str(row["query"])))
 
 
-def _values(table: pa.Table, name: str) -> Doubles:
+def metric_by_query(table: pa.Table, name: str) -> Doubles:
+    """Each query's `ap`, or whether it has a match at rank 1 (`r1`), (Q,)."""
     if name == "ap":
         return np.asarray(table["ap"].to_numpy(), np.float64)
     return hits_at(

@@ -1,0 +1,155 @@
+"""The benchmark of methods: one data set, and each method trained, embedded and evaluated on it.
+
+In: the methods' names and a budget. Out: a folder per method and seed, and the leaderboard. The
+stages are those of the other jobs, each of which keeps what is finished.
+"""
+
+from dataclasses import replace
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from jobs.encoding.encoder import make_encoder_spec, read_checkpoint_bytes
+from jobs.stages.benchmark_settings import BenchmarkSettings
+from jobs.training.driver import train
+from jobs.training.recipes import RECIPES
+from jobs.training.recipes.equal_budget import at_equal_budget
+from jobs.training.recipes.recipe import Recipe
+from jobs.training.settings import TrainSettings
+from model.checkpoint import build_encoder, loads
+from pipeline.core import cluster, storage
+from pipeline.core.progress import console, results
+from pipeline.core.records import Split, View
+from pipeline.evaluation.evaluate import evaluate
+from pipeline.evaluation.leaderboard import Cost, leaderboard, leaderboard_markdown
+from pipeline.evaluation.published import PUBLISHED_SINCE, PUBLISHED_TABLE
+from pipeline.evaluation.settings import EvaluationSettings
+from pipeline.features.embed import embed_gallery
+from pipeline.features.settings import EmbeddingSettings
+from pipeline.report.inputs import EvaluationResults, read_evaluation
+from pipeline.report.leaderboard import render_leaderboard
+from pipeline.shards.pack import pack
+from pipeline.shards.settings import PackingSettings
+from pipeline.shards.shard_set import open_shards
+from pipeline.simulation.settings import SimulationSettings
+from pipeline.simulation.simulate import simulate
+from pipeline.sources.university1652 import University1652
+
+
+def benchmark(settings: BenchmarkSettings) -> str:
+    """Train and judge every method that is not finished; returns the page's path."""
+    out = storage.absolute(settings.out)
+    cluster.connect()
+    shards = storage.absolute(settings.shards) if settings.shards else simulate_simu(settings, out)
+    evaluations: dict[str, list[EvaluationResults]] = {}
+    costs: dict[str, Cost] = {}
+    for seed in range(settings.seeds):
+        for method in settings.methods:
+            console.rule(f"{method}, seed {seed}", align="left")
+            recipe = recipe_of(method, seed, settings, shards)
+            evaluation, cost = train_and_judge(recipe, f"{method}-seed{seed}", shards, out)
+            evaluations.setdefault(method, []).append(evaluation)
+            costs.setdefault(method, cost)
+            page = write_leaderboard(settings, out, evaluations, costs)  # what is known by now
+    rows = leaderboard(evaluations, costs)
+    results.print(leaderboard_markdown(rows), soft_wrap=True)
+    print(f"leaderboard: {page}")
+    return page
+
+
+def simulate_simu(settings: BenchmarkSettings, out: str) -> str:
+    """SimU: simulated flights in University-1652's layout and by its protocol, packed."""
+    flights, shards = storage.join(out, "flights"), storage.join(out, "shards")
+    simulate(
+        SimulationSettings(
+            out=flights,
+            train_locations=settings.train_locations,
+            test_locations=settings.test_locations,
+            distractors=settings.distractors,
+            views=settings.views,
+            size=settings.size,
+            textures=settings.textures,
+            fill_with_towns=settings.textures is not None,
+        )
+    )
+    pack(University1652(), PackingSettings(root=flights, out=shards))
+    return shards
+
+
+def recipe_of(method: str, seed: int, settings: BenchmarkSettings, shards: str) -> Recipe:
+    """The method as published, or at the budget: whole epochs, at least one."""
+    recipe = RECIPES[method]()
+    if settings.published_sizes:
+        return replace(recipe, seed=seed)
+    manifest = open_shards(shards).manifest
+    images = sum(shard.samples for shard in manifest.of(Split.TRAIN, View.SATELLITE))
+    batch = at_equal_budget(recipe, recipe.schedule.epochs, seed).batch_size
+    of_an_epoch = 2 * batch * max(1, images // batch)
+    return at_equal_budget(recipe, max(1, round(settings.budget / of_an_epoch)), seed)
+
+
+def train_and_judge(
+    recipe: Recipe, name: str, shards: str, out: str
+) -> tuple[EvaluationResults, Cost]:
+    """Train, embed and evaluate one run; each keeps what is finished."""
+    run, table, judged = (
+        storage.join(out, folder, name) for folder in ("runs", "features", "evaluations")
+    )
+    options = TrainSettings(recipe=recipe, shards=shards, out=run, workers=0, probe_epochs=0)
+    checkpoint = train(options)
+    data = read_checkpoint_bytes(checkpoint)
+    for split in (Split.QUERY, Split.GALLERY):
+        embedding = EmbeddingSettings(shards=shards, out=table, split=split)
+        embed_gallery(embedding, make_encoder_spec(data, checkpoint, embedding))
+    evaluate(EvaluationSettings(table=table, out=judged, shards=shards, run=run, title=name))
+    return read_evaluation(judged), cost_of(data, checkpoint)
+
+
+def cost_of(data: bytes, name: str) -> Cost:
+    """What a trained encoder costs: its own size and work, and its training's."""
+    trained = loads(data, name)
+    encoder = build_encoder(trained)
+    side = trained.network.image_size
+    counter = FlopCounterMode(display=False)
+    with counter, torch.inference_mode():
+        encoder(torch.zeros(1, 3, side, side, dtype=torch.uint8))
+    seconds = sum(row["seconds"] for row in trained.history)
+    rates = [row["images_per_second"] for row in trained.history]
+    return Cost(
+        parameters=sum(parameter.numel() for parameter in encoder.parameters()),
+        gmac=counter.get_total_flops() / 2e9,
+        numbers=trained.network.embedding_dim,
+        images_per_second=sum(rates) / max(1, len(rates)),
+        minutes=seconds / 60,
+    )
+
+
+def write_leaderboard(
+    settings: BenchmarkSettings,
+    out: str,
+    evaluations: dict[str, list[EvaluationResults]],
+    costs: dict[str, Cost],
+) -> str:
+    """Write leaderboard.html, .md and .json; the page's path."""
+    rows = leaderboard(evaluations, costs)
+    terms = (
+        "each method's own network, rates, batch and whole schedule"
+        if settings.published_sizes
+        else f"{settings.budget:,} images a training, EfficientNet-Lite0 at 128 px from ImageNet's "
+        "weights, one optimizer, one batch and one augmentation for all"
+    )
+    data = settings.shards or (
+        f"SimU: simulated flights, {settings.train_locations} training places, "
+        f"{settings.test_locations} queried and {settings.distractors} distractors"
+    )
+    page = storage.join(out, "leaderboard.html")
+    text = render_leaderboard(
+        [row.as_dict() for row in rows],
+        published=[vars(one) for one in (*PUBLISHED_TABLE, *PUBLISHED_SINCE)],
+        data=data,
+        terms=terms,
+    )
+    storage.write_bytes(page, text.encode())
+    storage.write_bytes(storage.join(out, "leaderboard.md"), leaderboard_markdown(rows).encode())
+    storage.write_json(storage.join(out, "leaderboard.json"), [row.as_dict() for row in rows])
+    return page

@@ -1,0 +1,55 @@
+"""A method at a budget of images that two cores can bear, on one backbone, beside all others.
+
+In: a method's recipe. Out: a recipe with the method's parts, neck, losses, sampler, adversary and
+the shape of its schedule; backbone, start, optimizer, rates, batch and augmentation are the same
+for every method. What is compared is then the ingredients and not what each was tuned with.
+"""
+
+from dataclasses import replace
+
+import torch
+
+from jobs.training.recipes.builtin import builtin
+from jobs.training.recipes.recipe import Recipe
+from model.backbones.base import build_backbone
+
+PART_DIM, DISCRIMINATOR_CHANNELS = 256, 256
+"A quarter to a half of the published widths, as the backbone's is [chosen]."
+
+
+def at_equal_budget(recipe: Recipe, epochs: int, seed: int) -> Recipe:
+    """The method's recipe on the built-in encoder's terms, its schedule shrunk to `epochs`."""
+    terms = builtin()
+    network = replace(
+        recipe.network,
+        backbone=terms.network.backbone,
+        width=terms.network.width,
+        image_size=terms.network.image_size,
+        part_dim=PART_DIM,
+        discriminator_channels=DISCRIMINATOR_CHANNELS,
+    )
+    if network.neck == "norm":  # it keeps the backbone's channels
+        with torch.device("meta"):
+            channels = build_backbone(network.backbone, network.width).channels
+        network = replace(network, part_dim=channels)
+    own = recipe.schedule
+    share = epochs / own.epochs
+    schedule = replace(
+        own,
+        epochs=epochs,
+        period=max(1, round(own.period * share)),
+        decay_epochs=tuple(round(epoch * share) for epoch in own.decay_epochs),
+        warmup_epochs=own.warmup_epochs * share,
+    )
+    return replace(
+        recipe,
+        network=network,
+        schedule=schedule,
+        start=terms.start,
+        optimization=terms.optimization,
+        augmentation=terms.augmentation,
+        batch_size=terms.batch_size,
+        joint_bn=terms.joint_bn,
+        pair_repeats=1,
+        seed=seed,
+    )
