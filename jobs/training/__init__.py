@@ -1,6 +1,6 @@
 """Training: from shards and a recipe to a run's folder.
 
-In: TrainSettings (`settings.py`), with a recipe (`recipes.py`). Out: RUN/last.pt, metrics.jsonl,
+In: TrainSettings (`settings.py`), with a recipe (`recipes/`). Out: RUN/last.pt, metrics.jsonl,
 config.yaml and TensorBoard. A step is four calls deep: the driver (`driver.py`) validates the
 input and starts the workers, in this process or by Ray Train (`ray_group.py`); a worker
 (`worker.py`) runs the epochs; the loop (`loop.py`) takes an epoch's steps; `Training.step` is in

@@ -31,12 +31,12 @@ def test_equal_budget_keeps_ingredients_and_no_more() -> None:
     assert {recipe.network.backbone for recipe in shrunk.values()} == {"efficientnet_lite0"}
     assert shrunk["paper"].schedule.period == 5
     assert shrunk["lpn"].schedule.decay_epochs == (13,)
-    assert shrunk["sample4geo"].network.part_dim == 320
+    assert shrunk["sample4geo"].network.part_dim == 1280
 
 
 @pytest.mark.parametrize("methods", [("lpn",), ("lpn", "lpn"), ("lpn", "street")])
 def test_benchmark_refuses_methods_it_cannot_compare(methods: tuple[str, ...]) -> None:
-    with pytest.raises(InputError, match="--methods is lpn.*expected two or more different"):
+    with pytest.raises(InputError, match=r"--methods is lpn.*expected two or more different"):
         BenchmarkSettings(methods=methods)
 
 
@@ -59,7 +59,7 @@ def test_benchmark_writes_leaderboard_and_keeps_finished_runs(
     [baseline, other] = [row["tasks"][0] for row in rows]
     assert baseline["difference"] is None
     assert other["difference"]["mean"] == pytest.approx(other["r1"] - baseline["r1"])
-    assert rows[1]["cost"]["numbers"] == 320
+    assert rows[1]["cost"]["numbers"] == 1280
     assert 0 < rows[0]["cost"]["gmac"] < 1
     text = page.read_text()
     assert "sample4geo" in text
