@@ -37,8 +37,8 @@ def without(**changes: float | bool) -> Callable[[Recipe], Recipe]:
     """A recipe with other settings of its augmentation."""
 
     def change(recipe: Recipe) -> Recipe:
-        augmentation: Augmentation = replace(recipe.augmentation, **changes)  # type: ignore[arg-type]
-        return replace(recipe, augmentation=augmentation)
+        settings = vars(recipe.augmentation) | changes
+        return replace(recipe, augmentation=Augmentation(**settings))
 
     return change
 
