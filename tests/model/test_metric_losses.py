@@ -46,7 +46,8 @@ def test_triplet_equals_loop_over_anchors(labels2: list[int]) -> None:
 def test_triplet_of_equal_views_has_finite_gradients() -> None:
     g_BPD = torch.randn(3, 2, 4, requires_grad=True)
     labels_B = torch.arange(3)
-    cross_view_triplet(g_BPD, labels_B, g_BPD, labels_B, 0.3).backward()  # type: ignore[no-untyped-call]
+    loss = cross_view_triplet(g_BPD, labels_B, g_BPD, labels_B, 0.3)
+    loss.backward()  # type: ignore[no-untyped-call]
     assert g_BPD.grad is not None
     assert bool(g_BPD.grad.isfinite().all())
 
