@@ -1,8 +1,8 @@
 """Public weights as a checkpoint.
 
-In: a torchvision ResNet's state dict, or that of a three_view_net of the public LPN code. Out: a
-checkpoint that jobs/embed_gallery.py takes. The backbone, its width, the rings and the numbers per
-ring are read off the file.
+In: a torchvision ResNet's state dict, or that of LPN's, FSRA's or Sample4Geo's public code. Out: a
+checkpoint that jobs/embed_gallery.py takes. The backbone, its size, the parts and the numbers per
+part are read off the file.
 """
 
 import hashlib
@@ -17,8 +17,10 @@ from model.checkpoint import Checkpoint, dumps, loads
 from model.config import PVDAConfig
 from model.errors import CheckpointError
 from model.pvda import FeatureEncoder
+from model.weights.fsra import convert_fsra
 from model.weights.load import TORCHVISION_HINT, infer_backbone, load_backbone, parse_state_dict
 from model.weights.lpn import convert_lpn
+from model.weights.sample4geo import convert_sample4geo
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.progress import console
@@ -30,11 +32,7 @@ def import_weights(settings: ImportWeightsSettings) -> str:
     Raises InputError or CheckpointError on unusable input.
     """
     if not storage.exists(settings.source):
-        expected = (
-            TORCHVISION_HINT
-            if settings.kind == "torchvision"
-            else "the net_*.pth of a training run of the LPN code"
-        )
+        expected = EXPECTED[settings.kind]
         raise InputError(f"no weights at {settings.source}; expected {expected}")
     if storage.is_folder(settings.source):
         raise InputError(
@@ -44,18 +42,16 @@ def import_weights(settings: ImportWeightsSettings) -> str:
     made_of = {
         "kind": settings.kind,
         "sha256": hashlib.sha256(data).hexdigest(),
-        "image_size": settings.image_size,
+        "image_size": settings.side,
     }
     out = storage.absolute(settings.out)
     if storage.exists(out):
         require_same_origin(out, made_of)
         console.print(f"{out} is complete: made of {settings.source}; nothing to do")
         return out
-    convert: Callable[..., Checkpoint] = (
-        from_torchvision if settings.kind == "torchvision" else from_lpn
-    )
     try:
-        checkpoint = convert(parse_state_dict(data, settings.source), settings, made_of)
+        state = parse_state_dict(data, settings.source)
+        checkpoint = CONVERTERS[settings.kind](state, settings, made_of)
     except CheckpointError:
         raise
     except ValueError as error:  # a size that the network cannot have
@@ -88,7 +84,7 @@ def from_torchvision(
     no classifier.
     """
     backbone, width = infer_backbone(state, settings.source)
-    network = PVDAConfig(backbone=backbone, width=width, image_size=settings.image_size)
+    network = PVDAConfig(backbone=backbone, width=width, image_size=settings.side)
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(0)  # the same file gives the same embeddings
         encoder = FeatureEncoder(network)
@@ -103,17 +99,39 @@ def from_lpn(
     state: dict[str, Tensor], settings: ImportWeightsSettings, made_of: dict[str, Any]
 ) -> Checkpoint:
     """LPN's encoder and classifier."""
-    converted = convert_lpn(state, settings.source, settings.image_size)
+    converted = convert_lpn(state, settings.source, settings.side)
     if converted.left_out:
         console.print(f"{converted.left_out} is left out: LPN's backbone of street and web images")
     console.print(
         "taken as trained with stride 1 and average pooling; LPN's opts.yaml says whether it was"
     )
-    # Named by number: the file has no names. LPN numbers its training folders in the order of their
-    # names.
-    digits = len(str(converted.locations - 1))
-    names = [f"unnamed-{number:0{digits}}" for number in range(converted.locations)]
+    names = unnamed(converted.locations)
     return make_checkpoint(converted.network, converted.modules, names, made_of)
+
+
+def from_fsra(
+    state: dict[str, Tensor], settings: ImportWeightsSettings, made_of: dict[str, Any]
+) -> Checkpoint:
+    """FSRA's encoder and classifier."""
+    converted = convert_fsra(state, settings.source, settings.side)
+    names = unnamed(converted.locations)
+    return make_checkpoint(converted.network, converted.modules, names, made_of)
+
+
+def from_sample4geo(
+    state: dict[str, Tensor], settings: ImportWeightsSettings, made_of: dict[str, Any]
+) -> Checkpoint:
+    """Sample4Geo's encoder; it has no classifier."""
+    converted = convert_sample4geo(state, settings.source, settings.side)
+    return make_checkpoint(converted.network, converted.modules, [], made_of)
+
+
+def unnamed(locations: int) -> list[str]:
+    """Names by number: the files have none. Training folders are numbered in the order of their
+    names.
+    """
+    digits = len(str(locations - 1))
+    return [f"unnamed-{number:0{digits}}" for number in range(locations)]
 
 
 def make_checkpoint(
@@ -130,3 +148,18 @@ def make_checkpoint(
         history=[],
         state={"modules": modules},
     )
+
+
+CONVERTERS: dict[str, Callable[..., Checkpoint]] = {
+    "torchvision": from_torchvision,
+    "lpn": from_lpn,
+    "fsra": from_fsra,
+    "sample4geo": from_sample4geo,
+}
+EXPECTED = {
+    "torchvision": TORCHVISION_HINT,
+    "lpn": "the net_*.pth of a training run of the LPN code",
+    "fsra": "the net_*.pth of a training run of the FSRA code",
+    "sample4geo": "the weights_*.pth of a training run of the Sample4Geo code",
+}
+"What a kind of weights is read from."

@@ -2,7 +2,7 @@
 so that the command line is parsed at once."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import tyro
 
@@ -194,23 +194,39 @@ class ImportWeightsSettings:
     "State dict of torchvision's ResNet-18, 34, 50 or 101 (.pth or .safetensors)."
     lpn: str | None = None
     "State dict of LPN's three_view_net (its net_119.pth), trained with --share and --stride=1."
-    image_size: int = 256
-    "Side of the network's input images in pixels: `h` in LPN's opts.yaml."
+    fsra: str | None = None
+    "State dict of FSRA's two_view_net (its net_119.pth)."
+    sample4geo: str | None = None
+    "State dict of Sample4Geo's TimmModel, a ConvNeXt of timm (its weights_*.pth)."
+    image_size: int | None = None
+    """Side of the network's input images in pixels: `h` in LPN's opts.yaml. By default 256, for
+    Sample4Geo 384."""
 
     def __post_init__(self) -> None:
-        if (self.torchvision is None) == (self.lpn is None):
-            given = "neither" if self.lpn is None else "both"
-            raise InputError(f"{given} of --torchvision and --lpn given, expected one of them")
+        if len(self._given) != 1:
+            flags = ", ".join(f"--{kind}" for kind in self.KINDS)
+            found = " and ".join(f"--{kind}" for kind in self._given) or "none"
+            raise InputError(f"{found} given, expected one of {flags}")
+
+    KINDS: ClassVar[tuple[str, ...]] = ("torchvision", "lpn", "fsra", "sample4geo")
+    "What can be imported: flags."
+
+    @property
+    def _given(self) -> dict[str, str]:
+        flags = {kind: getattr(self, kind) for kind in self.KINDS}
+        return {kind: path for kind, path in flags.items() if path is not None}
 
     @property
     def kind(self) -> str:
-        return "torchvision" if self.lpn is None else "lpn"
+        return next(iter(self._given))
 
     @property
     def source(self) -> str:
-        source = self.lpn if self.torchvision is None else self.torchvision
-        assert source is not None
-        return source
+        return self._given[self.kind]
+
+    @property
+    def side(self) -> int:
+        return self.image_size or (384 if self.kind == "sample4geo" else 256)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -77,7 +77,7 @@ WRONG: list[tuple[str, list[str], str]] = [
     ),
     ("import_weights", ["--torchvision", "{}/none.pth", "--out", "{}/o"], "no weights at"),
     ("import_weights", ["--lpn", __file__, "--out", "{}/o"], "is no state dict"),
-    ("import_weights", ["--out", "{}/o"], "neither of --torchvision and --lpn"),
+    ("import_weights", ["--out", "{}/o"], "none given, expected one of --torchvision"),
     (
         "export_weights",
         ["--checkpoint", "{}/none.pt", "--out", "{}/o.safetensors"],

@@ -18,7 +18,7 @@ from tests.jobs.tiny_runs import settings
 
 METHODS = (
     "instance_loss", "lcm_style", "lpn", "usam", "usam_lpn", "msba_style", "fsra", "mccg",
-    "sample4geo", "dac", "camp",
+    "sample4geo", "dac", "camp", "qdfl",
 )  # fmt: skip
 LOSSES = {
     "msba_style": {"kl_loss"},
@@ -27,6 +27,7 @@ LOSSES = {
     "sample4geo": {"contrastive_loss"},
     "dac": {"contrastive_loss", "alignment_loss", "gates_loss"},
     "camp": {"contrastive_loss", "regions_loss"},
+    "qdfl": {"similarity_loss", "js_loss"},
 }
 "Besides the location loss."
 
@@ -34,6 +35,7 @@ LOSSES = {
 def small(recipe: Recipe) -> Recipe:
     """The published network on the smallest images that it can divide, two images a view."""
     side = 64 if recipe.network.pooling == "mean" and recipe.sampler == "independent" else 128
+    side = 112 if "dinov2" in recipe.network.backbone else side  # patches of 14
     return replace(recipe, network=replace(recipe.network, image_size=side), batch_size=2)
 
 

@@ -71,6 +71,7 @@ def test_recipes_are_listed_by_their_names() -> None:
         "sample4geo",
         "dac",
         "camp",
+        "qdfl",
     ]
     assert all(make().name == name for name, make in RECIPES.items())
     assert all((make.__doc__ or "").splitlines()[0].endswith(".") for make in RECIPES.values())

@@ -265,9 +265,9 @@ def test_import_weights_finished_is_a_no_op(
 
 def test_import_weights_wrong_call_names_the_remedy(tmp_path: Path) -> None:
     out = str(tmp_path / "o.pt")
-    with pytest.raises(InputError, match="neither of --torchvision and --lpn given"):
+    with pytest.raises(InputError, match="none given, expected one of --torchvision, --lpn"):
         ImportWeightsSettings(out=out)
-    with pytest.raises(InputError, match="both of --torchvision and --lpn given"):
+    with pytest.raises(InputError, match="--torchvision and --lpn given, expected one of"):
         ImportWeightsSettings(out=out, torchvision="a", lpn="b")
     with pytest.raises(
         InputError, match=r"no weights at .*none\.pth; expected .*torchvision\.models\.resnet50"

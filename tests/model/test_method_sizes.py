@@ -16,8 +16,9 @@ PUBLISHED = {
     "usam_lpn": 29_146_932 + 4,
     "fsra": 51_048_948,
     "mccg": 30_083_423,
+    "qdfl": 22_288_305,
 }
-"Encoder and location classifier of 701 places."
+"Encoder and location classifier of 701 places; of QDFL what is trained."
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -26,6 +27,14 @@ def test_method_has_the_published_parameters(name: str) -> None:
         model = EncoderWithClassifier(RECIPES[name]().network, LOCATIONS)
     trained = sum(p.numel() for p in model.parameters() if p.requires_grad)
     assert trained == PUBLISHED[name]
+
+
+def test_qdfl_freezes_its_trunk() -> None:
+    with torch.device("meta"):
+        model = EncoderWithClassifier(RECIPES["qdfl"]().network, LOCATIONS)
+    assert sum(p.numel() for p in model.parameters()) == 108_868_785
+    frozen = [name for name, p in model.named_parameters() if not p.requires_grad]
+    assert all(name.startswith("encoder.backbone.network.") for name in frozen)
 
 
 @pytest.mark.parametrize("name", ["sample4geo", "dac", "camp"])

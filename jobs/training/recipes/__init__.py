@@ -24,6 +24,7 @@ from jobs.training.recipes.pvda import (
     paper_384,
     smoke,
 )
+from jobs.training.recipes.qdfl import qdfl
 from jobs.training.recipes.recipe import Recipe
 from jobs.training.recipes.sample4geo import sample4geo
 from jobs.training.recipes.usam import usam, usam_lpn
@@ -52,5 +53,6 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
         sample4geo,
         dac,
         camp,
+        qdfl,
     )
 }
