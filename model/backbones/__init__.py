@@ -19,8 +19,6 @@ BACKBONES: dict[str, str] = {
     "vit_base": "model.backbones.huggingface:ViT",
     "dinov2_small": "model.backbones.huggingface:DINOv2",
     "dinov2_base": "model.backbones.huggingface:DINOv2",
-    "dinov2_small_qdfl": "model.backbones.adapters:AdaptedDINOv2",
-    "dinov2_base_qdfl": "model.backbones.adapters:AdaptedDINOv2",
     "dinov3_small": "model.backbones.huggingface:DINOv3",
     "vit_small_fsra": "model.backbones.vit:FSRAViT",
     "convnext_tiny": "model.backbones.huggingface:ConvNeXt",

@@ -13,7 +13,6 @@ POOLINGS: dict[str, str] = {
     "gem": "model.parts.global_pooling:GeM",
     "heat_regions": "model.parts.heat_regions:HeatRegions",
     "cross_gates": "model.parts.cross_gates:CrossGates",
-    "queries": "model.parts.query_pool:QueryPool",
     "attended_rings": "model.parts.ring_attention:AttendedRings",
 }
 "Module and class by name: command lines list them without loading torch."

@@ -15,7 +15,6 @@ from model.parts.base import build_pooling
 from model.parts.cross_gates import CrossGates
 from model.parts.global_pooling import generalised_mean
 from model.parts.heat_regions import HeatRegions, heat_regions
-from model.parts.query_pool import shift_channels
 from model.parts.ring_attention import AttendedRings
 from model.parts.ring_pooling import ring_average
 from model.pvda import FeatureEncoder
@@ -152,21 +151,6 @@ def test_usam_is_nine_times_the_difference_to_the_mean() -> None:
             weight = (9 * sums[:, row + 1, column + 1] - window.sum((1, 2))).relu()
             expected[:, :, row, column] *= 1 + weight[:, None]
     assert torch.allclose(module(maps_BCHW), expected, atol=1e-4)
-
-
-def test_shifted_channels_read_their_neighbours() -> None:
-    maps_BDHW = torch.arange(2 * 7 * 3 * 4).float().reshape(2, 7, 3, 4)
-    for axis in (2, 3):
-        found = shift_channels(maps_BDHW, axis)
-        for channel in range(7):
-            offset = (channel + 1) % 3 - 1
-            for row in range(3):
-                for column in range(4):
-                    at = [row, column]
-                    at[axis - 2] += offset
-                    inside = 0 <= at[0] < 3 and 0 <= at[1] < 4
-                    expected = maps_BDHW[:, channel, at[0], at[1]] if inside else torch.zeros(2)
-                    assert torch.equal(found[:, channel, row, column], expected)
 
 
 def test_token_pooling_needs_a_backbone_with_token() -> None:
