@@ -21,6 +21,8 @@ BACKBONES: dict[str, str] = {
     "dinov2_base": "model.backbones.huggingface:DINOv2",
     "dinov3_small": "model.backbones.huggingface:DINOv3",
     "vit_small_fsra": "model.backbones.vit:FSRAViT",
+    "dinov2_small_qdfl": "model.backbones.dinov2_adapters:DINOv2Adapters",
+    "dinov2_base_qdfl": "model.backbones.dinov2_adapters:DINOv2Adapters",
     "convnext_tiny": "model.backbones.huggingface:ConvNeXt",
     "convnext_base": "model.backbones.huggingface:ConvNeXt",
     "swin_tiny": "model.backbones.huggingface:Swin",

@@ -2,7 +2,8 @@
 
 In: normalised images (B, 3, H, W), sides a multiple of 16. Out: feature maps (B, 768, H/16, W/16)
 and the class token. From the public code (Dmmm1997/FSRA). Other transformers are in
-`huggingface.py`; this one scales its attention by the width and not by a head's, and drops paths.
+`huggingface.py`; this one scales its attention by the width and not by a head's, and drops paths. It
+shares `TokenBackbone` with `dinov2_adapters.py`.
 Shapes: B images, N tokens with the class token first, D numbers of a token, h x w cells.
 """
 
@@ -52,29 +53,31 @@ def resample_positions(positions_1ND: Tensor, height: int, width: int) -> Tensor
 
 
 class Attention(nn.Module):
-    """Multi-head self-attention without biases of queries, keys and values."""
+    """Multi-head self-attention."""
 
-    def __init__(self) -> None:
+    def __init__(self, dim: int, heads: int, *, bias: bool, scale: float) -> None:
+        """`scale` multiplies the products of queries and keys; `bias` is theirs and the values'."""
         super().__init__()
-        self.qkv = nn.Linear(DIM, 3 * DIM, bias=False)
-        self.proj = nn.Linear(DIM, DIM)
+        self.heads, self.scale = heads, scale
+        self.qkv = nn.Linear(dim, 3 * dim, bias=bias)
+        self.proj = nn.Linear(dim, dim)
 
     def forward(self, tokens_BND: Tensor) -> Tensor:
         """(B, N, D) -> (B, N, D)."""
-        count, length, _ = tokens_BND.shape
-        split = self.qkv(tokens_BND).reshape(count, length, 3, HEADS, DIM // HEADS)
+        count, length, dim = tokens_BND.shape
+        split = self.qkv(tokens_BND).reshape(count, length, 3, self.heads, dim // self.heads)
         query, key, value = split.permute(2, 0, 3, 1, 4)
-        mixed = F.scaled_dot_product_attention(query, key, value, scale=DIM**-0.5)
-        out: Tensor = self.proj(mixed.transpose(1, 2).reshape(count, length, DIM))
+        mixed = F.scaled_dot_product_attention(query, key, value, scale=self.scale)
+        out: Tensor = self.proj(mixed.transpose(1, 2).reshape(count, length, dim))
         return out
 
 
 class MLP(nn.Module):
     """Two linear layers with GELU between them."""
 
-    def __init__(self) -> None:
+    def __init__(self, dim: int, hidden: int) -> None:
         super().__init__()
-        self.fc1, self.fc2 = nn.Linear(DIM, MLP_DIM), nn.Linear(MLP_DIM, DIM)
+        self.fc1, self.fc2 = nn.Linear(dim, hidden), nn.Linear(hidden, dim)
 
     def forward(self, tokens_BND: Tensor) -> Tensor:
         """(B, N, D) -> (B, N, D)."""
@@ -90,7 +93,8 @@ class Block(nn.Module):
     def __init__(self, drop_path: float) -> None:
         super().__init__()
         self.norm1, self.norm2 = nn.LayerNorm(DIM, NORM_EPS), nn.LayerNorm(DIM, NORM_EPS)
-        self.attn, self.mlp, self.drop_path = Attention(), MLP(), drop_path
+        self.attn = Attention(DIM, HEADS, bias=False, scale=DIM**-0.5)
+        self.mlp, self.drop_path = MLP(DIM, MLP_DIM), drop_path
 
     def forward(self, tokens_BND: Tensor) -> Tensor:
         """(B, N, D) -> (B, N, D)."""
@@ -104,17 +108,53 @@ class Block(nn.Module):
         return path_BND * kept_B11 / (1 - self.drop_path)
 
 
-class FSRAViT(Backbone):
-    """48,031,488 parameters; stages are the embedding, each block, and the last norm."""
+class TokenBackbone(Backbone):
+    """A plain transformer of `embed`, `blocks` and `norm`, its class token first; its stages are
+    the embedding, each block, and the last norm.
+    """
 
-    stride = PATCH
-    mean, std = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
     foreign_names: ClassVar[dict[str, str]] = {
         r"embed\.proj": "patch_embed.proj", r"embed\.": "",
     }  # fmt: skip
-    foreign_extra = ("head.", "fc.", "dist")
+    mean, std = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
     has_token = True
     quantizable = False
+    embed: nn.Module
+    blocks: nn.ModuleList
+    norm: nn.LayerNorm
+
+    def check_size(self, height: int, width: int) -> None:
+        """Raises ValueError where a side is no multiple of the stride."""
+        for side in (height, width):
+            if side % self.stride or side < self.stride:
+                lower = max(side // self.stride, 1) * self.stride
+                raise ValueError(
+                    f"images have {side} pixels a side, expected a multiple of {self.stride}; set "
+                    f"--image-size {lower} or {lower + self.stride}"
+                )
+
+    def stages(self) -> list[list[nn.Module]]:
+        """The embedding, each block, the last norm."""
+        return [[self.embed], *([block] for block in self.blocks), [self.norm]]
+
+    def features(self, images_B3HW: Tensor) -> Features:
+        """Normalised images (B, 3, H, W) -> maps (B, D, h, w) and class token (B, D)."""
+        self.check_size(*images_B3HW.shape[2:])
+        height, width = (side // self.stride for side in images_B3HW.shape[2:])
+        tokens_BND = super().forward(images_B3HW)
+        cells_BDN = tokens_BND[:, 1:].transpose(1, 2)
+        return Features(cells_BDN.reshape(*cells_BDN.shape[:2], height, width), tokens_BND[:, 0])
+
+    def forward(self, images_B3HW: Tensor) -> Tensor:
+        """Normalised images (B, 3, H, W) -> maps (B, D, H/stride, W/stride)."""
+        return self.features(images_B3HW).maps_BCHW
+
+
+class FSRAViT(TokenBackbone):
+    """FSRA's transformer: 48,031,488 parameters."""
+
+    stride = PATCH
+    foreign_extra = ("head.", "fc.", "dist")
     channels = DIM
 
     def __init__(self) -> None:
@@ -154,29 +194,3 @@ class FSRAViT(Backbone):
         if (patches := state.get("patch_embed.proj.weight")) is not None and patches.dim() == 2:
             adapted["patch_embed.proj.weight"] = patches.reshape(-1, 3, PATCH, PATCH)
         return adapted
-
-    def check_size(self, height: int, width: int) -> None:
-        """Raises ValueError where a side is no multiple of 16."""
-        for side in (height, width):
-            if side % PATCH or side < PATCH:
-                lower = max(side // PATCH, 1) * PATCH
-                raise ValueError(
-                    f"images have {side} pixels a side, expected a multiple of {PATCH}; set "
-                    f"--image-size {lower} or {lower + PATCH}"
-                )
-
-    def stages(self) -> list[list[nn.Module]]:
-        """The embedding, each block, the last norm."""
-        return [[self.embed], *([block] for block in self.blocks), [self.norm]]
-
-    def features(self, images_B3HW: Tensor) -> Features:
-        """Normalised images (B, 3, H, W) -> maps (B, D, H/16, W/16) and class token (B, D)."""
-        self.check_size(*images_B3HW.shape[2:])
-        height, width = (side // PATCH for side in images_B3HW.shape[2:])
-        tokens_BND = super().forward(images_B3HW)
-        cells_BDN = tokens_BND[:, 1:].transpose(1, 2)
-        return Features(cells_BDN.reshape(*cells_BDN.shape[:2], height, width), tokens_BND[:, 0])
-
-    def forward(self, images_B3HW: Tensor) -> Tensor:
-        """Normalised images (B, 3, H, W) -> maps (B, D, H/16, W/16)."""
-        return self.features(images_B3HW).maps_BCHW

@@ -14,5 +14,6 @@ POOLINGS: dict[str, str] = {
     "heat_regions": "model.parts.heat_regions:HeatRegions",
     "cross_gates": "model.parts.cross_gates:CrossGates",
     "attended_rings": "model.parts.ring_attention:AttendedRings",
+    "queries": "model.parts.queries:Queries",
 }
 "Module and class by name: command lines list them without loading torch."

@@ -35,7 +35,7 @@ def config_of(pooling: str) -> PVDAConfig:
     return replace(TINY, pooling=pooling, parts=PARTS[pooling])
 
 
-@pytest.mark.parametrize("pooling", POOLINGS)
+@pytest.mark.parametrize("pooling", [name for name in POOLINGS if name != "queries"])
 def test_pooling_makes_parts_of_its_channels(pooling: str) -> None:
     made = build_pooling(config_of(pooling), 6)(torch.randn(2, 6, 8, 8), None)
     widths = [512, 512, 6, 512] if pooling == "queries" else [6] * PARTS[pooling]
@@ -154,6 +154,8 @@ def test_usam_is_nine_times_the_difference_to_the_mean() -> None:
 
 
 def test_token_pooling_needs_a_backbone_with_token() -> None:
+    with pytest.raises(ValueError, match=r"pooling queries takes a class token.*set --backbone"):
+        FeatureEncoder(replace(TINY, pooling="queries"))
     maps_BCHW, token_BC = FSRAViT().eval().features(torch.zeros(1, 3, 32, 48))
     assert maps_BCHW.shape == (1, 768, 2, 3)
     assert token_BC is not None
