@@ -2,8 +2,8 @@
 
 In: normalised images (B, 3, H, W), sides a multiple of 16. Out: feature maps (B, 768, H/16, W/16)
 and the class token. From the public code (Dmmm1997/FSRA). Other transformers are in
-`huggingface.py`; this one scales its attention by the width and not by a head's, and drops paths. It
-shares `TokenBackbone` with `dinov2_adapters.py`.
+`huggingface.py`; this one scales its attention by the width and not by a head's, and drops paths.
+`dinov2_adapters.py` shares its attention, MLP and `TokenBackbone`.
 Shapes: B images, N tokens with the class token first, D numbers of a token, h x w cells.
 """
 
