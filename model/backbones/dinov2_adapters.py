@@ -15,16 +15,16 @@ from torch import Tensor, nn
 
 from model.backbones.vit import MLP, NORM_EPS, Attention, TokenBackbone
 
-PATCH, GRID = 14, 37
-"GRID: positions a side, those of 518 px, at which DINOv2 was trained last."
-MLP_RATIO, DEPTH = 4, 12
+PATCH_SIDE, NATIVE_GRID = 14, 37
+"NATIVE_GRID: positions a side, those of 518 px, at which DINOv2 was trained last."
+MLP_RATIO, BLOCKS = 4, 12
 ADAPTER_SHRINK, ADAPTER_SCALE = 2, 0.2
 "An adapter has D / 2 numbers inside; that beside the MLP is multiplied by 0.2 [QDFL]."
-SIZES = {"dinov2_small_qdfl": (384, 6), "dinov2_base_qdfl": (768, 12)}
+DINOV2_SIZES = {"dinov2_small_qdfl": (384, 6), "dinov2_base_qdfl": (768, 12)}
 "D and heads of the networks."
 
 
-def resample_positions(positions_1ND: Tensor, height: int, width: int) -> Tensor:
+def resample_bicubic(positions_1ND: Tensor, height: int, width: int) -> Tensor:
     """Positions of a square grid, the class token's first, for another grid: bicubic by a factor
     of (cells + 0.1) / side, as DINOv2's code; the same where the grid is.
     """
@@ -37,7 +37,7 @@ def resample_positions(positions_1ND: Tensor, height: int, width: int) -> Tensor
     return torch.cat([positions_1ND[:, :1], resized_1Dhw.flatten(2).transpose(1, 2)], dim=1)
 
 
-class Embedding(nn.Module):
+class DINOv2Embedding(nn.Module):
     """Images -> tokens: patches, the class token before them, positions. The mask token is unused
     and stands here because public weights have it.
     """
@@ -46,8 +46,8 @@ class Embedding(nn.Module):
         super().__init__()
         self.cls_token = nn.Parameter(torch.zeros(1, 1, dim))
         self.mask_token = nn.Parameter(torch.zeros(1, dim))
-        self.pos_embed = nn.Parameter(torch.empty(1, 1 + GRID * GRID, dim))
-        self.proj = nn.Conv2d(3, dim, PATCH, PATCH)
+        self.pos_embed = nn.Parameter(torch.empty(1, 1 + NATIVE_GRID * NATIVE_GRID, dim))
+        self.proj = nn.Conv2d(3, dim, PATCH_SIDE, PATCH_SIDE)
         nn.init.trunc_normal_(self.pos_embed, std=0.02)
 
     def forward(self, images_B3HW: Tensor) -> Tensor:
@@ -55,7 +55,7 @@ class Embedding(nn.Module):
         cells_BDhw = self.proj(images_B3HW)
         patches_BND = cells_BDhw.flatten(2).transpose(1, 2)
         tokens_BND = torch.cat([self.cls_token.expand(len(patches_BND), -1, -1), patches_BND], 1)
-        return tokens_BND + resample_positions(self.pos_embed, *cells_BDhw.shape[2:])
+        return tokens_BND + resample_bicubic(self.pos_embed, *cells_BDhw.shape[2:])
 
 
 class LayerScale(nn.Module):
@@ -84,7 +84,7 @@ class Adapter(nn.Module):
         return out
 
 
-class Block(nn.Module):
+class AdaptedBlock(nn.Module):
     """DINOv2's block: adapter1 follows the attention and is added to it, adapter2 stands beside
     the MLP.
     """
@@ -112,16 +112,16 @@ class DINOv2Adapters(TokenBackbone):
     100,763,904 parameters.
     """
 
-    stride = PATCH
+    stride = PATCH_SIDE
     foreign_extra = ("head.",)
-    added = ("mask_token", *(f"blocks.{number}.adapter" for number in range(DEPTH)))
-    sizes: ClassVar[dict[str, tuple[int, int]]] = SIZES
+    added = ("mask_token", *(f"blocks.{number}.adapter" for number in range(BLOCKS)))
+    sizes: ClassVar[dict[str, tuple[int, int]]] = DINOV2_SIZES
 
     def __init__(self, name: str) -> None:
         super().__init__()
         self.channels, heads = self.sizes[name]
-        self.embed = Embedding(self.channels)
-        self.blocks = nn.ModuleList(Block(self.channels, heads) for _ in range(DEPTH))
+        self.embed = DINOv2Embedding(self.channels)
+        self.blocks = nn.ModuleList(AdaptedBlock(self.channels, heads) for _ in range(BLOCKS))
         self.norm = nn.LayerNorm(self.channels, NORM_EPS)
         for module in self.modules():
             if isinstance(module, nn.Linear):

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model.backbones.dinov2_adapters import DINOv2Adapters, resample_positions
+from model.backbones.dinov2_adapters import DINOv2Adapters, resample_bicubic
 from model.backbones.vit import FSRAViT
 from model.config import PVDAConfig
 from model.errors import CheckpointError
@@ -47,9 +47,9 @@ def test_qdfl_has_the_published_parameters() -> None:
 
 def test_positions_at_native_size_are_unchanged() -> None:
     positions = torch.randn(1, 1 + 37 * 37, 4)
-    assert resample_positions(positions, 37, 37) is positions
+    assert resample_bicubic(positions, 37, 37) is positions
     for cells in (16, 20):
-        found = resample_positions(positions, cells, cells)
+        found = resample_bicubic(positions, cells, cells)
         assert found.shape == (1, 1 + cells * cells, 4)
         assert torch.equal(found[:, 0], positions[:, 0])
 
