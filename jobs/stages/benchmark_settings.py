@@ -9,10 +9,9 @@ from pipeline.core.errors import InputError, require
 METHODS = (
     "alpha_zero", "paper", "constant_alpha", "no_restart", "instance_loss", "lcm_style", "lpn",
     "msba_style", "fsra", "mccg", "sample4geo", "dac", "camp",
-    "qdfl",
 )  # fmt: skip
-"""The control first: differences are to it. USAM is a part of ResNet: it has a row at published
-sizes only."""
+"""The control first: differences are to it. USAM is a part of ResNet, and QDFL takes a transformer's
+class token: they have rows at published sizes only."""
 
 
 @dataclass(frozen=True, kw_only=True)
