@@ -10,7 +10,7 @@ METHODS = (
     "alpha_zero", "paper", "constant_alpha", "no_restart", "instance_loss", "lcm_style", "lpn",
     "msba_style", "fsra", "mccg", "sample4geo", "dac", "camp",
 )  # fmt: skip
-"""The control first: differences are to it. USAM is a part of ResNet, and QDFL takes a transformer's
+"""The control first: differences are to it. USAM is a part of ResNet, QDFL takes a transformer's
 class token: they have rows at published sizes only."""
 
 
