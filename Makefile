@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 # Processes that share the tests, each with a Ray of its own; 0: this one alone.
-TEST_PROCESSES ?= 2
+TEST_PROCESSES ?= 0
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-fast check format bench chaos
