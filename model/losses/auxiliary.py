@@ -42,6 +42,7 @@ class AlignmentMaps(nn.Module):
 
     def forward(self, maps_BCHW: Tensor) -> Tensor:
         """Maps (B, C, H, W) -> (B, C + K, N); a channel's weights sum to one over the cells."""
+        maps_BCHW = maps_BCHW.float()  # they may come from networks in bfloat16
         logits_BKN = F.normalize(self.project(maps_BCHW), dim=1).flatten(2)
         return torch.cat([maps_BCHW.flatten(2), logits_BKN.softmax(2)], dim=1)
 
@@ -62,7 +63,7 @@ class GateHeads(nn.Module):
 
     def forward(self, maps_BCHW: Tensor, location_B: Tensor) -> Tensor:
         """The location loss of one view's maps, the mean over the parts."""
-        parts = self.pooling(maps_BCHW, None)
+        parts = self.pooling(maps_BCHW.float(), None)
         g_BPD = torch.stack([neck(part) for neck, part in zip(self.necks, parts, strict=True)], 1)
         return location_by_part(self.classifier(g_BPD), location_B).mean()
 

@@ -1,6 +1,6 @@
 """Every compared method trains: its network at its published size, its losses and its sampler."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +11,7 @@ from jobs.training.recipes import RECIPES
 from jobs.training.recipes.recipe import Recipe
 from model.backbones.vit import FSRAViT
 from model.checkpoint import build_encoder, loads
+from model.config import LossWeights
 from model.inference.embed import embed
 from model.schedule import schedule_at
 from model.training import Training
@@ -113,6 +114,27 @@ def test_adversary_joins_any_method() -> None:
     state = training.state_dict()
     assert set(state["modules"]) == {"encoder", "classifier", "objective", "discriminator"}
     training.load_state_dict(state)
+
+
+def test_all_losses_at_once_in_bfloat16() -> None:
+    recipe = RECIPES["smoke"]()
+    network = replace(
+        recipe.network, part_dim=8, image_size=128, discriminator_channels=8, neck="linear_ones"
+    )
+    weights = {field.name: 0.5 for field in fields(LossWeights) if field.name.endswith("_weight")}
+    training = Training(
+        network, recipe.optimization, 2, losses=LossWeights(learn_temperature=True, **weights),  # type: ignore[arg-type]
+        precision="bfloat16",
+    )  # fmt: skip
+    images_B3HW = torch.randint(0, 256, (4, 3, 128, 128), dtype=torch.uint8)
+    labels_B = torch.arange(2)
+    now = schedule_at(recipe.schedule, 9.0)
+    measures = training.step(images_B3HW[:2], labels_B, images_B3HW[2:], labels_B, now)
+    names = {name.replace("_weight", "_loss") for name in weights}
+    assert names <= measures.keys()
+    assert all(bool(value.isfinite()) for value in measures.values())
+    parameters = training.objective.named_parameters()
+    assert all(p.grad is not None and bool(p.grad.isfinite().all()) for _, p in parameters)
 
 
 def test_clip_value_bounds_every_gradient() -> None:
