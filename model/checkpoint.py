@@ -246,13 +246,21 @@ def load_encoder(path: str) -> FeatureEncoder:
         return build_encoder(loads(stream.read(), path))
 
 
+ADDED_SETTINGS = ("pooling", "neck")
+"""Of PVDAConfig, since format 2: at their defaults they are left out of the fingerprint, so that
+features and indexes from before stay those of the same encoder."""
+
+
 def fingerprint(checkpoint: Checkpoint, preprocessing: str) -> str:
     """Hash of all that an embedding depends on, 64 hexadecimal digits: weights, network,
     preprocessing."""
-    digest = hashlib.sha256()
-    digest.update(
-        json.dumps([dataclasses.asdict(checkpoint.network), preprocessing], sort_keys=True).encode()
-    )
+    digest, defaults = hashlib.sha256(), dataclasses.asdict(PVDAConfig())
+    network = {
+        name: value
+        for name, value in dataclasses.asdict(checkpoint.network).items()
+        if name not in ADDED_SETTINGS or value != defaults[name]
+    }
+    digest.update(json.dumps([network, preprocessing], sort_keys=True).encode())
     for name, tensor in sorted(checkpoint.encoder_weights.items()):
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.contiguous().flatten().view(torch.uint8).numpy().tobytes())

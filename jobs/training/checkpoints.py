@@ -13,6 +13,7 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
+from jobs.training.recipes.recipe import Recipe
 from jobs.training.settings import RunConfig
 from model.checkpoint import Checkpoint, dumps, loads
 from model.errors import CheckpointError
@@ -81,10 +82,25 @@ def read_checkpoint(run: RunConfig) -> Checkpoint | None:
     return None if found is None else found[1]
 
 
+def with_defaults(settings: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
+    """Settings by name, those within settings too, with the defaults of the ones that lack."""
+    filled = {
+        name: with_defaults(settings.get(name, {}), default)
+        if isinstance(default, dict) and isinstance(settings.get(name, {}), dict)
+        else settings.get(name, default)
+        for name, default in defaults.items()
+    }
+    return settings | filled
+
+
 def require_same_recipe(run: RunConfig, checkpoint: Checkpoint, path: str) -> None:
-    """Raise InputError where a checkpoint was trained with other settings."""
+    """Raise InputError where a checkpoint was trained with other settings.
+
+    A setting that it does not know is newer than it, and had its default.
+    """
     # Through JSON, as in the checkpoint: tuples become lists.
-    recipe, trained = json.loads(json.dumps(asdict(run.recipe))), checkpoint.recipe
+    recipe, defaults = (json.loads(json.dumps(asdict(one))) for one in (run.recipe, Recipe()))
+    trained = with_defaults(checkpoint.recipe, defaults)
     changed = sorted(name for name in recipe | trained if trained.get(name) != recipe.get(name))
     if changed:
         raise InputError(

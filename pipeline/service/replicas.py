@@ -121,7 +121,8 @@ class Replicas:
         try:
             status: ServiceStatus = handle.status.remote().result(timeout_s=60)
         except NotReady as error:
-            raise InputError(str(error)) from None
+            # Ray's own kind has the replica's traceback in its text; the sentence is its cause.
+            raise InputError(str(getattr(error, "cause", error))) from None
         self._handle = handle
         return status
 

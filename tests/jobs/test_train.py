@@ -2,6 +2,7 @@
 cannot run.
 """
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,8 @@ from jobs.training.recipes.pvda import paper
 from jobs.training.settings import RECIPE, RunConfig
 from jobs.training.state import WorkerContext
 from jobs.training.worker import train_worker
-from model.checkpoint import build_encoder, loads
+from model.checkpoint import build_encoder, dumps, loads
+from model.config import LossWeights
 from model.errors import CheckpointError
 from pipeline.core.arrays import Pixels
 from pipeline.core.errors import InputError
@@ -79,6 +81,19 @@ def test_train_finished_run_is_a_no_op(
     assert "nothing to do" in capsys.readouterr().err
     with pytest.raises(InputError, match="with another schedule; choose another --out"):
         train(settings(tiny_shards, tmp_path, tiny(3)))
+
+
+def test_run_from_before_a_setting_came_goes_on(tiny_shards: str, tmp_path: Path) -> None:
+    recipe = tiny(epochs=1)
+    path = Path(train(settings(tiny_shards, tmp_path, recipe)))
+    trained = loads(path.read_bytes())
+    older = json.loads(json.dumps(trained.recipe))
+    del older["pair_repeats"], older["network"]["pooling"], older["losses"]
+    path.write_bytes(dumps(replace(trained, recipe=older)))
+    assert train(settings(tiny_shards, tmp_path, recipe)) == str(path)
+    changed = replace(recipe, losses=LossWeights(triplet_weight=1.0))
+    with pytest.raises(InputError, match="with another losses; choose another --out"):
+        train(settings(tiny_shards, tmp_path, changed))
 
 
 def test_train_counts_damaged_images_per_epoch(

@@ -1,10 +1,11 @@
 """A checkpoint is bytes that give back what went in, run no code, and have a name of their own."""
 
+import hashlib
 import io
 import json
 import pickle
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -143,8 +144,19 @@ def test_fingerprint_changes_with_config_and_encoding(
         fingerprint(held, "bilinear"),
         fingerprint(replace(held, network=replace(TINY, ring_divisor="ring")), "bicubic"),
         fingerprint(replace(held, network=replace(TINY, image_size=80)), "bicubic"),
+        fingerprint(replace(held, network=replace(TINY, neck="linear_ones")), "bicubic"),
     }
-    assert len(found) == 4
+    assert len(found) == 5
+
+
+def test_fingerprint_of_an_encoder_from_before_poolings(held: Checkpoint) -> None:
+    network = asdict(held.network)
+    assert (network.pop("pooling"), network.pop("neck")) == ("rings", "linear")
+    digest = hashlib.sha256(json.dumps([network, "bicubic"], sort_keys=True).encode())
+    for name, tensor in sorted(held.encoder_weights.items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.contiguous().flatten().view(torch.uint8).numpy().tobytes())
+    assert fingerprint(held, "bicubic") == digest.hexdigest()
 
 
 def test_fingerprint_ignores_history_recipe_and_layout(

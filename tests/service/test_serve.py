@@ -168,8 +168,10 @@ def test_serve_other_encoder_is_refused(
     checkpoint, index = checkpoint_and_index
     metadata = json_files.read_checksummed(str(index / "index.json"))
     json_files.write_checksummed(str(index / "index.json"), metadata | {"fingerprint": "e" * 64})
-    with pytest.raises(InputError, match="did not make this index"):
+    with pytest.raises(InputError, match="did not make this index") as refused:
         main(ServeSettings(checkpoint=str(checkpoint), index=str(index), port=0, threads=1))
+    assert "\n" not in str(refused.value)
+    assert "Replica" not in str(refused.value)
     assert not serve_actors()
 
 
