@@ -21,6 +21,7 @@ from pipeline.batches.ordered import decode_samples, split_failed, stack
 from pipeline.core.records import Split, View
 from pipeline.retrieval.bootstrap import metrics_with_intervals
 from pipeline.retrieval.embedding_set import EmbeddingSet, embedding_set_from_array
+from pipeline.retrieval.metrics import recall_at
 from pipeline.retrieval.ranking import rank
 from pipeline.shards.shard_set import ShardSet, open_shards
 
@@ -54,7 +55,7 @@ def retrieve(queries: EmbeddingSet, gallery: EmbeddingSet) -> dict[str, Any]:
     """R@1, R@10 and AP with intervals over places."""
     ranking = rank(queries, gallery, top=1)
     found = metrics_with_intervals(ranking.first_rank_Q, ranking.ap_Q, queries.locations)
-    return found | {"r10": float((ranking.first_rank_Q < 10).mean())}
+    return found | {"r10": recall_at(10, ranking.first_rank_Q)}
 
 
 def main() -> None:

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from encoders import embed_view
 
 from jobs.training.driver import train
@@ -27,6 +26,7 @@ from pipeline.core.arrays import Doubles, Strings
 from pipeline.core.records import Split, View
 from pipeline.images.augmentation import Augmentation
 from pipeline.retrieval.bootstrap import confidence_intervals, paired_difference
+from pipeline.retrieval.metrics import hits_at
 from pipeline.retrieval.ranking import rank
 from pipeline.shards.shard_set import open_shards
 
@@ -73,7 +73,7 @@ def hits(checkpoint: str, shards_folder: str) -> tuple[Doubles, Strings]:
     queries, _ = embed_view(shards, Split.QUERY, View.DRONE, checkpoint, None)
     gallery, _ = embed_view(shards, Split.GALLERY, View.SATELLITE, checkpoint, None)
     ranking = rank(queries, gallery, top=1)
-    return (ranking.first_rank_Q == 0).astype(np.float64), queries.locations
+    return hits_at(1, ranking.first_rank_Q), queries.locations
 
 
 def named(argument: str) -> tuple[str, str]:

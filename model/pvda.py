@@ -31,6 +31,7 @@ class FeatureEncoder(nn.Module):
                 f"pooling {config.pooling} takes a class token, which {config.backbone} does not "
                 "have, expected a vision transformer; set --backbone or --pooling"
             )
+        self.with_token = self.backbone.has_token
         least = max(self.pooling.least_cells, 4) * self.backbone.stride  # D halves the maps twice
         if config.image_size < least:
             raise ValueError(
@@ -49,7 +50,12 @@ class FeatureEncoder(nn.Module):
         D).
         """
         normalised = (images_B3HW.to(self.mean_31.dtype) / 255 - self.mean_31) / self.std_31
-        maps_BCHW, token_BC = self.backbone.features(normalised)
+        # A backbone in 8-bit integers is a graph that has no more than `forward`.
+        maps_BCHW, token_BC = (
+            self.backbone.features(normalised)
+            if self.with_token
+            else (self.backbone(normalised), None)
+        )
         parts = self.pooling(maps_BCHW, token_BC)
         g_BPD = torch.stack(
             [refine(part_BC) for refine, part_BC in zip(self.refine, parts, strict=True)], dim=1

@@ -62,7 +62,7 @@ CASES: dict[str, tuple[str, str]] = {
     "ingredients": (
         "--shards {trained}/shards --held places={trained}/shards --out {out} --epochs 1 "
         "--batch-size 2 --only without_turns",
-        r"without_turns \| [\d.]+% .*% \| [+-][\d.]+% \[",
+        r"without_turns \| [\d.]+% \[.*\] \| [+-][\d.]+% \[",
     ),
     "own_map": (
         "--imagery {images} --out {out} --tiles 3 --photos 3",

@@ -181,7 +181,9 @@ def test_pvda_lists_every_job_and_refuses_others(
     with pytest.raises(SystemExit) as ended:
         pvda.main()
     assert ended.value.code == 2
-    assert "unknown job 'trian', expected one of: build_index," in capsys.readouterr().err
+    assert (
+        "unknown job 'trian', expected one of: benchmark, build_index," in capsys.readouterr().err
+    )
 
 
 def test_pvda_runs_a_job(

@@ -181,7 +181,7 @@ def test_train_too_few_images_is_rejected_at_once(tiny_shards: str, tmp_path: Pa
 
 def test_train_unknown_recipe_names_the_known_ones() -> None:
     with pytest.raises(
-        InputError, match="unknown recipe 'papr', expected one of: paper, paper_384, lpn, "
+        InputError, match="unknown recipe 'papr', expected one of: paper, paper_384, "
     ):
         expand(main, ["papr", "--shards", "x"], RECIPE, None)
     assert expand(main, ["--help"], RECIPE, None) == (None, ["--help"])

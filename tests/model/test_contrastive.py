@@ -68,7 +68,7 @@ def test_training_adds_info_nce_by_its_weight() -> None:
 
 
 def test_loss_weights_refuse_nothing_to_learn() -> None:
-    with pytest.raises(ValueError, match="expected 0 or more and not both 0"):
+    with pytest.raises(ValueError, match="the weights of all losses are 0, expected one above 0"):
         LossWeights(location_weight=0.0)
     with pytest.raises(ValueError, match="temperature is 0"):
         LossWeights(temperature=0.0)

@@ -203,7 +203,9 @@ def test_repair_changed_imagery_leaves_the_set_alone(tmp_path: Path) -> None:
     assert content(out) == before
 
 
-def test_pending_shards_with_verify_finds_damaged_pages(out: Path, tmp_path: Path) -> None:
+def test_pending_shards_with_verify_finds_damaged_pages(
+    out: Path, tmp_path: Path, ray_cluster: None
+) -> None:
     manifest, table = read_manifest(str(out)), tmp_path / "table"
     for shard in manifest.shards:
         count = shard.samples

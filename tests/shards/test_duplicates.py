@@ -15,7 +15,7 @@ from pipeline.shards.verify import verify
 from tests.shards.imagery import SOURCE, content, imagery, jpeg, packing, rejected
 
 
-def test_pack_skips_duplicates_of_one_location(tmp_path: Path) -> None:
+def test_pack_skips_duplicates_of_one_location(tmp_path: Path, ray_cluster: None) -> None:
     root, out = imagery(tmp_path / "root"), tmp_path / "out"
     copied = (root / "train/drone/0002/image-03.jpeg").read_bytes()
     (root / "train/drone/0002/zz copy.jpeg").write_bytes(copied)  # a double
@@ -58,7 +58,7 @@ def test_find_duplicates_compares_positions() -> None:
     assert find_duplicates([table], frozenset()) == {"s": {records[2].key: "/a.png"}}
 
 
-def test_extend_adds_tars_and_changes_nothing_old(tmp_path: Path) -> None:
+def test_extend_adds_tars_and_changes_nothing_old(tmp_path: Path, ray_cluster: None) -> None:
     root, out = imagery(tmp_path / "root"), tmp_path / "out"
     first = pack(SOURCE, packing(root, out))
     before = content(out)
