@@ -1,5 +1,7 @@
 """Leaderboard rows: means over seeds, differences by query, figures that contradict each other."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -52,6 +54,18 @@ def test_leaderboard_averages_seeds_and_pairs_queries() -> None:
         [row.as_dict() for row in (control, method)], published=[], data="A set", terms="few images"
     )
     assert page.index('<th scope="row">method') < page.index('<th scope="row">control')
+
+
+@pytest.mark.parametrize(("ap_of_hits", "marked"), [(1.0, True), (0.8, False)])
+def test_leaderboard_marks_contradictions_of_one_match(ap_of_hits: float, marked: bool) -> None:
+    run = evaluation("a", [1, 2, 1, 2])  # AP 1/2 at rank 2, where one match gives at most 1/4
+    aps = [ap_of_hits if rank == 1 else 0.5 for rank in (1, 2, 1, 2)]
+    results = run.results.set_column(run.results.column_names.index("ap"), "ap", pa.array(aps))
+    runs = {"a": [replace(run, results=results)]}
+    [row] = leaderboard(runs, {"a": COST})
+    assert row.tasks[0].impossible is marked
+    page = render_leaderboard([row.as_dict()], published=[], data="A set", terms="few images")
+    assert ("impossible beside this R@1" in page) is marked
 
 
 def test_leaderboard_refuses_other_queries() -> None:
