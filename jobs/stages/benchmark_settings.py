@@ -7,11 +7,11 @@ from jobs.training.recipes import RECIPES
 from pipeline.core.errors import InputError, require
 
 METHODS = (
-    "alpha_zero", "paper", "constant_alpha", "no_restart", "instance_loss", "lcm_style", "lpn",
-    "msba_style", "fsra", "mccg", "sample4geo", "dac", "camp",
+    "alpha_zero", "paper", "constant_alpha", "no_restart", "instance_loss", "lpn", "msba_style",
+    "fsra", "mccg", "sample4geo", "dac", "camp",
 )  # fmt: skip
-"""The control first: differences are to it. USAM is a part of ResNet, QDFL takes a transformer's
-class token: they have rows at published sizes only."""
+"""The control first: differences are to it. Rows at published sizes only: USAM is a part of ResNet,
+QDFL takes a transformer's class token, and LCM differs in augmentation and epochs."""
 
 
 @dataclass(frozen=True, kw_only=True)
