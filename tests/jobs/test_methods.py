@@ -122,10 +122,8 @@ def test_all_losses_at_once_in_bfloat16() -> None:
         recipe.network, part_dim=8, image_size=128, discriminator_channels=8, neck="linear_ones"
     )
     weights = {field.name: 0.5 for field in fields(LossWeights) if field.name.endswith("_weight")}
-    training = Training(
-        network, recipe.optimization, 2, losses=LossWeights(learn_temperature=True, **weights),  # type: ignore[arg-type]
-        precision="bfloat16",
-    )  # fmt: skip
+    losses = replace(LossWeights(learn_temperature=True), **weights)  # type: ignore[arg-type]
+    training = Training(network, recipe.optimization, 2, losses=losses, precision="bfloat16")
     images_B3HW = torch.randint(0, 256, (4, 3, 128, 128), dtype=torch.uint8)
     labels_B = torch.arange(2)
     now = schedule_at(recipe.schedule, 9.0)
