@@ -10,13 +10,14 @@ from torch import nn
 from torch.optim import SGD, Adam, AdamW, Optimizer
 
 from model.config import Optimization
+from model.losses.objective import Objective
 from model.pvda import ViewDiscriminator
 from model.two_views import EncoderWithClassifier
 
 
 def build_optimizers(
     model: EncoderWithClassifier,
-    objective: nn.Module,
+    objective: Objective,
     discriminator: ViewDiscriminator | None,
     config: Optimization,
 ) -> list[Optimizer]:
@@ -31,7 +32,7 @@ def build_optimizers(
         group("head", nn.ModuleList([model.encoder.pooling, model.encoder.refine]), config.head_lr),
         group("classifier", model.classifier, config.classifier_lr),
     ]
-    if any(True for _ in objective.parameters()):
+    if objective.learns:
         groups.append(group("objective", objective, config.head_lr))
     optimizers: list[Optimizer] = [
         SGD(

@@ -77,8 +77,7 @@ class Training:
         "Why the networks are not compiled though compilation was requested."
         self._wrapped = wrap_ddp(self.model)
         self._discriminator = None if self.discriminator is None else wrap_ddp(self.discriminator)
-        learns = any(True for _ in self.objective.parameters())
-        self._objective = wrap_ddp(self.objective) if learns else self.objective
+        self._objective = wrap_ddp(self.objective) if self.objective.learns else self.objective
         self.clip_value = optimization.clip_value
         self._fitted = [*self.model.parameters(), *self.objective.parameters()]
         self.optimizers = build_optimizers(
@@ -92,7 +91,7 @@ class Training:
             "encoder": self.model.encoder,
             "classifier": self.model.classifier,
         }
-        if any(True for _ in self.objective.parameters()):
+        if self.objective.learns:
             named["objective"] = self.objective
         if self.discriminator is not None:
             named["discriminator"] = self.discriminator

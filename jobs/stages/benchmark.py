@@ -9,10 +9,12 @@ from dataclasses import replace
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from jobs.encoding.encoder import make_encoder_spec, read_checkpoint_bytes
+from jobs.encoding.embed_test import embed_test
+from jobs.encoding.encoder import read_checkpoint_bytes
 from jobs.stages.benchmark_settings import BenchmarkSettings
 from jobs.training.driver import train
 from jobs.training.recipes import RECIPES
+from jobs.training.recipes.builtin import builtin
 from jobs.training.recipes.equal_budget import at_equal_budget
 from jobs.training.recipes.recipe import Recipe
 from jobs.training.settings import TrainSettings
@@ -21,11 +23,14 @@ from pipeline.core import cluster, storage
 from pipeline.core.progress import console, results
 from pipeline.core.records import Split, View
 from pipeline.evaluation.evaluate import evaluate
-from pipeline.evaluation.leaderboard import Cost, leaderboard, leaderboard_markdown
+from pipeline.evaluation.leaderboard import (
+    Cost,
+    LeaderboardRow,
+    leaderboard,
+    leaderboard_markdown,
+)
 from pipeline.evaluation.published import PUBLISHED_SINCE, PUBLISHED_TABLE
 from pipeline.evaluation.settings import EvaluationSettings
-from pipeline.features.embed import embed_gallery
-from pipeline.features.settings import EmbeddingSettings
 from pipeline.report.inputs import EvaluationResults, read_evaluation
 from pipeline.report.leaderboard import render_leaderboard
 from pipeline.shards.pack import pack
@@ -43,15 +48,17 @@ def benchmark(settings: BenchmarkSettings) -> str:
     shards = storage.absolute(settings.shards) if settings.shards else simulate_simu(settings, out)
     evaluations: dict[str, list[EvaluationResults]] = {}
     costs: dict[str, Cost] = {}
+    epochs = None if settings.published_sizes else epochs_of(settings.budget, shards)
     for seed in range(settings.seeds):
         for method in settings.methods:
             console.rule(f"{method}, seed {seed}", align="left")
-            recipe = recipe_of(method, seed, settings, shards)
-            evaluation, cost = train_and_judge(recipe, f"{method}-seed{seed}", shards, out)
+            recipe = recipe_of(method, seed, epochs)
+            evaluation, checkpoint = train_and_judge(recipe, f"{method}-seed{seed}", shards, out)
             evaluations.setdefault(method, []).append(evaluation)
-            costs.setdefault(method, cost)
-            page = write_leaderboard(settings, out, evaluations, costs)  # what is known by now
-    rows = leaderboard(evaluations, costs)
+            if method not in costs:
+                costs[method] = cost_of(checkpoint)
+            rows = leaderboard(evaluations, costs)
+            page = write_leaderboard(settings, out, rows)  # what is known by now
     results.print(leaderboard_markdown(rows), soft_wrap=True)
     print(f"leaderboard: {page}")
     return page
@@ -76,38 +83,37 @@ def simulate_simu(settings: BenchmarkSettings, out: str) -> str:
     return shards
 
 
-def recipe_of(method: str, seed: int, settings: BenchmarkSettings, shards: str) -> Recipe:
-    """The method as published, or at the budget: whole epochs, at least one."""
-    recipe = RECIPES[method]()
-    if settings.published_sizes:
-        return replace(recipe, seed=seed)
-    manifest = open_shards(shards).manifest
+def epochs_of(budget: int, shards: str) -> int:
+    """Whole epochs that come nearest to a budget of images of both views; at least one."""
+    manifest, batch = open_shards(shards).manifest, builtin().batch_size
     images = sum(shard.samples for shard in manifest.of(Split.TRAIN, View.SATELLITE))
-    batch = at_equal_budget(recipe, recipe.schedule.epochs, seed).batch_size
-    of_an_epoch = 2 * batch * max(1, images // batch)
-    return at_equal_budget(recipe, max(1, round(settings.budget / of_an_epoch)), seed)
+    return max(1, round(budget / (2 * batch * max(1, images // batch))))
+
+
+def recipe_of(method: str, seed: int, epochs: int | None) -> Recipe:
+    """The method on equal terms for `epochs`; None: as published."""
+    recipe = RECIPES[method]()
+    return replace(recipe, seed=seed) if epochs is None else at_equal_budget(recipe, epochs, seed)
 
 
 def train_and_judge(
     recipe: Recipe, name: str, shards: str, out: str
-) -> tuple[EvaluationResults, Cost]:
-    """Train, embed and evaluate one run; each keeps what is finished."""
+) -> tuple[EvaluationResults, str]:
+    """Train, embed and evaluate one run, or what of it is missing; its checkpoint beside it."""
     run, table, judged = (
         storage.join(out, folder, name) for folder in ("runs", "features", "evaluations")
     )
-    options = TrainSettings(recipe=recipe, shards=shards, out=run, workers=0, probe_epochs=0)
-    checkpoint = train(options)
-    data = read_checkpoint_bytes(checkpoint)
-    for split in (Split.QUERY, Split.GALLERY):
-        embedding = EmbeddingSettings(shards=shards, out=table, split=split)
-        embed_gallery(embedding, make_encoder_spec(data, checkpoint, embedding))
+    checkpoint = train(
+        TrainSettings(recipe=recipe, shards=shards, out=run, workers=0, probe_epochs=0)
+    )
+    embed_test(shards, checkpoint, table)
     evaluate(EvaluationSettings(table=table, out=judged, shards=shards, run=run, title=name))
-    return read_evaluation(judged), cost_of(data, checkpoint)
+    return read_evaluation(judged), checkpoint
 
 
-def cost_of(data: bytes, name: str) -> Cost:
+def cost_of(checkpoint: str) -> Cost:
     """What a trained encoder costs: its own size and work, and its training's."""
-    trained = loads(data, name)
+    trained = loads(read_checkpoint_bytes(checkpoint), checkpoint)
     encoder = build_encoder(trained)
     side = trained.network.image_size
     counter = FlopCounterMode(display=False)
@@ -124,14 +130,8 @@ def cost_of(data: bytes, name: str) -> Cost:
     )
 
 
-def write_leaderboard(
-    settings: BenchmarkSettings,
-    out: str,
-    evaluations: dict[str, list[EvaluationResults]],
-    costs: dict[str, Cost],
-) -> str:
+def write_leaderboard(settings: BenchmarkSettings, out: str, rows: list[LeaderboardRow]) -> str:
     """Write leaderboard.html, .md and .json; the page's path."""
-    rows = leaderboard(evaluations, costs)
     terms = (
         "each method's own network, rates, batch and whole schedule"
         if settings.published_sizes

@@ -17,7 +17,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from jobs.encoding.encoder import make_encoder_spec, read_checkpoint_bytes
+from jobs.encoding.embed_test import embed_test
 from jobs.stages.calibrate import calibrate_index
 from jobs.stages.evaluation_tables import print_table
 from jobs.stages.locate import locate_photos
@@ -32,8 +32,6 @@ from pipeline.core.progress import console, results
 from pipeline.core.records import Split, View
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.settings import EvaluationSettings
-from pipeline.features.embed import embed_gallery
-from pipeline.features.settings import EmbeddingSettings
 from pipeline.features.table import open_table
 from pipeline.index.build import build_index
 from pipeline.index.searcher import Index
@@ -125,10 +123,7 @@ def embed_and_evaluate(
 
     `run`: the training that the encoder comes from; its report stands beside the built-in one's.
     """
-    data = read_checkpoint_bytes(checkpoint)
-    for split in (Split.QUERY, Split.GALLERY):
-        embedding = EmbeddingSettings(shards=folders.shards, out=folders.table(name), split=split)
-        embed_gallery(embedding, make_encoder_spec(data, checkpoint, embedding))
+    embed_test(folders.shards, checkpoint, folders.table(name))
     return evaluate(
         EvaluationSettings(
             table=folders.table(name),

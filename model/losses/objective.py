@@ -42,6 +42,11 @@ class Objective(nn.Module):
         if weights.regions_weight:
             self.regions = RegionContrast(channels, config.image_size // stride)
 
+    @property
+    def learns(self) -> bool:
+        """Whether it has parameters: it is then trained, wrapped and stored like the networks."""
+        return any(True for _ in self.parameters())
+
     def forward(
         self, drone: ViewOutput, location1_B: Tensor, satellite: ViewOutput, location2_B: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
