@@ -26,6 +26,12 @@ from jobs.stages.settings import CalibrateSettings
 from jobs.training.driver import train
 from jobs.training.recipes.pvda import smoke
 from jobs.training.settings import TrainSettings
+from pipeline.confidence.reliability import (
+    ReliabilityBin,
+    expected_calibration_error,
+    reliability_bins,
+    reliability_diagram,
+)
 from pipeline.core import cluster, storage
 from pipeline.core.arrays import Doubles
 from pipeline.core.geo import haversine_m
@@ -42,12 +48,6 @@ from pipeline.locate.calibration_data import LabelledImages, make_examples
 from pipeline.locate.flight import apply_track, motion_for_gallery
 from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
 from pipeline.locate.locate import Answer, answers_from_hits
-from pipeline.locate.reliability import (
-    ReliabilityBin,
-    expected_calibration_error,
-    reliability_bins,
-    reliability_diagram,
-)
 from pipeline.locate.track import TRACK_CANDIDATES, TrackStart
 from pipeline.shards.pack import pack
 from pipeline.shards.settings import PackingSettings

@@ -2,13 +2,15 @@
 
     python benchmarks/own_map.py --imagery DIR --out DIR [--tiles 12] [--photos 60]
 
-Puts overhead images together into a GeoTIFF, renders UAV photos of random places of it (any
-heading, 40 to 90 degrees below the horizon, another day), and walks the road of the README: tiles,
-embeddings, index, locate. Prints how far the answers are from the photos' places and the seconds,
-and as control the same road with ImageNet's weights alone (and a random refinement).
+Puts overhead images together into a GeoTIFF, flies over it (any heading, 45 to 90 degrees below the
+horizon, 60 to 120 m high, another day), and walks the road of the README: tiles, embeddings, index,
+locate. Prints how far the answers are from the photos' places: with the camera's pose in the tags
+(heading wrong by 3 degrees, pitch by 1, height by 3 %), without it, by tiles alone; and as control
+by tiles with ImageNet's weights (and a random refinement).
 """
 
 import argparse
+import csv
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -17,8 +19,7 @@ import numpy as np
 import rasterio
 import torch
 from PIL import Image
-from rasterio.transform import Affine, from_origin
-from rasterio.warp import transform as transform_points
+from rasterio.transform import Affine
 
 from jobs.encoding.encoder import make_encoder_spec, read_checkpoint_bytes
 from jobs.stages.locate import locate_photos
@@ -29,7 +30,7 @@ from model.pvda import FeatureEncoder
 from model.weights.builtin import BUILTIN
 from model.weights.start import load_start
 from pipeline.core import cluster
-from pipeline.core.arrays import Doubles, Pixels
+from pipeline.core.arrays import Pixels
 from pipeline.features.embed import embed_gallery
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.index.build import build_index
@@ -37,7 +38,8 @@ from pipeline.index.settings import IndexSettings
 from pipeline.locate.page import LatLon, distance_to_m
 from pipeline.shards.pack import pack
 from pipeline.shards.settings import PackingSettings
-from pipeline.simulation.location import LocationSpec, render_location
+from pipeline.simulation.over_map.fly import fly
+from pipeline.simulation.over_map.settings import MapFlightSettings
 from pipeline.sources.geotiff import GeoTiff
 
 TILE_PX, METRES_PER_PIXEL = 256, 0.3
@@ -58,38 +60,15 @@ def make_map(imagery: Path, side: int, seed: int) -> Pixels:
     return np.concatenate(rows)
 
 
-def write_map(mosaic_HW3: Pixels, path: Path) -> Affine:
-    """Write the GeoTIFF, in UTM; its transform."""
-    transform = from_origin(500_000, 5_200_000, METRES_PER_PIXEL, METRES_PER_PIXEL)
+def write_map(mosaic_HW3: Pixels, path: Path) -> None:
+    """Write the GeoTIFF, in UTM."""
+    transform = Affine(METRES_PER_PIXEL, 0, 500_000, 0, -METRES_PER_PIXEL, 5_200_000)
     height, width, _ = mosaic_HW3.shape
     with rasterio.open(
         path, "w", driver="GTiff", width=width, height=height, count=3, dtype="uint8",
         crs="EPSG:32632", transform=transform, photometric="RGB",
     ) as opened:  # fmt: skip
         opened.write(mosaic_HW3.transpose(2, 0, 1))
-    return transform
-
-
-def take_photos(mosaic_HW3: Pixels, folder: Path, count: int, seed: int) -> Doubles:
-    """Photos of random places; columns and rows (P, 2) of what their location is."""
-    rng = np.random.default_rng(seed)
-    half = TILE_PX // 2
-    places = np.stack(
-        [rng.integers(half, extent - half, count) for extent in mosaic_HW3.shape[1::-1]], axis=1
-    )
-    folder.mkdir(parents=True, exist_ok=True)
-    texture = folder.parent / "ground.png"
-    for number, (column, row) in enumerate(places):
-        window = mosaic_HW3[row - half : row + half, column - half : column + half]
-        Image.fromarray(window).save(texture)
-        flown = render_location(
-            LocationSpec(
-                seed=seed, location=number, views=1, size=384, flight="free", texture=str(texture),
-                texture_metres_per_pixel=METRES_PER_PIXEL,
-            )
-        )  # fmt: skip
-        (folder / f"{number:04d}.jpg").write_bytes(flown.drone[0])
-    return places.astype(np.float64)
 
 
 def imagenet_checkpoint() -> bytes:
@@ -107,26 +86,45 @@ def imagenet_checkpoint() -> bytes:
     )  # fmt: skip
 
 
-def walk_road(out: Path, tiles: str, checkpoint: str, positions: list[LatLon]) -> Doubles:
-    """Embed, index and locate by one encoder; the answers' errors (P,) in metres."""
+def make_index(out: Path, tiles: str, checkpoint: str) -> str:
+    """Embed and index the tiles by one encoder; the index."""
     out.mkdir(parents=True, exist_ok=True)
     table, index = str(out / "table"), str(out / "index")
     embedding = EmbeddingSettings(shards=tiles, out=table)
     spec = make_encoder_spec(read_checkpoint_bytes(checkpoint), checkpoint, embedding)
     embed_gallery(embedding, spec)
     build_index(IndexSettings(table=table, out=index))
-    photos = sorted(str(path) for path in (out.parent / "photos").iterdir())
-    settings = LocateSettings(
-        photos=tuple(photos), checkpoint=checkpoint, index=index, shards=tiles,
-        out=str(out / "where.geojson"), page=str(out / "where.html"),
-    )  # fmt: skip
-    found = locate_photos(settings)
-    return np.array(
+    return index
+
+
+def print_errors(
+    name: str, settings: LocateSettings, truth: dict[str, LatLon], baseline: float
+) -> float:
+    """Locate the photos and print how far off the answers are; the share within 25 m."""
+    begin = time.perf_counter()
+    located = locate_photos(settings)
+    seconds = time.perf_counter() - begin
+    error_P = np.array(
         [
-            np.inf if one.answer is None else distance_to_m(one.answer, position)
-            for one, position in zip(found, positions, strict=True)
+            np.inf if one.answer is None else distance_to_m(one.answer, truth[Path(one.name).name])
+            for one in located
         ]
     )
+    share = float((error_P <= 25).mean())
+    within = ", ".join(
+        f"{(error_P <= metres).mean():.1%} within {metres} m" for metres in (1, 5, 25)
+    )
+    ratio = share / max(baseline or share, 1 / len(error_P))
+    wrong = sum(
+        error > 25 and one.answer is not None and one.answer.refinement is not None
+        for error, one in zip(error_P, located, strict=True)
+    )
+    print(
+        f"{name}: {within} of {len(error_P)} photos, {ratio:.2f} x ImageNet's tiles within 25 m; "
+        f"median {np.median(error_P):.2f} m; {wrong} refined and more than 25 m off; "
+        f"{seconds / len(error_P):.2f} s a photo"
+    )
+    return share
 
 
 def main() -> None:
@@ -136,38 +134,44 @@ def main() -> None:
     parser.add_argument("--tiles", type=int, default=12, help="images along a side of the map")
     parser.add_argument("--photos", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--height", type=float, nargs=2, default=(60.0, 120.0), help="metres")
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
+    out = options.out
+    (out / "map").mkdir(parents=True, exist_ok=True)
     cluster.connect()
     mosaic_HW3 = make_map(options.imagery, options.tiles, options.seed)
-    (options.out / "map").mkdir(exist_ok=True)
-    transform = write_map(mosaic_HW3, options.out / "map" / "map.tif")
-    places = take_photos(mosaic_HW3, options.out / "photos", options.photos, options.seed)
-    east, north = transform @ (places[:, 0], places[:, 1])
-    lons, lats = transform_points("EPSG:32632", "EPSG:4326", east, north)
-    positions = list(zip(lats, lons, strict=True))
-    begin = time.perf_counter()
-    tiles = str(options.out / "tiles")
-    pack(
-        GeoTiff(tile_m=TILE_M, overlap=0.5),
-        PackingSettings(root=str(options.out / "map"), out=tiles),
-    )
-    packed = time.perf_counter() - begin
-    start = options.out / "imagenet.pt"
-    start.write_bytes(imagenet_checkpoint())
-    shares = {}
-    for name, checkpoint in (("ImageNet alone", str(start)), ("built-in", BUILTIN)):
-        begin = time.perf_counter()
-        folder = options.out / name.replace(" ", "-")
-        errors = walk_road(folder, tiles, checkpoint, positions)
-        spent = packed + time.perf_counter() - begin
-        shares[name] = float((errors <= 25).mean())
-        ratio = shares[name] / max(shares["ImageNet alone"], 1 / len(errors))
-        print(
-            f"{name}: {shares[name]:.1%} of {len(errors)} photos within 25 m, {ratio:.2f} x "
-            f"ImageNet's weights alone; median {np.median(errors):.0f} m; map of "
-            f"{mosaic_HW3.shape[1] * METRES_PER_PIXEL / 1000:.2f} km a side, {spent:.0f} s"
+    mosaic = out / "map" / "map.tif"
+    write_map(mosaic_HW3, mosaic)
+    flight = fly(
+        MapFlightSettings(
+            mosaic=str(mosaic), out=str(out / "flight"), photos=options.photos,
+            height=tuple(options.height), seed=options.seed,
         )
+    )  # fmt: skip
+    with (flight / "photos.csv").open() as table:
+        truth = {
+            Path(row["path"]).name: (float(row["lat"]), float(row["lon"]))
+            for row in csv.DictReader(table)
+        }
+    tiles = str(out / "tiles")
+    pack(GeoTiff(tile_m=TILE_M, overlap=0.5), PackingSettings(root=str(out / "map"), out=tiles))
+    start = out / "imagenet.pt"
+    start.write_bytes(imagenet_checkpoint())
+    print(f"map of {mosaic_HW3.shape[1] * METRES_PER_PIXEL / 1000:.2f} km a side")
+    baseline = 0.0
+    for name, checkpoint, match, pose in (
+        ("ImageNet's weights, tiles", str(start), False, True),
+        ("built-in, tiles", BUILTIN, False, True),
+        ("built-in, matched, no pose", BUILTIN, True, False),
+        ("built-in, matched, pose", BUILTIN, True, True),
+    ):
+        index = make_index(out / name.partition(",")[0].replace(" ", "-"), tiles, checkpoint)
+        settings = LocateSettings(
+            photos=(str(flight / "photos"),), checkpoint=checkpoint, index=index, shards=tiles,
+            out=str(out / "where.geojson"), page=str(out / "where.html"), match=match, pose=pose,
+        )  # fmt: skip
+        share = print_errors(name, settings, truth, baseline)
+        baseline = baseline or share
 
 
 if __name__ == "__main__":

@@ -113,20 +113,34 @@ class PhotoEncoder:
             else None
             for name, image in zip(names, images, strict=True)
         ]
-        decoded = [image for image in images if not isinstance(image, DecodeError)]
-        if not decoded:
-            return np.empty((0, self.dimension), np.float32), rejected
-        return self._encode(torch.from_numpy(stack(decoded))).cpu().numpy(), rejected
+        return self.forward(
+            [image for image in images if not isinstance(image, DecodeError)]
+        ), rejected
+
+    def forward(self, images: Sequence[Pixels]) -> Floats:
+        """Unit embeddings (B, D) of images of the network's size."""
+        if not images:
+            return np.empty((0, self.dimension), np.float32)
+        return self._encode(torch.from_numpy(stack(images))).cpu().numpy()
+
+    def to_input(self, image_HW3: Pixels) -> Pixels:
+        """Pixels at the network's size."""
+        return resize(image_HW3, self.image_size, self.encoding.resizer)
 
     def _decode(self, data: bytes) -> Pixels | DecodeError:
-        """A photo's pixels. Its structure is inspected first, so that no decompression bomb is
-        decoded.
-        """
         try:
-            inspect(data)
-            return resize(decode(data), self.image_size, self.encoding.resizer)
+            return self.to_input(decode_photo(data))
         except DecodeError as error:
             return error
+
+
+def decode_photo(data: bytes) -> Pixels:
+    """A photo's pixels. Its structure is inspected first, so that no decompression bomb is decoded.
+
+    Raises DecodeError.
+    """
+    inspect(data)
+    return decode(data)
 
 
 def _check_images(

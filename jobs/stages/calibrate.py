@@ -14,6 +14,7 @@ from jobs.encoding.encoder import read_checkpoint_bytes
 from jobs.encoding.photo_encoder import PhotoEncoder
 from jobs.stages.settings import CalibrateSettings
 from model.checkpoint import loads
+from pipeline.confidence.reliability import reliability_diagram
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.progress import console, progress, results
@@ -28,7 +29,6 @@ from pipeline.locate.calibration import (
 )
 from pipeline.locate.calibration_data import LabelledImages, make_examples
 from pipeline.locate.gallery_map import read_gallery_map
-from pipeline.locate.reliability import reliability_diagram
 from pipeline.locate.settings import CalibrationCriteria
 from pipeline.shards.shard_set import open_or_scan
 

@@ -9,11 +9,10 @@ with the reason, the others are answered, and the exit code is 1.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from jobs.encoding.encoder import read_checkpoint_bytes
 from jobs.encoding.photo_encoder import PhotoEncoder
-from jobs.encoding.queries import Query, encode_photos, merge_by_folder
+from jobs.encoding.queries import Query, encode_photos, merge_by_folder, one_view
+from jobs.stages.matching import open_map, refine_answers, view_maker
 from jobs.stages.settings import LocateSettings
 from pipeline.core import storage
 from pipeline.core.errors import Incomplete, InputError
@@ -28,10 +27,16 @@ from pipeline.locate.calibration import Calibration, find_calibration, read_cali
 from pipeline.locate.flight import TRACK_THRESHOLD, apply_track, motion_for_gallery
 from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
 from pipeline.locate.geojson import LocatedPhoto, to_csv, to_geojson
-from pipeline.locate.locate import Answer, locate_embeddings
+from pipeline.locate.locate import (
+    CONSENSUS_CANDIDATES,
+    Answer,
+    answers_from_hits,
+    search_views,
+)
 from pipeline.locate.page import LatLon, PageContext, render_page
 from pipeline.locate.photo_files import find_photos, parse_time, read_times
 from pipeline.locate.track import TRACK_CANDIDATES, TrackStart
+from pipeline.matching.map_windows import MapWindows
 from pipeline.shards.shard_set import open_shards
 
 
@@ -59,13 +64,17 @@ def locate_photos(
         settings.shards,
     )
     gallery = read_gallery_map(index)
-    queries = encode_photos(photos, encoder)
+    windows = _open_map(settings, gallery)
+    make_views = view_maker(windows, settings) if windows else one_view
+    queries = encode_photos(photos, encoder, make_views)
     if settings.together:
         queries = merge_by_folder(queries)
-    decoded = [query for query in queries if query.embedding_D is not None]
+    decoded = [query for query in queries if query.views_VD is not None]
     if settings.track:
         decoded = with_times(decoded, settings)
     answers = answer_queries(decoded, index, gallery, calibration, settings)
+    if windows:
+        answers = refine_answers(decoded, answers, windows, settings)
     by_name = {
         query.name: _located(query, answer, settings.top)
         for query, answer in zip(decoded, answers, strict=True)
@@ -85,6 +94,13 @@ def locate_photos(
     return located
 
 
+def _open_map(settings: LocateSettings, gallery: GalleryMap) -> MapWindows | None:
+    """The map's pixels, if photos are to be matched: several as one query have no pixels."""
+    if settings.shards is None or settings.together or not settings.match:
+        return None
+    return open_map(settings.shards, gallery)
+
+
 def answer_queries(
     queries: Sequence[Query],
     index: Index,
@@ -93,20 +109,26 @@ def answer_queries(
     settings: LocateSettings,
 ) -> list[Answer]:
     """One answer per query; with --track given the whole flight."""
-    rows = [query.embedding_D for query in queries]
-    embeddings_QD = np.array(rows, np.float32).reshape(-1, index.dimension)
+    views = [query.views_VD for query in queries if query.views_VD is not None]
     near = settings.near
     if not settings.track or calibration is None:
-        where = Filter(near=near) if near else None
-        return locate_embeddings(
-            index, embeddings_QD, settings.top, where, calibration, gallery.spacing_m
-        )
+        # Matching tries more candidates than are listed.
+        k, where = max(settings.top, CONSENSUS_CANDIDATES), Filter(near=near) if near else None
+        hits = search_views(index, views, k, where)
+        return _framed(queries, answers_from_hits(hits, k, calibration, gallery.spacing_m))
     k = max(settings.top, TRACK_CANDIDATES)
-    single = locate_embeddings(index, embeddings_QD, k, None, calibration)
+    hits = search_views(index, views, k)
+    single = _framed(queries, answers_from_hits(hits, k, calibration))
     start = TrackStart(lat=near.lat, lon=near.lon, radius_m=near.radius_m) if near else None
     motion = motion_for_gallery(gallery, settings.max_speed, settings.elsewhere)
     times_s = [parse_time(query.taken_at or "0") for query in queries]
     return apply_track(single, times_s, calibration, motion, start)
+
+
+def _framed(queries: Sequence[Query], answers: Sequence[Answer]) -> list[Answer]:
+    """The answers with how their photos were framed."""
+    pairs = zip(queries, answers, strict=True)
+    return [replace(answer, framing=query.framing) for query, answer in pairs]
 
 
 def load_calibration(settings: LocateSettings, index: Index) -> Calibration | None:
@@ -156,7 +178,9 @@ def with_times(queries: Sequence[Query], settings: LocateSettings) -> list[Query
             f"{len(unknown)} of {len(names)} photos have no time in their tags, {unknown[0]} among "
             "them; expected times for --track; give --times TABLE or --interval SECONDS"
         )
-    return [replace(query, taken_at=times[query.name]) for query in queries]
+    return [
+        replace(query, tags=replace(query.tags, taken_at=times[query.name])) for query in queries
+    ]
 
 
 def _located(query: Query, answer: Answer | None, top: int) -> LocatedPhoto:

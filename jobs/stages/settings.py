@@ -15,6 +15,7 @@ from pipeline.features.settings import EmbeddingSettings
 from pipeline.index.settings import IndexSettings
 from pipeline.locate.settings import CalibrationCriteria
 from pipeline.locate.track import Motion
+from pipeline.matching.photo_pose import PoseSettings
 from pipeline.service.settings import ServiceSettings
 from pipeline.shards.settings import PackingSettings
 
@@ -80,7 +81,7 @@ CIRCLE_FLAG: Any = tyro.constructors.PrimitiveConstructorSpec(
 
 
 @dataclass(frozen=True, kw_only=True)
-class LocateSettings:
+class LocateSettings(PoseSettings):
     """Photos to locate, the index to search, and the files to write."""
 
     photos: tyro.conf.Positional[tuple[str, ...]]
@@ -120,10 +121,15 @@ class LocateSettings:
     page: str | None = None
     "An HTML page with photos, candidates and a map, in one file that needs no connection."
     shards: str | None = None
-    """The shards that the index was made of: they have the images of the page; needed also where
-    the index's embeddings are int8."""
+    """The shards that the index was made of: photos are matched with their pixels, and the page
+    shows them; needed also where the index's embeddings are int8."""
+    match: bool = True
+    """Match each photo with the map's pixels around its candidates: its place within metres instead
+    of a tile's middle. Takes --shards whose tiles know their corners, such as those of a GeoTIFF;
+    --no-match answers with tiles."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require(self.top >= 1, "top", self.top, "at least 1")
         if self.together and self.track:
             raise InputError(

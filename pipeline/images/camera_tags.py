@@ -1,4 +1,4 @@
-"""The camera tags of a photo: bytes of the image's beginning -> position, heights, heading, pitch,
+"""The camera tags of a photo: bytes of the image's beginning -> position, heights, angles, lens,
 time.
 
 In: bytes. Out: CameraTags. Pure, and bounded in time and memory whatever the bytes are. A tag that
@@ -24,10 +24,12 @@ from pipeline.images.xmp import read_xmp
 
 ALTITUDE_REF, ALTITUDE, DIRECTION_REF, DIRECTION = 5, 6, 16, 17
 TAKEN, TAKEN_OFFSET, TAKEN_FRACTION = 0x9003, 0x9011, 0x9291
+MODEL, FOCAL, FOCAL_35MM = 0x0110, 0x920A, 0xA405
 XMP_HEIGHT = ("AboveGroundAltitude", "RelativeAltitude")
 XMP_HEADING = ("GimbalYawDegree", "CameraYawDegree", "CameraOrientationNED.Yaw")
 XMP_BODY_HEADING = ("FlightYawDegree", "DroneYawDegree")
 XMP_PITCH = ("GimbalPitchDegree", "CameraPitchDegree", "CameraOrientationNED.Pitch")
+XMP_FOCAL_PX = ("CalibratedFocalLength",)
 XMP_ROLL = ("GimbalRollDegree", "CameraRollDegree", "CameraOrientationNED.Roll")
 GIMBAL_OVERSHOOT_DEG = 1.0
 "By which gimbals overshoot straight down: -90.1 is common."
@@ -51,6 +53,16 @@ class CameraTags:
     "Of the camera, else of the aircraft; clockwise from true north, from 0 to below 360."
     pitch_deg: float | None = None
     "Of the optical axis, from -90 (straight down) to 90."
+    roll_deg: float | None = None
+    "About the optical axis, from -90 to 90; above 0 the image's right side is the lower one."
+    focal_px: float | None = None
+    "Calibrated focal length in pixels of the photo as it was taken."
+    focal_35mm: float | None = None
+    "Focal length of the same field of view on 35 mm film, millimetres."
+    focal_mm: float | None = None
+    "Focal length, millimetres."
+    model: str = ""
+    "Of the camera."
     taken_at: str | None = None
     "ISO 8601; without an offset the camera's own clock."
     ignored: tuple[str, ...] = ()
@@ -83,12 +95,19 @@ def read_tags(blocks: MetadataBlocks) -> CameraTags:
     if sea_level is None:
         sea_level = _first_number(xmp, ("AbsoluteAltitude",), ignored)
     heading, taken_at = _heading(exif.gps, xmp, pitch, ignored), _taken_at(exif.photo, ignored)
+    roll = _first_number(xmp, XMP_ROLL, ignored)
+    focal_35mm = exif.photo[FOCAL_35MM].integer() if FOCAL_35MM in exif.photo else None
     return CameraTags(
         position=position,
         height_m=height,
         sea_level_m=sea_level,
         heading_deg=heading,
         pitch_deg=pitch,
+        roll_deg=None if roll is None else (roll + 90) % 180 - 90,
+        focal_px=_above_zero(_first_number(xmp, XMP_FOCAL_PX, ignored)),
+        focal_35mm=_above_zero(focal_35mm),
+        focal_mm=_above_zero(_first_rational(exif.photo, FOCAL)),
+        model=exif.main[MODEL].text() if MODEL in exif.main else "",
         taken_at=taken_at,
         ignored=tuple(dict.fromkeys(ignored)),
     )
@@ -122,6 +141,11 @@ def _first_number(
         if text:
             ignored.append(f"{name} {text[:40]!r}")
     return None
+
+
+def _above_zero(value: float | None) -> float | None:
+    """Zero is EXIF's word for unknown."""
+    return float(value) if value is not None and value > 0 else None
 
 
 def _first_rational(gps: Directory, tag: int) -> float | None:

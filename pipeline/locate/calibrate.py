@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.confidence.logistic import fit_choice_model, fit_logistic
+from pipeline.confidence.reliability import expected_calibration_error, reliability_bins
 from pipeline.core.arrays import Doubles, Strings
 from pipeline.core.errors import InputError
 from pipeline.core.geo import haversine_m
@@ -19,8 +21,6 @@ from pipeline.index.searcher import Hit
 from pipeline.locate.calibration import Calibration, confidence_features
 from pipeline.locate.consensus import Consensus
 from pipeline.locate.locate import consensus_of, consensus_scores, relative_scores
-from pipeline.locate.logistic import fit_choice_model, fit_logistic
-from pipeline.locate.reliability import expected_calibration_error, reliability_bins
 from pipeline.locate.settings import CalibrationCriteria
 from pipeline.locate.track import TRACK_CANDIDATES
 

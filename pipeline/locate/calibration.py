@@ -10,13 +10,13 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from pipeline.confidence.logistic import LogisticModel
+from pipeline.confidence.reliability import ReliabilityBin
 from pipeline.core import json_files, storage
 from pipeline.core.arrays import Doubles
 from pipeline.core.errors import InputError
 from pipeline.core.json_files import from_json
 from pipeline.locate.consensus import Consensus
-from pipeline.locate.logistic import LogisticModel
-from pipeline.locate.reliability import ReliabilityBin
 
 SCHEMA_VERSION = 2
 CALIBRATION_FILE = "calibration.json"

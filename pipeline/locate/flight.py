@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.confidence.logistic import choice_log_probabilities
 from pipeline.locate.calibration import Calibration
 from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.locate import Answer, Position, coordinates, relative_scores
-from pipeline.locate.logistic import choice_log_probabilities
 from pipeline.locate.track import Motion, SmoothedPhoto, TrackPhoto, TrackStart, smooth_track
 
 TRACK_THRESHOLD = 0.5
@@ -87,7 +87,8 @@ def _apply_smoothed(answer: Answer, smoothed: SmoothedPhoto, calibration: Calibr
     lat, lon = hits[chosen].lat, hits[chosen].lon
     position = None
     if lat is not None and lon is not None:
-        position = Position(lat=lat, lon=lon, radius_m=(calibration.spacing_m or 0.0) / 2)
+        radius_m = (calibration.spacing_m or 0.0) / 2
+        position = Position(lat=lat, lon=lon, radius_m=radius_m, how="track")
     return replace(
         answer,
         position=position,

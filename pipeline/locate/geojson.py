@@ -23,10 +23,20 @@ PROPERTIES = (
     "lat",
     "lon",
     "radius_m",
+    "how",
+    "heading_deg",
+    "inliers",
+    "camera_lat",
+    "camera_lon",
+    "camera_height_m",
     "location",
     "agreeing",
+    "framing",
 )
 "Columns of the CSV that a feature of the GeoJSON has as properties."
+
+CAMERA = ("camera_lat", "camera_lon", "camera_height_m")
+"Columns of the camera's own place, where matching and the lens tell it."
 
 CSV_COLUMNS = (*PROPERTIES, "candidate", "score", "reason", "found")
 
@@ -66,12 +76,22 @@ def _feature(one: LocatedPhoto) -> dict[str, Any]:
     if row["known"] and row["lat"] is not None:
         point = {"type": "Point", "coordinates": [row["lon"], row["lat"]]}
     candidates = [asdict(hit) for hit in one.answer.candidates] if one.answer else []
+    position = one.answer.position if one.answer else None
+    refinement = one.answer.refinement if one.answer else None
     properties = {name: row[name] for name in PROPERTIES} | {
+        "ellipse": asdict(position.ellipse) if position and position.ellipse else None,
+        "footprint": _ring(refinement.footprint) if refinement else None,
         "photos": one.photos,
         "candidates": candidates,
         "rejected": [asdict(rejection) for rejection in one.rejected],
     }
     return {"type": "Feature", "geometry": point, "properties": properties}
+
+
+def _ring(footprint: Sequence[tuple[float, float]]) -> list[list[float]]:
+    """Corners as a closed ring of longitudes and latitudes, counter-clockwise from above."""
+    ring = [[lon, lat] for lat, lon in footprint]
+    return [*ring, ring[0]][::-1]
 
 
 def _track_feature(located: Sequence[LocatedPhoto]) -> dict[str, Any]:
@@ -112,10 +132,15 @@ def _row(one: LocatedPhoto) -> dict[str, Any]:
         row |= {"reason": one.rejected[0].reason, "found": one.rejected[0].found}
     if answer := one.answer:
         row |= {
-            name: getattr(answer, name) for name in ("known", "probability", "location", "agreeing")
+            name: getattr(answer, name)
+            for name in ("known", "probability", "location", "agreeing", "framing")
         }
-        if answer.position:
-            row |= asdict(answer.position)
+        if position := answer.position:
+            row |= {name: getattr(position, name) for name in ("lat", "lon", "radius_m", "how")}
+        if found := answer.refinement:
+            row |= {"heading_deg": found.heading_deg, "inliers": found.inliers}
+            if found.camera:
+                row |= dict(zip(CAMERA, found.camera, strict=True))
         if answer.candidates:
             row |= {"candidate": answer.candidates[0].key, "score": answer.candidates[0].score}
     return row

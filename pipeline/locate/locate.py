@@ -8,14 +8,18 @@ Shapes: Q photos, D dimensions, K candidates.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
+from pipeline.camera.framing import Framing
+from pipeline.camera.uncertainty import Ellipse
 from pipeline.core.arrays import Doubles, Floats
 from pipeline.core.filters import Filter
 from pipeline.index.searcher import Hit, Searchable
 from pipeline.locate.calibration import Calibration
 from pipeline.locate.consensus import Consensus, find_consensus
+from pipeline.matching.refine import Refinement
 
 CONSENSUS_CANDIDATES = 10
 """Candidates that decide on position and probability, however many are listed: a calibration holds
@@ -28,6 +32,11 @@ joins only images of one location: whether neighbours overlap is not known, and 
 other ground would pull the position away."""
 
 
+How = Literal["tile", "refined", "track"]
+"""How a position came about: the middle of gallery images, the photo matched with the map's pixels,
+or the gallery image where the whole flight passes."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Position:
     """The estimated position of a photo."""
@@ -38,7 +47,12 @@ class Position:
     "Degrees east."
     radius_m: float
     """Uncertainty in metres, if the location is right: half the distance to the next gallery image
-    and the spread of the agreeing candidates, added in quadrature."""
+    and the spread of the agreeing candidates, added in quadrature; of a refined position, half the
+    longer axis of its ellipse."""
+    how: How = "tile"
+    "How it came about."
+    ellipse: Ellipse | None = None
+    "95 % of a refined position's error, if it is right."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +71,10 @@ class Answer:
     "Best first."
     agreeing: int
     "How many of the candidates considered lie at the location."
+    refinement: Refinement | None = None
+    "How the photo lies on the map; null where it was not matched, or the match does not hold."
+    framing: Framing = "none"
+    "How the photo was framed for the search, by what is known of its camera."
 
 
 NO_ANSWER = Answer(
@@ -83,6 +101,33 @@ def locate_embeddings(
     return answers_from_hits(hits, k, calibration, spacing_m)
 
 
+def merge_views(hits_of_views: Sequence[Sequence[Hit]]) -> list[Hit]:
+    """The candidates of several views of one photo: each gallery image by its best score, best
+    first, as many as one view has."""
+    best: dict[str, Hit] = {}
+    for hits in hits_of_views:
+        for hit in hits:
+            if hit.key not in best or hit.score > best[hit.key].score:
+                best[hit.key] = hit
+    merged = sorted(best.values(), key=lambda hit: -hit.score)
+    return merged[: max(map(len, hits_of_views), default=0)]
+
+
+def search_views(
+    index: Searchable, views_of_photos: Sequence[Floats], k: int, where: Filter | None = None
+) -> list[list[Hit]]:
+    """The `k` best candidates of each photo by its views (V, D), all in one search.
+
+    Raises InputError where the embeddings do not fit the index.
+    """
+    if not views_of_photos:
+        return []
+    found = index.search(np.concatenate(views_of_photos), k, where)
+    ends = np.cumsum([len(views) for views in views_of_photos]).tolist()
+    starts = [0, *ends[:-1]]
+    return [merge_views(found[start:end]) for start, end in zip(starts, ends, strict=True)]
+
+
 def answers_from_hits(
     hits_of_photos: Sequence[Sequence[Hit]],
     k: int,
@@ -105,10 +150,10 @@ def _answer(
     calibration: Calibration | None,
     spacing: float,
 ) -> Answer:
-    probability = (
-        calibration.probability(consensus, consensus_scores(hits)) if calibration else None
-    )
-    position = None
+    probability, threshold, position = None, 0.0, None
+    if calibration:
+        probability = calibration.probability(consensus, consensus_scores(hits))
+        threshold = calibration.threshold
     if consensus.lat is not None and consensus.lon is not None:
         radius_m = math.hypot(consensus.spread_m, spacing / 2)
         position = Position(lat=consensus.lat, lon=consensus.lon, radius_m=radius_m)
@@ -116,7 +161,7 @@ def _answer(
         position=position,
         location=hits[consensus.leader].location,
         probability=probability,
-        known=calibration is None or probability is None or probability >= calibration.threshold,
+        known=probability is None or probability >= threshold,
         candidates=tuple(hits[:k]),
         agreeing=int(consensus.members_K.sum()),
     )

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.progress import console
-from pipeline.images.camera_tags import read_tags
+from pipeline.images.camera_tags import CameraTags, read_tags
 from pipeline.images.image_blocks import UnreadableTag, find_metadata
 from pipeline.images.inspect import RAW_SUFFIXES, is_image_name, is_undecoded_image_name
 
@@ -74,12 +74,12 @@ def parent_folder(photo: str) -> str:
     return photo.rpartition("/")[0] or "."
 
 
-def read_taken_at(data: bytes) -> str | None:
-    """The time in the camera's tags, ISO 8601; None where they have none."""
+def read_photo_tags(data: bytes) -> CameraTags:
+    """The camera's tags; none of them where they contradict each other."""
     try:
-        return read_tags(find_metadata(data, complete=True)).taken_at
+        return read_tags(find_metadata(data, complete=True))
     except UnreadableTag:
-        return None
+        return CameraTags()
 
 
 def parse_time(text: str) -> float:

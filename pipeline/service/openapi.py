@@ -141,7 +141,9 @@ def _json(description: str, schema: str) -> dict[str, Any]:
 class _Bodies(BaseModel):
     """All dataclasses that bodies of responses are made of."""
 
-    model_config = ConfigDict(use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        use_attribute_docstrings=True, json_schema_serialization_defaults_required=True
+    )
 
     answer: Answer
     timing: AnswerTiming
@@ -165,7 +167,7 @@ def response_schemas() -> dict[str, Any]:
     answer, timing = schemas.pop("Answer"), schemas.pop("AnswerTiming")
     readiness, status = schemas.pop("Readiness"), schemas.pop("ServiceStatus")
     bodies = {"Answer": _merge(answer, timing), "Health": _merge(readiness, status)}
-    bodies["Health"]["required"] = readiness["required"]  # without the token only these are sent
+    bodies["Health"]["required"] = ["ready"]  # without the token, or a reason, only that is sent
     return bodies | {"Error": schemas.pop("ErrorBody")} | schemas
 
 

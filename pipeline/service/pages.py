@@ -64,5 +64,7 @@ def type_name(schema: dict[str, Any]) -> str:
     if "$ref" in schema:
         return str(schema["$ref"].rpartition("/")[2])
     if schema.get("type") == "array":
+        if "prefixItems" in schema:
+            return f"list of {len(schema['prefixItems'])} values"
         return f"list of {type_name(schema['items'])}"
     return str(schema["type"])

@@ -9,22 +9,9 @@ from math import atan, cos, degrees, radians, sin, tan
 
 import numpy as np
 
+from pipeline.camera.pose import Pose
+
 UNIVERSITY_VIEWS = 54
-
-
-@dataclass(frozen=True, kw_only=True)
-class Pose:
-    """Position and direction of a camera without roll; (0, 0) is the world's middle, y north."""
-
-    x_m: float
-    y_m: float
-    altitude_m: float
-    heading_deg: float
-    """Clockwise from north, 0 to 360."""
-    pitch_deg: float
-    """Angle above the horizon: -90 looks straight down."""
-    fov_deg: float
-    """Field of view across the frame, which is square."""
 
 
 @dataclass(frozen=True, kw_only=True)

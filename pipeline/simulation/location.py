@@ -11,8 +11,9 @@ from math import cos, pi, radians, sin, sqrt
 import numpy as np
 import simplejpeg
 
+from pipeline.camera.pose import Pose
 from pipeline.simulation.appearance import sample_day
-from pipeline.simulation.flight import FlightPlan, FreeFlight, Pose
+from pipeline.simulation.flight import FlightPlan, FreeFlight
 from pipeline.simulation.render import render_nadir, render_perspective
 from pipeline.simulation.scene import prepare_scene
 from pipeline.simulation.settings import Flight

@@ -13,7 +13,7 @@ from math import cos, radians, sin, tan
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.simulation.flight import Pose
+from pipeline.camera.pose import Pose
 from pipeline.simulation.scene import COARSE_CELL_PX, Scene
 from pipeline.simulation.walls import wall_colours
 from pipeline.simulation.world import ByteMap, FloatMap

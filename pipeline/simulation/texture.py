@@ -88,7 +88,7 @@ def textured_world(path: str, *, metres_per_pixel: float, frame_pixels: int = 25
     side = round(TEXELS_PER_RADIUS / RADIUS_FRACTION * frame_pixels / 256)
     box = (left, top, left + square, top + square)
     texture_HW3 = np.asarray(image.resize((side, side), Image.Resampling.BICUBIC, box=box))
-    grass_HW, trees_HW = _vegetation(texture_HW3.astype(np.float32))
+    grass_HW, trees_HW = vegetation(texture_HW3.astype(np.float32))
     return World(
         texture_HW3=texture_HW3,
         height_HW=_read_heights(path, image.size, box, side),
@@ -129,7 +129,7 @@ def _read_heights(
     )
 
 
-def _vegetation(colour_HW3: FloatMap) -> tuple[FloatMap, FloatMap]:
+def vegetation(colour_HW3: FloatMap) -> tuple[FloatMap, FloatMap]:
     """(grass, trees), each (H, W) from 0 to 1: vegetation is green, trees darker than grass."""
     red, green, blue = (colour_HW3[..., c] for c in range(3))
     total = red + green + blue + 1

@@ -13,7 +13,7 @@ from pipeline.core.records import Rejection
 from pipeline.images import optional_formats
 from pipeline.images.decode import decode
 from pipeline.images.optional_formats import convert_optional
-from pipeline.locate.photo_files import read_taken_at
+from pipeline.locate.photo_files import read_photo_tags
 
 TAKEN = "2026:11:24 09:30:05"
 
@@ -56,7 +56,7 @@ def test_optional_format_heif_keeps_pixels_and_time() -> None:
     assert isinstance(converted, bytes)
     error = np.abs(decode(converted).astype(int) - np.asarray(picture()).astype(int))
     assert error.mean() < 5
-    assert read_taken_at(converted) == "2026-11-24T09:30:05"
+    assert read_photo_tags(converted).taken_at == "2026-11-24T09:30:05"
 
 
 def test_optional_format_raw_is_developed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,7 +82,7 @@ def test_optional_format_raw_is_developed(monkeypatch: pytest.MonkeyPatch) -> No
     converted = convert_optional("c.DNG", exif.tobytes().removeprefix(b"Exif\0\0"))
     assert isinstance(converted, bytes)
     assert (decode(converted) == pixels_HW3).all()
-    assert read_taken_at(converted) == "2026-11-24T09:30:05"
+    assert read_photo_tags(converted).taken_at == "2026-11-24T09:30:05"
     assert isinstance(convert_optional("c.DNG", b"II*\0"), bytes), "a raw file without tags"
     whole = io.BytesIO()
     picture().save(whole, "TIFF")

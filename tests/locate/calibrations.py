@@ -3,9 +3,9 @@
 from dataclasses import replace
 from typing import Any
 
+from pipeline.confidence.logistic import LogisticModel
+from pipeline.confidence.reliability import ReliabilityBin
 from pipeline.locate.calibration import FEATURE_NAMES, Calibration
-from pipeline.locate.logistic import LogisticModel
-from pipeline.locate.reliability import ReliabilityBin
 
 ZEROS, ONES = (0.0,) * len(FEATURE_NAMES), (1.0,) * len(FEATURE_NAMES)
 

@@ -4,6 +4,7 @@ radius."""
 import numpy as np
 import pytest
 
+from pipeline.confidence.logistic import sigmoid
 from pipeline.core.arrays import Floats
 from pipeline.core.errors import InputError
 from pipeline.core.filters import Filter
@@ -21,7 +22,6 @@ from pipeline.locate.calibrate import (
 from pipeline.locate.calibration import Calibration
 from pipeline.locate.calibration_data import LabelledImages, make_examples
 from pipeline.locate.locate import answers_from_hits, consensus_of, consensus_scores
-from pipeline.locate.logistic import sigmoid
 from pipeline.locate.settings import CalibrationCriteria
 from pipeline.locate.track import TRACK_CANDIDATES
 

@@ -4,8 +4,8 @@ damaged by flipped bits, zeroed blocks, truncation and removal: rejected, or rea
 
 from pathlib import Path
 
+from pipeline.confidence.logistic import LogisticModel
 from pipeline.locate.calibration import read_calibration, write_calibration
-from pipeline.locate.logistic import LogisticModel
 from tests.damaging import count_detected, raising_if_missing
 from tests.locate.calibrations import make_calibration
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.confidence.logistic import LogisticModel
 from pipeline.core.arrays import Floats
 from pipeline.core.errors import InputError
 from pipeline.core.filters import Filter
@@ -28,7 +29,6 @@ from pipeline.locate.locate import (
     locate_embeddings,
     relative_scores,
 )
-from pipeline.locate.logistic import LogisticModel
 from pipeline.locate.track import Motion
 from tests.locate.calibrations import make_calibration
 

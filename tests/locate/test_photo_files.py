@@ -7,11 +7,12 @@ import pytest
 from PIL import Image
 
 from pipeline.core.errors import InputError
+from pipeline.images.camera_tags import CameraTags
 from pipeline.locate.photo_files import (
     find_photos,
     parent_folder,
     parse_time,
-    read_taken_at,
+    read_photo_tags,
     read_times,
 )
 
@@ -49,12 +50,12 @@ def test_find_photos_missing_path_is_refused(tmp_path: Path) -> None:
         find_photos([])
 
 
-def test_read_taken_at_from_exif() -> None:
+def test_read_photo_tags_from_exif() -> None:
     stream, exif = io.BytesIO(), Image.Exif()
     exif.get_ifd(0x8769)[0x9003] = "2026:11:24 09:30:05"
     Image.new("RGB", (16, 16)).save(stream, "JPEG", exif=exif)
-    assert read_taken_at(stream.getvalue()) == "2026-11-24T09:30:05"
-    assert read_taken_at(b"no image") is None
+    assert read_photo_tags(stream.getvalue()).taken_at == "2026-11-24T09:30:05"
+    assert read_photo_tags(b"no image") == CameraTags()
 
 
 def test_parse_time_seconds_and_iso_8601() -> None:

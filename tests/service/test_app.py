@@ -22,7 +22,8 @@ def test_locate_photo_as_body() -> None:
         response = await post(client, photo(), query="?top=2&lat=47&lon=8&radius_m=500")
         assert response.status == 200
         body = await response.json()
-        assert body["position"] == {"lat": 47.0, "lon": 8.0, "radius_m": 25.0}
+        position = {"lat": 47.0, "lon": 8.0, "radius_m": 25.0, "how": "tile", "ellipse": None}
+        assert body["position"] == position
         assert (body["probability"], body["known"], body["location"]) == (0.8, True, "0000")
         assert [hit["key"] for hit in body["candidates"]] == ["gallery-0", "gallery-1"]
         assert body["seconds"] >= 0

@@ -5,8 +5,9 @@ from math import cos, radians, sin, tan
 import numpy as np
 import pytest
 
+from pipeline.camera.pose import Pose
 from pipeline.simulation.appearance import Day, light_world
-from pipeline.simulation.flight import FlightPlan, Pose
+from pipeline.simulation.flight import FlightPlan
 from pipeline.simulation.render import render_nadir, render_perspective
 from pipeline.simulation.scene import Scene, prepare_scene
 from pipeline.simulation.shadows import cast_shadows

@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from pipeline.locate.reliability import (
+from pipeline.confidence.reliability import (
     expected_calibration_error,
     reliability_bins,
     reliability_diagram,

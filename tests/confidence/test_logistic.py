@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.locate.logistic import (
+from pipeline.confidence.logistic import (
     RIDGE,
     LogisticModel,
     choice_log_probabilities,

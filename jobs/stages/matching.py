@@ -1,0 +1,82 @@
+"""Photos of any storage matched with the map's pixels: opens the tiles, reads photos, refines.
+
+In: queries with their answers, and the shards that the index was made of. Out: the answers within
+metres where matching holds.
+"""
+
+from collections.abc import Sequence
+
+from jobs.encoding.photo_encoder import decode_photo
+from jobs.encoding.queries import Query, ViewMaker, read_photo
+from pipeline.camera.framing import Framing, nearest_side, views_of_photo
+from pipeline.core.arrays import Pixels
+from pipeline.core.prefetch import prefetch_map
+from pipeline.core.progress import console, progress
+from pipeline.core.records import Rejection
+from pipeline.images.camera_tags import CameraTags
+from pipeline.locate.gallery_map import GalleryMap
+from pipeline.locate.locate import Answer
+from pipeline.locate.refined import refine_answer, with_refinement
+from pipeline.matching.map_windows import MapWindows
+from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
+from pipeline.matching.refine import Refinement
+from pipeline.shards.shard_set import open_shards
+from pipeline.shards.tile_reader import TileReader
+
+AHEAD = 4
+"Photos that are read while another is matched."
+
+
+def open_map(shards: str, gallery: GalleryMap) -> MapWindows | None:
+    """The windows of a map; None, with a message, where its tiles do not know their corners.
+
+    Raises InputError where there are no such shards.
+    """
+    opened = open_shards(shards)
+    reader = None if opened.external else TileReader(opened)
+    if reader is None or not len(gallery.keys) or not reader.footprints([str(gallery.keys[0])]):
+        console.print(
+            f"the images of {shards} do not say which ground their corners show: photos are not "
+            "matched with them, and positions are those of tiles"
+        )
+        return None
+    return MapWindows(gallery, reader.fetch, reader.footprints)
+
+
+def view_maker(windows: MapWindows, pose: PoseSettings) -> ViewMaker:
+    """Frames photos as the tiles of a map, as far as tags and flags tell the camera."""
+    sides_m = windows.tile_sides_m()
+
+    def make_views(photo_HW3: Pixels, tags: CameraTags) -> tuple[list[Pixels], Framing]:
+        size = (photo_HW3.shape[1], photo_HW3.shape[0])
+        known = pose_of_photo(tags, size, pose)
+        return views_of_photo(photo_HW3, known, nearest_side(known, size, sides_m))
+
+    return make_views
+
+
+def match_photo(
+    photo_HW3: Pixels, tags: CameraTags, answer: Answer, windows: MapWindows, pose: PoseSettings
+) -> Refinement | None:
+    """The photo matched around its answer, by what its tags and the flags say of the camera."""
+    height, width = photo_HW3.shape[:2]
+    return refine_answer(answer, photo_HW3, pose_of_photo(tags, (width, height), pose), windows)
+
+
+def refine_answers(
+    queries: Sequence[Query],
+    answers: Sequence[Answer],
+    windows: MapWindows,
+    pose: PoseSettings,
+) -> list[Answer]:
+    """The answers of single photos, in their order, refined where that holds."""
+    refined: list[Answer] = []
+    with progress(len(queries), "matching", "photos") as meter:
+        contents = prefetch_map(read_photo, [query.photos[0] for query in queries], AHEAD, AHEAD)
+        for query, answer, data in zip(queries, answers, contents, strict=True):
+            found = None
+            if not isinstance(data, Rejection):  # else it was removed since it was embedded
+                found = match_photo(decode_photo(data), query.tags, answer, windows, pose)
+            refined.append(with_refinement(answer, found))
+            meter.advance()
+    return refined

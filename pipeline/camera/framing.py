@@ -1,0 +1,134 @@
+"""A photo as a tile of the map would show it: north up, and as much ground as the tile.
+
+In: pixels, and what is known of the camera. Out: pixels, framed as far as it is known. A complete
+pose lays the photo on the ground; a heading alone turns it; without either it stays.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from pipeline.camera.ground import apply_homography, corners, photo_to_ground
+from pipeline.camera.pose import PartialPose
+from pipeline.core.arrays import Doubles, Pixels
+
+Framing = Literal["ground", "scale", "north", "none"]
+"""How a photo was framed: laid on the ground north up; likewise, as it was turned, without a
+heading; only turned north up; or not at all."""
+FRAME_PX = 384
+"Side of a framed photo: encoders take 256 to 384 pixels."
+
+
+SCALES = (1.0, 0.7, 0.5)
+"""Middles of a photo of unknown scale, as shares of its width and height: photos show one to
+four tiles' widths (docs/results.md has what each is worth)."""
+
+
+def views_of_photo(
+    photo_HW3: Pixels, pose: PartialPose, side_m: float | None
+) -> tuple[list[Pixels], Framing]:
+    """The views of a photo by which a gallery of tiles of `side_m` metres is searched, and how they
+    were framed: one where the scale is known, else one for each of SCALES."""
+    framed_HW3, how = frame_photo(photo_HW3, pose, side_m)
+    if how in ("ground", "scale"):
+        return [framed_HW3], how
+    return [_middle(framed_HW3, share) for share in SCALES], how
+
+
+def nearest_side(
+    pose: PartialPose, size: tuple[int, int], sides_m: Sequence[float]
+) -> float | None:
+    """Of a gallery's tile sides, in metres, rising: the largest that the ground shown by a photo of
+    `size` (width, height) holds, else the smallest; None without any."""
+    if not sides_m:
+        return None
+    if pose.height_m is None or pose.fov_deg is None or pose.pitch_deg is None:
+        return sides_m[0]
+    slant_m = pose.height_m / np.sin(np.radians(-pose.pitch_deg))
+    width_m = 2 * slant_m * np.tan(np.radians(pose.fov_deg) / 2) * min(1.0, size[1] / size[0])
+    fitting = [side for side in sides_m if side <= width_m]
+    return max(fitting, default=sides_m[0])
+
+
+def _middle(photo_HW3: Pixels, share: float) -> Pixels:
+    """The middle of a photo: this share of its width and of its height."""
+    height, width = photo_HW3.shape[:2]
+    top, left = round(height * (1 - share) / 2), round(width * (1 - share) / 2)
+    return np.ascontiguousarray(photo_HW3[top : height - top, left : width - left])
+
+
+def frame_photo(
+    photo_HW3: Pixels, pose: PartialPose, side_m: float | None
+) -> tuple[Pixels, Framing]:
+    """The photo framed like a tile of `side_m` metres, and how; (FRAME_PX, FRAME_PX, 3) unless it
+    stays as it is. Ground beyond the photo takes the photo's mean colour.
+
+    `side_m` None: the tile's size is not known, and only the heading is used.
+    """
+    height, width = photo_HW3.shape[:2]
+    known = None not in (pose.pitch_deg, pose.height_m, pose.fov_deg)
+    if known and side_m is not None:
+        upright = PartialPose(
+            heading_deg=pose.heading_deg or 0.0, pitch_deg=pose.pitch_deg, height_m=pose.height_m,
+            fov_deg=pose.fov_deg, roll_deg=pose.roll_deg,
+        )  # fmt: skip
+        to_ground_33 = photo_to_ground(upright.over(), (width, height))
+        if _shows_no_sky(to_ground_33, (width, height)):
+            framed = _on_ground(photo_HW3, to_ground_33, side_m)
+            return framed, "scale" if pose.heading_deg is None else "ground"
+    if pose.heading_deg is not None:
+        return _turned(photo_HW3, pose.heading_deg), "north"
+    return photo_HW3, "none"
+
+
+def _shows_no_sky(to_ground_33: Doubles, size: tuple[int, int]) -> bool:
+    weight_4 = np.c_[corners(size), np.ones(4)] @ to_ground_33[2]
+    return bool(weight_4.min() > 0.05 * weight_4.max())
+
+
+def _on_ground(photo_HW3: Pixels, to_ground_33: Doubles, side_m: float) -> Pixels:
+    """The ground around the photo's middle, a square of `side_m` metres."""
+    height, width = photo_HW3.shape[:2]
+    middle_2 = apply_homography(to_ground_33, np.array([[width / 2, height / 2]]))[0]
+    scale = FRAME_PX / side_m
+    place_33 = np.array(
+        [
+            [scale, 0, FRAME_PX / 2 - scale * middle_2[0]],
+            [0, -scale, FRAME_PX / 2 + scale * middle_2[1]],
+            [0, 0, 1],
+        ]
+    )
+    return _warp(photo_HW3, place_33 @ to_ground_33)
+
+
+def _turned(photo_HW3: Pixels, heading_deg: float) -> Pixels:
+    """The middle square of the photo, turned north up."""
+    height, width = photo_HW3.shape[:2]
+    scale = FRAME_PX / min(height, width)
+    c, s = np.cos(np.radians(heading_deg)) * scale, np.sin(np.radians(heading_deg)) * scale
+    middle = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array(
+        [[1, 0, -width / 2], [0, 1, -height / 2], [0, 0, 1]]
+    )
+    return _warp(
+        photo_HW3, np.array([[1, 0, FRAME_PX / 2], [0, 1, FRAME_PX / 2], [0, 0, 1]]) @ middle
+    )
+
+
+def _warp(photo_HW3: Pixels, to_frame_33: Doubles) -> Pixels:
+    """The photo by a homography to the frame; averaged first where it becomes much smaller."""
+    height, width = photo_HW3.shape[:2]
+    framed_42 = apply_homography(to_frame_33, corners((width, height)))
+    shrink = float(np.linalg.norm(framed_42[2] - framed_42[3])) / width
+    if shrink < 0.75:
+        size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+        to_frame_33 = to_frame_33 @ np.diag([width / size[0], height / size[1], 1.0])
+        photo_HW3 = np.asarray(cv2.resize(photo_HW3, size, interpolation=cv2.INTER_AREA), np.uint8)
+    half_33 = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV counts from pixels' middles
+    mean = tuple(float(value) for value in photo_HW3.reshape(-1, 3).mean(axis=0))
+    framed_HW3 = cv2.warpPerspective(
+        photo_HW3, np.linalg.inv(half_33) @ to_frame_33 @ half_33, (FRAME_PX, FRAME_PX),
+        flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=mean,
+    )  # fmt: skip
+    return np.asarray(framed_HW3, np.uint8)

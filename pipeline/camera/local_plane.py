@@ -1,0 +1,44 @@
+"""Degrees and metres around a point of the earth: the plane that touches it there, north up.
+
+Accurate to centimetres over some kilometres (tests compare it with pyproj).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.core.arrays import Doubles
+
+EQUATOR_M = 6_378_137.0
+"Semi-major axis of WGS84 [EPSG 7030]."
+ECCENTRICITY_2 = 6.69437999014e-3
+"First eccentricity of WGS84, squared."
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalPlane:
+    """The plane whose zero is this position, WGS84; it is undefined at the poles."""
+
+    lat: float
+    lon: float
+
+    @property
+    def metres_per_degree(self) -> Doubles:
+        """Of latitude and of longitude (2,), by WGS84's radii of curvature here."""
+        sine = np.sin(np.radians(self.lat))
+        bend = 1 - ECCENTRICITY_2 * sine * sine
+        meridian_m = EQUATOR_M * (1 - ECCENTRICITY_2) / bend**1.5
+        parallel_m = EQUATOR_M / np.sqrt(bend) * np.cos(np.radians(self.lat))
+        return np.asarray(np.radians([meridian_m, parallel_m]))
+
+    def to_metres(self, positions_N2: Doubles) -> Doubles:
+        """(east, north) in metres (N, 2) of latitudes and longitudes (N, 2); longitudes wrap."""
+        north_N = positions_N2[:, 0] - self.lat
+        east_N = (positions_N2[:, 1] - self.lon + 180) % 360 - 180
+        return np.stack([east_N, north_N], axis=1) * self.metres_per_degree[::-1]
+
+    def to_degrees(self, metres_N2: Doubles) -> Doubles:
+        """Latitudes and longitudes (N, 2) of (east, north) in metres (N, 2)."""
+        east_N, north_N = (metres_N2 / self.metres_per_degree[::-1]).T
+        lon_N = (self.lon + east_N + 180) % 360 - 180
+        return np.stack([self.lat + north_N, lon_N], axis=1)

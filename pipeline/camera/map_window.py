@@ -1,0 +1,106 @@
+"""Tiles of a map -> one north-up window of it around a position.
+
+In: pixels of tiles and the positions of their corners. Out: a square of pixels with a known ground.
+Shapes: H, W pixels, 3 = red, green, blue; N points, 2 = column, row, or east, north.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.camera.local_plane import LocalPlane
+from pipeline.core.arrays import Doubles, Pixels
+
+Footprint = npt.ArrayLike
+"Corners (4, 2), latitude and longitude, from the image's upper left clockwise."
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapWindow:
+    """A square of the map, north up, around the zero of its plane."""
+
+    pixels_HW3: Pixels
+    "Black where no tile shows the ground."
+    shown_HW: Pixels
+    "255 where a tile shows the ground, else 0."
+    metres_per_pixel: float
+    plane: LocalPlane
+
+    @property
+    def to_ground_33(self) -> Doubles:
+        """The homography from its pixels to (east, north) in metres."""
+        half_m = len(self.pixels_HW3) / 2 * self.metres_per_pixel
+        scale = self.metres_per_pixel
+        return np.array([[scale, 0, -half_m], [0, -scale, half_m], [0, 0, 1]])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tile:
+    """An image of the map and the ground that it shows."""
+
+    pixels_HW3: Pixels
+    footprint: Footprint
+
+
+def tile_resolution(footprint: Footprint, size: tuple[int, int]) -> float:
+    """Metres per pixel of a tile of `size` (width, height)."""
+    corners_42 = np.asarray(footprint, np.float64)
+    plane = LocalPlane(lat=float(corners_42[0, 0]), lon=float(corners_42[0, 1]))
+    ground_42 = plane.to_metres(corners_42)
+    across, down = (
+        np.linalg.norm(ground_42[1] - ground_42[0]),
+        np.linalg.norm(ground_42[3] - ground_42[0]),
+    )
+    return float(np.sqrt(across * down / (size[0] * size[1])))
+
+
+def compose_window(
+    plane: LocalPlane, tiles: Iterable[Tile], half_m: float, metres_per_pixel: float
+) -> MapWindow:
+    """The ground within `half_m` east, west, north and south of the plane's zero, from the tiles
+    that show it; where several do, from the first."""
+    side = max(1, round(2 * half_m / metres_per_pixel))
+    pixels_HW3, shown_HW = np.zeros((side, side, 3), np.uint8), np.zeros((side, side), np.uint8)
+    for tile in tiles:
+        ground_42 = plane.to_metres(np.asarray(tile.footprint, np.float64))
+        target_42 = (ground_42 * (1, -1) + half_m) / metres_per_pixel
+        least, most = np.floor(target_42.min(axis=0)), np.ceil(target_42.max(axis=0))
+        (left, top), (right, bottom) = (
+            np.clip(edge, 0, side).astype(int).tolist() for edge in (least, most)
+        )
+        if right <= left or bottom <= top or shown_HW[top:bottom, left:right].all():
+            continue
+        patch_HW3, inside_HW = _warp(tile.pixels_HW3, target_42 - (left, top), right - left,
+                                     bottom - top)  # fmt: skip
+        new_HW = inside_HW & (shown_HW[top:bottom, left:right] == 0)
+        pixels_HW3[top:bottom, left:right][new_HW] = patch_HW3[new_HW]
+        shown_HW[top:bottom, left:right][new_HW] = 255
+    return MapWindow(
+        pixels_HW3=pixels_HW3, shown_HW=shown_HW, metres_per_pixel=metres_per_pixel, plane=plane
+    )  # fmt: skip
+
+
+def _warp(pixels_HW3: Pixels, target_42: Doubles, width: int, height: int) -> tuple[Pixels, Any]:
+    """A tile drawn with its corners at `target_42`, and where it covers its patch."""
+    rows, columns = pixels_HW3.shape[:2]
+    shrink = np.linalg.norm(target_42[1] - target_42[0]) / columns
+    if shrink < 0.75:  # averaged first: a warp alone would alias
+        size = (max(1, round(columns * shrink)), max(1, round(rows * shrink)))
+        pixels_HW3 = np.asarray(cv2.resize(pixels_HW3, size, interpolation=cv2.INTER_AREA))
+        rows, columns = pixels_HW3.shape[:2]
+    source_42 = np.array([[0, 0], [columns, 0], [columns, rows], [0, rows]], np.float32)
+    # OpenCV counts from the middle of the first pixel.
+    to_patch_33 = cv2.getPerspectiveTransform(
+        source_42 - np.float32(0.5), (target_42 - 0.5).astype(np.float32)
+    )
+    patch_HW3 = cv2.warpPerspective(
+        pixels_HW3, to_patch_33, (width, height), flags=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    inside_HW = np.zeros((height, width), np.uint8)
+    cv2.fillConvexPoly(inside_HW, np.round(target_42 * 16 - 8).astype(np.int32), 1, shift=4)
+    return np.asarray(patch_HW3, np.uint8), inside_HW > 0

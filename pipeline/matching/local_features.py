@@ -1,0 +1,61 @@
+"""Points of an image that look alike in another image: SIFT, compared as square roots.
+
+In: images. Out: points with descriptors, and pairs of them. SIFT is OpenCV's [Lowe 2004]; the
+descriptors' square roots are compared [RootSIFT, Arandjelovic and Zisserman 2012], and a pair holds
+where each is the other's nearest and clearly nearer than the second [Lowe 2004, section 7.1].
+Shapes: N points, D = 128, M pairs.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from pipeline.core.arrays import Doubles, Floats, Ints, Pixels
+
+LEAST_CONTRAST = 0.02
+"Half of SIFT's own: haze and shadow leave little of a photo's contrast."
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalFeatures:
+    """Points of one image."""
+
+    points_N2: Doubles
+    "Column and row, (0, 0) being the outer corner of the first pixel."
+    descriptors_ND: Floats
+    "Of unit length."
+
+
+def find_features(image_HW3: Pixels, most: int, mask_HW: Pixels | None = None) -> LocalFeatures:
+    """The points of the strongest contrast, at most `most`; only where `mask_HW` is not 0."""
+    grey_HW = cv2.cvtColor(image_HW3, cv2.COLOR_RGB2GRAY)
+    sift = cv2.SIFT.create(nfeatures=most, contrastThreshold=LEAST_CONTRAST)
+    points, descriptors_ND = sift.detectAndCompute(grey_HW, mask_HW)
+    if descriptors_ND is None:
+        return LocalFeatures(
+            points_N2=np.zeros((0, 2)), descriptors_ND=np.zeros((0, 128), np.float32)
+        )
+    total_N1 = descriptors_ND.sum(axis=1, keepdims=True)
+    return LocalFeatures(
+        points_N2=np.array([point.pt for point in points]) + 0.5,
+        descriptors_ND=np.sqrt(descriptors_ND / np.maximum(total_N1, 1e-12)).astype(np.float32),
+    )
+
+
+def match_features(one: LocalFeatures, other: LocalFeatures, ratio: float) -> Ints:
+    """Pairs (M, 2) of points, numbers in `one` and `other`: mutually nearest, and nearer than
+    `ratio` times the distance of the second nearest."""
+    if len(one.points_N2) == 0 or len(other.points_N2) < 2:
+        return np.zeros((0, 2), np.int64)
+    similarity_NM = one.descriptors_ND @ other.descriptors_ND.T
+    nearest_N = similarity_NM.argmax(axis=1)
+    rows_N = np.arange(len(nearest_N))
+    mutual_N = similarity_NM.argmax(axis=0)[nearest_N] == rows_N
+    best_N = similarity_NM[rows_N, nearest_N]
+    similarity_NM[rows_N, nearest_N] = -1
+    second_N = similarity_NM.max(axis=1)
+    # Of unit vectors the squared distance is 2 - 2 * cosine.
+    clear_N = 1 - best_N < ratio**2 * (1 - second_N)
+    kept = np.flatnonzero(mutual_N & clear_N)
+    return np.stack([kept, nearest_N[kept]], axis=1)

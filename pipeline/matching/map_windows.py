@@ -1,0 +1,159 @@
+"""Windows of the map around candidates, put together from the gallery's tiles.
+
+In: a gallery's positions, and readers of its tiles' pixels and footprints. Out: windows with their
+features. Windows lie on a grid of half their own size, so that neighbouring photos share them.
+"""
+
+import math
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Protocol
+
+import numpy as np
+
+from pipeline.camera.local_plane import LocalPlane
+from pipeline.camera.map_window import Tile, compose_window, tile_resolution
+from pipeline.core.arrays import Doubles, Ints, Pixels, Strings
+from pipeline.images.decode import DecodeError, decode
+from pipeline.images.thumbnails import ImageLoader
+from pipeline.matching.refine import MatchableWindow, prepare_window
+
+
+class TilePositions(Protocol):
+    """The tiles of a gallery and where their middles lie."""
+
+    @property
+    def keys(self) -> Strings:
+        """Keys of the tiles (N,)."""
+
+    @property
+    def positions_N2(self) -> Doubles:
+        """Latitudes and longitudes (N, 2), NaN where unknown."""
+
+    def nearest(self, lat: float, lon: float, count: int) -> Ints:
+        """Numbers of the tiles nearest to a position, nearest first."""
+
+
+Footprints = Callable[[Iterable[str]], Mapping[str, list[list[float]]]]
+"Corners (lat, lon) of gallery images by key, where known."
+TILES_ACROSS = 4.0
+"Side of a window in sides of a tile: photos see one to four."
+MOST_SIDE_PX = 1200
+"Of a window: more pixels than a photo of 640 can use."
+WINDOWS_IN_MEMORY = 48
+"Some 8 MB each."
+MOST_TILES = 400
+"Of a window."
+SIDES_SAMPLE = 200
+"Tiles whose sizes are looked at."
+Place = tuple[float, int, int]
+"Half a window's side in metres, and the row and column of its grid."
+
+
+class MapWindows:
+    """The windows of one gallery, made when asked for; the latest are kept."""
+
+    def __init__(self, gallery: TilePositions, fetch: ImageLoader, footprints: Footprints) -> None:
+        self._gallery, self._fetch, self._footprints = gallery, fetch, footprints
+        self._kept: OrderedDict[Place, MatchableWindow | None] = OrderedDict()
+
+    def around(
+        self, positions: Iterable[tuple[float, float, str]], most: int, reach_m: float = 0.0
+    ) -> Iterator[MatchableWindow]:
+        """The windows around positions (lat, lon, key of the tile there), each once, at most `most`
+        of them; `reach_m`: the least half of a window's side."""
+        seen: set[Place] = set()
+        for lat, lon, key in positions:
+            half_m = self._half_side(key, reach_m)
+            if half_m is None:
+                continue
+            place = self._place(lat, lon, half_m)
+            if place in seen:
+                continue
+            if len(seen) == most:
+                return
+            seen.add(place)
+            window = self._window(place)
+            if window is not None:
+                yield window
+
+    def tile_sides_m(self) -> list[float]:
+        """The sides of the gallery's tiles, rising; such as differ by less than a tenth are one."""
+        count = len(self._gallery.keys)
+        numbers = np.unique(np.linspace(0, count - 1, min(count, SIDES_SAMPLE)).astype(int))
+        shown = self._footprints([str(key) for key in self._gallery.keys[numbers]])
+        sides = sorted(tile_resolution(footprint, (1, 1)) for footprint in shown.values())
+        kept: list[float] = []
+        for side in sides:
+            if not kept or side > 1.1 * kept[-1]:
+                kept.append(side)
+        return kept
+
+    def _half_side(self, key: str, reach_m: float) -> float | None:
+        """Half the side of the window for a tile, metres, in steps of a quarter more; None where
+        the tile's ground is not known."""
+        footprint = self._footprints([key]).get(key)
+        if footprint is None:
+            return None
+        half_m = max(TILES_ACROSS / 2 * tile_resolution(footprint, (1, 1)), reach_m)
+        return float(1.25 ** math.ceil(math.log(half_m, 1.25) - 1e-6))
+
+    def _place(self, lat: float, lon: float, half_m: float) -> Place:
+        row = round(lat / self._step_lat(half_m))
+        return half_m, row, round(lon / self._step_lon(half_m, row))
+
+    def _step_lat(self, half_m: float) -> float:
+        return half_m / 2 / 111_000
+
+    def _step_lon(self, half_m: float, row: int) -> float:
+        lat = row * self._step_lat(half_m)
+        return self._step_lat(half_m) / max(math.cos(math.radians(lat)), 0.01)
+
+    def _window(self, place: Place) -> MatchableWindow | None:
+        if place in self._kept:
+            self._kept.move_to_end(place)
+        else:
+            self._kept[place] = self._make(place)
+            if len(self._kept) > WINDOWS_IN_MEMORY:
+                self._kept.popitem(last=False)
+        return self._kept[place]
+
+    def _make(self, place: Place) -> MatchableWindow | None:
+        half_m, row, column = place
+        plane = LocalPlane(
+            lat=row * self._step_lat(half_m), lon=column * self._step_lon(half_m, row)
+        )
+        keys = self._keys_within(plane, half_m)
+        footprints = self._footprints(keys)
+        images = self._fetch(footprints)
+        decoded = {key: decode_or_none(data) for key, data in images.items()}
+        tiles = [
+            Tile(pixels_HW3=pixels, footprint=footprints[key])
+            for key in keys
+            if key in footprints and (pixels := decoded.get(key)) is not None
+        ]
+        if not tiles:
+            return None
+        finest = min(
+            tile_resolution(tile.footprint, tile.pixels_HW3.shape[1::-1]) for tile in tiles
+        )
+        # The finest tiles first: a window shows each ground by the first tile that has it.
+        tiles.sort(key=lambda tile: tile_resolution(tile.footprint, tile.pixels_HW3.shape[1::-1]))
+        return prepare_window(
+            compose_window(plane, tiles, half_m, max(finest, 2 * half_m / MOST_SIDE_PX))
+        )
+
+    def _keys_within(self, plane: LocalPlane, half_m: float) -> list[str]:
+        """Tiles whose middle lies within the window or a tile's side beyond it, nearest first."""
+        numbers = self._gallery.nearest(plane.lat, plane.lon, MOST_TILES)
+        away_N = np.abs(plane.to_metres(self._gallery.positions_N2[numbers])).max(axis=1)
+        beyond_m = 2 * half_m / TILES_ACROSS
+        return [str(key) for key in self._gallery.keys[numbers[away_N < half_m + beyond_m]]]
+
+
+def decode_or_none(data: bytes) -> Pixels | None:
+    """The pixels; None of a damaged tile, which leaves a hole in the window."""
+    try:
+        return decode(data)
+    except DecodeError:
+        return None

@@ -1,0 +1,246 @@
+"""A photo and windows of the map -> the place that the photo shows, within metres.
+
+In: a photo's pixels, windows around candidate positions, and what is known of the camera. Out: a
+`Refinement`, or None where no window holds a view that a camera can have.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from pipeline.camera.ground import (
+    HorizonInView,
+    apply_homography,
+    camera_above,
+    corners,
+    footprint,
+    heading_of,
+    photo_to_ground,
+)
+from pipeline.camera.map_window import MapWindow
+from pipeline.camera.pose import PartialPose
+from pipeline.camera.uncertainty import Ellipse, ellipse_of
+from pipeline.core.arrays import Doubles, Pixels
+from pipeline.matching.ground_fit import (
+    GroundFit,
+    agree_with_promise,
+    fit_ground,
+    is_camera_view,
+)
+from pipeline.matching.local_features import LocalFeatures, find_features, match_features
+
+PHOTO_PX = 640
+"Longest side of a photo when it is matched."
+PHOTO_FEATURES, WINDOW_FEATURES = 2000, 6000
+TOLERANCE_PX = 4.0
+"Of an inlier, in pixels of the window."
+ALONE_RATIO, PROMISED_RATIO = 0.85, 0.95
+"""Of the distances of the nearest and the second nearest descriptor. Where a pose promises the
+ground, more doubtful pairs may come: it sorts them out."""
+ENOUGH_INLIERS = 60
+"A window with so many ends the search for a better one."
+MOST_SCALE = 4.0
+"Between a footprint's sides and those that the pose promises: height above take-off errs."
+MOST_TURN_DEG = 45.0
+"Between a heading and the one that the pose promises."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refinement:
+    """Where a photo lies on the map."""
+
+    lat: float
+    "Of the ground in the photo's middle, WGS84."
+    lon: float
+    "Degrees east."
+    ellipse: Ellipse
+    "95 % of its error, by the spread of the matches, if they are right."
+    heading_deg: float
+    "Of the image's top in the photo's middle, clockwise from true north."
+    footprint: tuple[tuple[float, float], ...]
+    "Corners (lat, lon) of the ground shown, from the photo's upper left clockwise."
+    camera: tuple[float, float, float] | None
+    "The camera's own latitude, longitude and height above the ground, where the lens is known."
+    inliers: int
+    "Matches that agree with one view of a camera."
+    matches: int
+    "Points of the photo and of the map that look alike."
+    residual_m: float
+    "Root mean square distance of the inliers on the ground."
+    pairs: tuple[tuple[float, float, float, float], ...]
+    """Up to MOST_PAIRS inliers spread over the photo: column and row as shares of the photo's width
+    and height, latitude, longitude."""
+
+
+MOST_PAIRS = 24
+"Pairs that a refinement keeps, to be drawn."
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchablePhoto:
+    """A photo with its features, found once for all windows."""
+
+    size: tuple[int, int]
+    "Width and height when matched."
+    features: LocalFeatures
+    pose: PartialPose
+    promised_N2: Doubles | None
+    "Ground (east, north) of its features below the camera, metres, where the pose is complete."
+
+
+def prepare_photo(photo_HW3: Pixels, pose: PartialPose | None = None) -> MatchablePhoto:
+    """The features of a photo; a large one is made smaller first."""
+    rows, columns = photo_HW3.shape[:2]
+    scale = min(1.0, PHOTO_PX / max(rows, columns))
+    size = (round(columns * scale), round(rows * scale))
+    small_HW3 = np.asarray(cv2.resize(photo_HW3, size, interpolation=cv2.INTER_AREA), np.uint8)
+    pose = pose or PartialPose()
+    to_ground_33 = promised_ground(pose, size)
+    if to_ground_33 is None:
+        features = find_features(small_HW3, PHOTO_FEATURES)
+        return MatchablePhoto(size=size, features=features, pose=pose, promised_N2=None)
+    features = _features_on_the_ground(small_HW3, to_ground_33)
+    promised_N2 = apply_homography(to_ground_33, features.points_N2)
+    return MatchablePhoto(size=size, features=features, pose=pose, promised_N2=promised_N2)
+
+
+def promised_ground(pose: PartialPose, size: tuple[int, int]) -> Doubles | None:
+    """The homography to the ground by the pose; None where it is not complete, or shows the
+    horizon."""
+    if not pose.complete:
+        return None
+    try:
+        footprint(pose.over(), size)
+    except HorizonInView:
+        return None
+    return photo_to_ground(pose.over(), size)
+
+
+def _features_on_the_ground(photo_HW3: Pixels, to_ground_33: Doubles) -> LocalFeatures:
+    """Features, in the photo's own pixels, that are found on the photo as it lies on the ground:
+    north up, an oblique view no longer foreshortened."""
+    size = (photo_HW3.shape[1], photo_HW3.shape[0])
+    to_flat_33, flat_size = _flat_frame(apply_homography(to_ground_33, corners(size)), to_ground_33)
+    half_33 = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV counts from pixels' middles
+    flat_HW3 = cv2.warpPerspective(
+        photo_HW3, np.linalg.inv(half_33) @ to_flat_33 @ half_33, flat_size, flags=cv2.INTER_LINEAR
+    )
+    mask_HW = np.zeros(flat_size[::-1], np.uint8)
+    outline_42 = apply_homography(to_flat_33, corners(size))
+    cv2.fillConvexPoly(mask_HW, np.round(outline_42).astype(np.int32), 255)
+    found = find_features(np.asarray(flat_HW3, np.uint8), PHOTO_FEATURES, mask_HW)
+    return LocalFeatures(
+        points_N2=apply_homography(np.asarray(np.linalg.inv(to_flat_33)), found.points_N2),
+        descriptors_ND=found.descriptors_ND,
+    )
+
+
+def _flat_frame(ground_42: Doubles, to_ground_33: Doubles) -> tuple[Doubles, tuple[int, int]]:
+    """The homography from a photo's pixels to a north-up picture of its ground, and its size."""
+    least_2, most_2 = ground_42.min(axis=0), ground_42.max(axis=0)
+    scale = PHOTO_PX / float((most_2 - least_2).max())
+    width, height = (max(1, round(side)) for side in ((most_2 - least_2) * scale).tolist())
+    place_33 = np.array(
+        [[scale, 0, -scale * least_2[0]], [0, -scale, scale * most_2[1]], [0, 0, 1]]
+    )
+    return place_33 @ to_ground_33, (width, height)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchableWindow:
+    """A window of the map with its features."""
+
+    window: MapWindow
+    features: LocalFeatures
+
+
+def prepare_window(window: MapWindow) -> MatchableWindow:
+    """The features of a window."""
+    found = find_features(window.pixels_HW3, WINDOW_FEATURES, window.shown_HW)
+    return MatchableWindow(window=window, features=found)
+
+
+def refine(photo: MatchablePhoto, windows: Iterable[MatchableWindow]) -> Refinement | None:
+    """The refinement of the most inliers among the windows; those after one of ENOUGH_INLIERS are
+    not tried."""
+    best: Refinement | None = None
+    for window in windows:
+        found = refine_in(photo, window)
+        if found is not None and (best is None or found.inliers > best.inliers):
+            best = found
+            if best.inliers >= ENOUGH_INLIERS:
+                break
+    return best
+
+
+def refine_in(photo: MatchablePhoto, matchable: MatchableWindow) -> Refinement | None:
+    """The refinement by one window; None where no homography holds, or no camera makes it."""
+    window = matchable.window
+    promised_N2 = photo.promised_N2
+    ratio = ALONE_RATIO if promised_N2 is None else PROMISED_RATIO
+    pairs_M2 = match_features(photo.features, matchable.features, ratio)
+    photo_M2 = photo.features.points_N2[pairs_M2[:, 0]]
+    ground_M2 = apply_homography(window.to_ground_33, matchable.features.points_N2[pairs_M2[:, 1]])
+    if promised_N2 is not None:
+        agree_M = agree_with_promise(promised_N2[pairs_M2[:, 0]], ground_M2)
+        photo_M2, ground_M2 = photo_M2[agree_M], ground_M2[agree_M]
+    fit = fit_ground(photo_M2, ground_M2, photo.size, TOLERANCE_PX * window.metres_per_pixel)
+    if fit is None or not is_camera_view(fit.to_ground_33, photo.size):
+        return None
+    if not _fits_the_pose(fit.to_ground_33, photo):
+        return None
+    return _refinement(fit, photo, window, photo_M2, ground_M2)
+
+
+def _fits_the_pose(to_ground_33: Doubles, photo: MatchablePhoto) -> bool:
+    """Whether heading and size of the footprint are near what is known of the camera."""
+    pose = photo.pose
+    if pose.heading_deg is not None:
+        turn = (heading_of(to_ground_33, photo.size) - pose.heading_deg + 180) % 360 - 180
+        if abs(turn) > MOST_TURN_DEG:
+            return False
+    promised_33 = promised_ground(pose, photo.size)
+    if promised_33 is not None:
+        sides_2 = np.ptp(apply_homography(promised_33, corners(photo.size)), axis=0)
+        found_2 = np.ptp(apply_homography(to_ground_33, corners(photo.size)), axis=0)
+        ratio = float(np.sqrt((found_2 / sides_2).prod()))
+        return 1 / MOST_SCALE < ratio < MOST_SCALE
+    return True
+
+
+def _refinement(
+    fit: GroundFit,
+    photo: MatchablePhoto,
+    window: MapWindow,
+    photo_M2: Doubles,
+    ground_M2: Doubles,
+) -> Refinement:
+    width, height = photo.size
+    shown_52 = np.concatenate([corners(photo.size), [[width / 2, height / 2]]])
+    *outline, (lat, lon) = window.plane.to_degrees(
+        apply_homography(fit.to_ground_33, shown_52)
+    ).tolist()
+    camera = None
+    if photo.pose.fov_deg is not None:
+        east, north, up = camera_above(fit.to_ground_33, photo.size, photo.pose.fov_deg)
+        [[camera_lat, camera_lon]] = window.plane.to_degrees(np.array([[east, north]])).tolist()
+        camera = (camera_lat, camera_lon, up)
+    agreeing = np.flatnonzero(fit.inliers_M)
+    drawn = agreeing[np.linspace(0, len(agreeing) - 1, min(MOST_PAIRS, len(agreeing))).astype(int)]
+    drawn_N4 = np.hstack(
+        [photo_M2[drawn] / (width, height), window.plane.to_degrees(ground_M2[drawn])]
+    )
+    return Refinement(
+        lat=lat,
+        lon=lon,
+        ellipse=ellipse_of(fit.middle_covariance_22),
+        heading_deg=heading_of(fit.to_ground_33, photo.size),
+        footprint=tuple((corner[0], corner[1]) for corner in outline),
+        camera=camera,
+        inliers=fit.inliers,
+        matches=len(photo_M2),
+        residual_m=fit.residual_m,
+        pairs=tuple((row[0], row[1], row[2], row[3]) for row in drawn_N4.tolist()),
+    )

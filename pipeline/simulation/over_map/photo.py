@@ -1,0 +1,210 @@
+"""One simulated UAV photo over a map: a GeoTIFF, a seed and a number come in, JPEG bytes with the
+camera's tags and the true position go out.
+
+A pure function of its spec and the map. The ground is the map's own pixels, on another day's
+season, haze and sensor; with a surface model it has relief and parallax, without one it is flat.
+Sun and shadows stay as in the map.
+"""
+
+from dataclasses import dataclass
+from math import cos, radians, sin, tan
+
+import cv2
+import numpy as np
+import rasterio
+import simplejpeg
+from rasterio.enums import Resampling
+from rasterio.transform import Affine
+from rasterio.warp import reproject
+
+from pipeline.camera.ground import apply_homography, corners, photo_to_ground
+from pipeline.camera.local_plane import LocalPlane
+from pipeline.camera.map_window import MapWindow, Tile, compose_window
+from pipeline.camera.pose import Pose
+from pipeline.core.errors import InputError
+from pipeline.simulation.appearance import sample_day
+from pipeline.simulation.flight import LOWEST_RAY_DEG
+from pipeline.simulation.over_map.photo_tags import with_camera_tags
+from pipeline.simulation.over_map.settings import MapFlightSettings
+from pipeline.simulation.render import render_perspective
+from pipeline.simulation.scene import REACH_IN_RADII, prepare_scene
+from pipeline.simulation.texture import vegetation
+from pipeline.simulation.world import FloatMap, World
+from pipeline.sources.maps.mosaic import colours_for, open_mosaic, read_window
+from pipeline.sources.maps.placement import MosaicRejected, Placement, place_mosaic
+from pipeline.sources.maps.tiles import Window
+
+JPEG_QUALITY = 88
+MOST_TRIES = 60
+"Places that are drawn for a photo until one shows enough of the map."
+LEAST_SHOWN = 0.98
+"Of the ground around a photo: its share that the map has."
+MARGIN_M = 12.0
+"Ground beyond the photo's corners."
+BLUR_PX = (0.4, 1.1)
+"Range of the lens' blur, standard deviation in pixels."
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapPhoto:
+    """A photo and its truth."""
+
+    jpeg: bytes
+    lat: float
+    "Of the ground in the photo's middle, WGS84."
+    lon: float
+    pose: Pose
+    "The true one; x and y from that ground."
+
+
+def photo_over_map(settings: MapFlightSettings, number: int) -> MapPhoto:
+    """Photo `number` of a flight.
+
+    Raises InputError where the map has no place for it, or cannot be used.
+    """
+    rng = np.random.default_rng([settings.seed, number])
+    try:
+        placement = place_mosaic(settings.mosaic, None, False)
+    except MosaicRejected as rejected:
+        raise InputError(
+            f"{settings.mosaic} cannot be flown over: {rejected.reason} ({rejected.found}); "
+            "expected a georeferenced GeoTIFF"
+        ) from None
+    for _ in range(MOST_TRIES):
+        pose = draw_pose(settings, rng)
+        window = _draw_window(settings.mosaic, placement, _reach_m(pose), rng)
+        if window.shown_HW.mean() >= LEAST_SHOWN * 255:
+            break
+    else:
+        raise InputError(
+            f"{settings.mosaic} shows no place for photo {number} in {MOST_TRIES} tries: found "
+            f"{window.shown_HW.mean() / 255:.0%} of the ground around the last one, expected "
+            f"{LEAST_SHOWN:.0%}; fly lower or steeper, or give a larger map"
+        )
+    heights_HW = _heights(settings.surface, window) if settings.surface else None
+    world = _world(window, heights_HW)
+    middle = len(world.height_HW) // 2
+    raised = _raise(pose, float(world.height_HW[middle, middle]))
+    frame_SS3 = render_perspective(
+        prepare_scene(world, sample_day(rng)), raised, size=settings.size, rng=rng
+    )
+    frame_SS3 = np.asarray(cv2.GaussianBlur(frame_SS3, (0, 0), rng.uniform(*BLUR_PX)), np.uint8)
+    jpeg: bytes = simplejpeg.encode_jpeg(frame_SS3, quality=JPEG_QUALITY, colorspace="RGB")
+    told = _told(pose, settings, rng)
+    return MapPhoto(
+        jpeg=with_camera_tags(jpeg, told, settings.size),
+        lat=window.plane.lat,
+        lon=window.plane.lon,
+        pose=pose,
+    )
+
+
+def draw_pose(settings: MapFlightSettings, rng: np.random.Generator) -> Pose:
+    """A pose that looks at (0, 0), uniformly within the settings' ranges; the view is narrowed
+    where its lowest ray would be flatter than LOWEST_RAY_DEG."""
+    pitch = float(rng.uniform(*settings.pitch))
+    widest = 2 * (-pitch - LOWEST_RAY_DEG)
+    fov = min(float(rng.uniform(*settings.fov)), widest)
+    height = float(rng.uniform(*settings.height))
+    heading = float(rng.uniform(0, 360))
+    away = height / tan(radians(-pitch))
+    return Pose(
+        x_m=-away * sin(radians(heading)),
+        y_m=-away * cos(radians(heading)),
+        altitude_m=height,
+        heading_deg=heading,
+        pitch_deg=pitch,
+        fov_deg=fov,
+    )
+
+
+def _reach_m(pose: Pose) -> float:
+    """Half the side of the square of ground that a photo shows, around (0, 0)."""
+    size = (100, 100)
+    shown_42 = apply_homography(photo_to_ground(pose, size), corners(size))
+    return float(np.abs(shown_42).max()) + MARGIN_M
+
+
+def _draw_window(
+    path: str, placement: Placement, half_m: float, rng: np.random.Generator
+) -> MapWindow:
+    """The map around a random one of its pixels, north up, at its own resolution."""
+    dataset = open_mosaic(path)
+    x, y = rng.uniform(0, dataset.width), rng.uniform(0, dataset.height)
+    [[lat, lon]] = placement.georeference.degrees(np.array([[x, y]])).tolist()
+    plane = LocalPlane(lat=lat, lon=lon)
+    # The diagonal: the map may be turned against north.
+    across, down = (1.45 * half_m / side for side in placement.pixel_m)
+    left, top = max(0, int(x - across)), max(0, int(y - down))
+    right, bottom = min(dataset.width, int(x + across) + 1), min(dataset.height, int(y + down) + 1)
+    part = Window(x=left, y=top, width=right - left, height=bottom - top)
+    colours = colours_for(path, None)
+    pixels_HW3 = read_window(path, part, (part.width, part.height), Resampling.average, colours)
+    [tag] = placement.georeference.geotags([part])
+    if tag is None or tag.footprint is None:
+        raise InputError(f"{path} has ground without a position, expected one; cut the map")
+    tile = Tile(pixels_HW3=pixels_HW3, footprint=tag.footprint)
+    window = compose_window(plane, [tile], half_m, min(placement.pixel_m))
+    if colours.gaps:  # black is a gap there
+        window.shown_HW[~window.pixels_HW3.any(axis=2)] = 0
+    return window
+
+
+def _heights(path: str, window: MapWindow) -> FloatMap:
+    """Metres (H, W) above the lowest ground of a window, by a surface model in any CRS."""
+    dataset = open_mosaic(path)
+    side = len(window.pixels_HW3)
+    plane, scale = window.plane, window.metres_per_pixel
+    local = f"+proj=aeqd +lat_0={plane.lat:.9f} +lon_0={plane.lon:.9f} +datum=WGS84 +units=m"
+    heights_HW = np.full((side, side), np.nan, np.float32)
+    reproject(
+        source=rasterio.band(dataset, 1), destination=heights_HW, dst_crs=local,
+        dst_transform=Affine(scale, 0, -side / 2 * scale, 0, -scale, side / 2 * scale),
+        dst_nodata=np.nan, resampling=Resampling.bilinear,
+    )  # fmt: skip
+    if np.isnan(heights_HW).mean() > 1 - LEAST_SHOWN:
+        raise InputError(
+            f"{path} has no heights around latitude {plane.lat:.5f}, longitude {plane.lon:.5f}; "
+            "expected a surface model of the same ground as the map; give one, or none"
+        )
+    lowest = np.nanmin(heights_HW)
+    return np.where(np.isnan(heights_HW), 0, heights_HW - lowest).astype(np.float32)
+
+
+def _world(window: MapWindow, heights_HW: FloatMap | None) -> World:
+    side = len(window.pixels_HW3)
+    grass_HW, trees_HW = vegetation(window.pixels_HW3.astype(np.float32))
+    flat_HW = np.zeros((side, side), np.float32)
+    return World(
+        texture_HW3=window.pixels_HW3,
+        height_HW=flat_HW if heights_HW is None else heights_HW,
+        metres_per_pixel=window.metres_per_pixel,
+        # The scene's mirrored margin follows from it: none is needed.
+        target_radius_m=side * window.metres_per_pixel / 2 / REACH_IN_RADII,
+        grass_HW=(grass_HW * 255).astype(np.uint8),
+        trees_HW=(trees_HW * 255).astype(np.uint8),
+        facade_HW=np.zeros((side, side), np.uint8),
+        along_HW=flat_HW,
+        facing_HW=flat_HW,
+        light_is_baked=True,
+    )
+
+
+def _raise(pose: Pose, ground_m: float) -> Pose:
+    """The pose over a world whose ground is so high at (0, 0)."""
+    return Pose(
+        x_m=pose.x_m, y_m=pose.y_m, altitude_m=pose.altitude_m + ground_m,
+        heading_deg=pose.heading_deg, pitch_deg=pose.pitch_deg, fov_deg=pose.fov_deg,
+    )  # fmt: skip
+
+
+def _told(pose: Pose, settings: MapFlightSettings, rng: np.random.Generator) -> Pose:
+    """The pose as the camera's sensors state it."""
+    return Pose(
+        x_m=pose.x_m,
+        y_m=pose.y_m,
+        altitude_m=pose.altitude_m * (1 + settings.height_error * rng.normal()),
+        heading_deg=(pose.heading_deg + settings.heading_error * rng.normal()) % 360,
+        pitch_deg=max(-90.0, pose.pitch_deg + settings.pitch_error * rng.normal()),
+        fov_deg=pose.fov_deg,
+    )

@@ -1,0 +1,56 @@
+"""The settings of a simulated flight over a map: the flags of jobs/fly.py.
+
+Imports nothing heavy, so that the command line is parsed at once.
+"""
+
+from dataclasses import dataclass
+
+from pipeline.core.errors import require
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapFlightSettings:
+    """The map, and the photos that are taken over it."""
+
+    mosaic: str
+    "The map: a GeoTIFF of any coordinate system and size."
+    out: str
+    "Folder of the photos and their table; a local or mounted path."
+    photos: int = 200
+    "Number of photos, each at a random place of the map."
+    surface: str | None = None
+    "A surface model (GeoTIFF, metres): relief and parallax. None: the ground is flat."
+    height: tuple[float, float] = (60.0, 120.0)
+    "Range of the camera's height above the ground, metres."
+    pitch: tuple[float, float] = (-90.0, -45.0)
+    "Range of the camera's angle above the horizon, degrees; -90 looks straight down."
+    fov: tuple[float, float] = (45.0, 65.0)
+    "Range of the field of view, degrees."
+    size: int = 512
+    "Side of a photo, pixels."
+    heading_error: float = 3.0
+    "Standard deviation of the heading in the photos' tags, degrees."
+    pitch_error: float = 1.0
+    "Likewise of the pitch."
+    height_error: float = 0.03
+    "Likewise of the height, as a share of it."
+    seed: int = 0
+    "Another seed flies elsewhere, on other days."
+    workers: int | None = None
+    """Photos rendered at once, each by a Ray task; None for as many as there are cores, 0 for one
+    after the other in this process."""
+
+    def __post_init__(self) -> None:
+        require(self.photos >= 1, "photos", self.photos, "1 or more")
+        require(64 <= self.size <= 2048, "size", self.size, "64 to 2048 pixels")
+        low, high = self.pitch
+        steep = "two angles from -90 to -35, the steeper first"
+        require(-90 <= low <= high <= -35, "pitch", self.pitch, steep)
+        low, high = self.height
+        require(0 < low <= high <= 2000, "height", self.height, "two heights up to 2,000 m")
+        low, high = self.fov
+        require(5 <= low <= high <= 120, "fov", self.fov, "two angles from 5 to 120 degrees")
+        for name in ("heading_error", "pitch_error", "height_error", "seed"):
+            require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
+        this = "0 (this process) or more"
+        require(self.workers is None or self.workers >= 0, "workers", self.workers, this)

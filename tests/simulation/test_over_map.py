@@ -1,0 +1,82 @@
+"""Flights over a map: photos with tags, true positions, and a rerun that does nothing."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import Affine
+
+from pipeline.core.errors import InputError
+from pipeline.images.camera_tags import read_tags
+from pipeline.images.image_blocks import find_metadata
+from pipeline.simulation.over_map.fly import fly
+from pipeline.simulation.over_map.photo import photo_over_map
+from pipeline.simulation.over_map.settings import MapFlightSettings
+
+SIDE = 700
+GROUND = Affine(0.3, 0, 500_000, 0, -0.3, 5_200_000)
+
+
+def write_map(path: Path, crs: str | None = "EPSG:32632") -> str:
+    cells = np.random.default_rng(0).integers(0, 256, (3, SIDE // 10, SIDE // 10), np.uint8)
+    with rasterio.open(
+        path, "w", driver="GTiff", width=SIDE, height=SIDE, count=3, dtype="uint8", crs=crs,
+        transform=GROUND, photometric="RGB",
+    ) as opened:  # fmt: skip
+        opened.write(cells.repeat(10, axis=1).repeat(10, axis=2))
+    return str(path)
+
+
+def settings(tmp_path: Path, **changes: object) -> MapFlightSettings:
+    given = {
+        "mosaic": str(tmp_path / "map.tif"), "out": str(tmp_path / "flight"), "photos": 2,
+        "height": (30.0, 40.0), "pitch": (-90.0, -70.0), "size": 96, "workers": 0,
+    }  # fmt: skip
+    return MapFlightSettings(**(given | changes))  # type: ignore[arg-type]
+
+
+def test_fly_writes_photos_with_tags_and_the_truth(tmp_path: Path) -> None:
+    write_map(tmp_path / "map.tif")
+    out = fly(settings(tmp_path))
+    rows = list(csv.DictReader((out / "photos.csv").open()))
+    assert [row["path"] for row in rows] == ["photos/00000.jpg", "photos/00001.jpg"]
+    for row in rows:
+        assert 46.95 < float(row["lat"]) < 46.96
+        tags = read_tags(find_metadata((out / row["path"]).read_bytes(), complete=True))
+        assert tags.position is None
+        assert tags.pitch_deg == pytest.approx(float(row["pitch_deg"]), abs=6)
+        assert tags.height_m == pytest.approx(float(row["altitude_m"]), rel=0.2)
+        assert tags.heading_deg is not None
+        assert tags.focal_px is not None
+        assert 75 < tags.focal_px < 120  # 96 pixels by 45 to 65 degrees
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
+    fly(settings(tmp_path))
+    assert before == {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match="other settings"):
+        fly(settings(tmp_path, seed=1))
+
+
+def test_photo_over_a_surface_model_has_relief(tmp_path: Path) -> None:
+    write_map(tmp_path / "map.tif")
+    steps = np.zeros((SIDE, SIDE), np.float32)
+    steps[:, ::40] = 8.0
+    with rasterio.open(
+        tmp_path / "surface.tif", "w", driver="GTiff", width=SIDE, height=SIDE, count=1,
+        dtype="float32", crs="EPSG:32632", transform=GROUND,
+    ) as opened:  # fmt: skip
+        opened.write(steps, 1)
+    flat = photo_over_map(settings(tmp_path), 0)
+    raised = photo_over_map(settings(tmp_path, surface=str(tmp_path / "surface.tif")), 0)
+    assert (flat.lat, flat.lon, flat.pose) == (raised.lat, raised.lon, raised.pose)
+    assert flat.jpeg != raised.jpeg
+
+
+def test_fly_over_an_unusable_map_is_refused(tmp_path: Path) -> None:
+    write_map(tmp_path / "map.tif", crs=None)
+    with pytest.raises(InputError, match="cannot be flown over"):
+        fly(settings(tmp_path))
+    write_map(tmp_path / "map.tif")
+    with pytest.raises(InputError, match="shows no place for photo 0"):
+        fly(settings(tmp_path, height=(900.0, 900.0)))
