@@ -119,6 +119,7 @@ def main() -> int:
     add = parser.add_argument
     add("--out", type=Path, required=True, help=f"folder of {FILE}")
     add("--minutes", type=float, default=9.5, help="then it stops with what it has")
+    add("--networks", nargs="+", choices=NETWORKS, default=NETWORKS, help="to measure")
     add("--only", help="one measurement, in this process")
     add("--width", type=float, default=1.0, help="channels of the networks, as a multiple")
     add("--size", type=int, default=256, help="side of their images, pixels")
@@ -136,7 +137,7 @@ def main() -> int:
         measure(args.only, args.out, settings)
         return 0
     deadline, missing = time.monotonic() + 60 * args.minutes, list[str]()
-    for name in (f"{kind}, {network}" for network in NETWORKS for kind in KINDS):
+    for name in (f"{kind}, {network}" for network in args.networks for kind in KINDS):
         problem = None
         if read_kept(args.out).get(name, {}).get("settings") == settings:
             print(f"{name}: kept from {args.out / FILE}")

@@ -22,6 +22,8 @@ os.environ.setdefault("RAY_AUTH_MODE", "disabled")
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 # Ray Train looks after its workers every 2 s otherwise, and ends that much later.
 os.environ.setdefault("RAY_TRAIN_HEALTH_CHECK_INTERVAL_S", "0.5")
+# A process of its own per training, for nodes that a cloud takes back.
+os.environ.setdefault("RAY_TRAIN_ENABLE_PREEMPTION_WATCHER", "0")
 # Never a cluster that someone, or another test, runs on this machine.
 os.environ["RAY_ADDRESS"] = "local"
 # Waiting threads yield their core: on a busy machine, a spinning thread takes it from the thread

@@ -50,8 +50,8 @@ CASES: dict[str, tuple[str, str]] = {
     ),
     "evaluate": ("--scale 0.01", r"satellite->drone .* [\d.]+ x the float32 products"),
     "gpu": (
-        "--out {out} --width 0.25 --size 128 --batch 2 --train-batch 2 --steps 1 --rounds 1 "
-        "--seconds 0.01 --compiling never --minutes 4",
+        "--out {out} --networks built-in --width 0.25 --size 128 --batch 2 --train-batch 2 "
+        "--steps 1 --rounds 1 --seconds 0.01 --compiling never --minutes 4",
         r"training, built-in: [\d.]+ images/s, [\d.]+ x the resident loop's(.|\n)*"
         r"\| embedding, built-in, float32, folded.* \| 1\.0000",
     ),
@@ -65,11 +65,11 @@ CASES: dict[str, tuple[str, str]] = {
         r"without_turns \| [\d.]+% \[.*\] \| [+-][\d.]+% \[",
     ),
     "own_map": (
-        "--imagery {images} --out {out} --tiles 3 --photos 3",
-        r"built-in: .* of 3 photos within 25 m, [\d.]+ x ImageNet's weights alone",
+        "--imagery {images} --out {out} --tiles 2 --photos 2",
+        r"built-in: .* of 2 photos within 25 m, [\d.]+ x ImageNet's weights alone",
     ),
     "serve": (
-        "--checkpoint {trained}/run/last.pt --index {trained}/index "
+        "--ray {ray} --checkpoint {trained}/run/last.pt --index {trained}/index "
         "--photos {trained}/flights/test/query_drone --clients 2 --seconds 0.2 --rounds 1",
         r"batching [\d.]+ x the photos/s",
     ),
@@ -86,15 +86,15 @@ CASES: dict[str, tuple[str, str]] = {
 }
 "Script -> arguments of its smallest size, and a line that it has to print."
 LOCATE = (
-    "--textures {images} --out {trained} --epochs 1 --hold-out 0.4 --train-locations 36 "
-    "--test-locations 6 --distractors 14 --flights 1 --stops 3 --draws 1"
+    "--textures {images} --out {trained} --epochs 1 --hold-out 0.35 --train-locations 28 "
+    "--test-locations 3 --distractors 7 --flights 1 --stops 3 --draws 1"
 )
 
 
 def run(launcher: Launcher, name: str, arguments: str, **folders: Path) -> str:
     """Run a benchmark to its end on the session's Ray; its output."""
-    words = arguments.format(**folders).split()
     address: str = ray.get_runtime_context().gcs_address
+    words = arguments.format(**folders, ray=address).split()
     result = launcher.start(name, words, folder="benchmarks", RAY_ADDRESS=address).end()
     assert result.code == 0, result.output[-3000:]
     return result.output
@@ -108,7 +108,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
         from synthetic import jpegs
     del sys.modules["synthetic"]
     folder = tmp_path_factory.mktemp("images")
-    for number, data in enumerate(jpegs(56, 96, 96)):
+    for number, data in enumerate(jpegs(38, 96, 96)):
         (folder / f"{number:03d}.jpg").write_bytes(data)
     return folder
 

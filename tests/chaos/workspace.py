@@ -16,6 +16,9 @@ from tests.processes import busy_workers, ray_daemons, start_cluster
 TIMEOUT_S = 180.0
 "A run counts as hung after this plus ten times an undisturbed run's duration."
 
+WORKER_STARTS_S = 1.0
+"Added to a stage's duration in one process, for a guess of that with Ray's workers."
+
 
 @dataclass(frozen=True, kw_only=True)
 class Baseline:
@@ -35,22 +38,25 @@ class Workspace:
         environment: Mapping[str, str],
         head: int,
         address: str,
-        quick: bool = False,
+        quick: Launcher | None = None,
     ) -> None:
         """`head`: process above the Ray cluster at `address`.
 
-        `quick`: a stage that can run in one process always does.
+        `quick`: starts the jobs, and a stage that can run in one process always does; how long it
+        takes with Ray's workers is not measured.
         """
-        self.quick = quick
+        self.quick = quick is not None
         self.folder, self._intact = scratch / "here", scratch / "pristine"
         self._fault, self._counter = scratch / "fault.json", scratch / "operations"
-        self._launcher = Launcher(scratch, {**environment, "CHAOS": str(self._fault)})
+        self._environment = {**environment, "CHAOS": str(self._fault)}
+        self._launcher = quick or Launcher(scratch, self._environment)
         self._head, self._address = head, address
         self._baselines: dict[str, Baseline] = {}
         self._seconds: dict[tuple[str, bool], float] = {}
 
     def close(self) -> None:
-        self._launcher.close()
+        if not self.quick:  # otherwise it is the caller's
+            self._launcher.close()
 
     def prepare(self, stage: Stage, with_output: bool = False) -> None:
         """Copy a stage's intact inputs, and its finished output if asked, to a fresh folder."""
@@ -65,7 +71,7 @@ class Workspace:
     ) -> RunningJob:
         address = "local" if own_cluster else self._address
         command = stage.command(self.folder, distributed, verified)
-        return self._launcher.start(stage.job, command, RAY_ADDRESS=address)
+        return self._start(stage.job, command, address)
 
     def run(self, stage: Stage, distributed: bool, verified: bool = False) -> JobResult:
         return self.start(stage, distributed, verified=verified).end(self.timeout_s(stage))
@@ -77,9 +83,12 @@ class Workspace:
     def verify_output(self, stage: Stage) -> JobResult:
         """Run the stage's own check of every byte that it wrote."""
         assert stage.verify_output
-        words = stage.verify_output.format(here=self.folder).split()
-        job = self._launcher.start(stage.job, words, RAY_ADDRESS=self._address)
-        return job.end(self.timeout_s(stage))
+        where = stage.in_process if self.quick else ""
+        words = f"{stage.verify_output} {where}".format(here=self.folder).split()
+        return self._start(stage.job, words, self._address).end(self.timeout_s(stage))
+
+    def _start(self, job: str, words: list[str], address: str) -> RunningJob:
+        return self._launcher.start(job, words, **self._environment, RAY_ADDRESS=address)
 
     def victims(self, job: RunningJob, kind: str) -> list[int]:
         """Processes that a kill of this kind may hit."""
@@ -113,9 +122,10 @@ class Workspace:
 
     def seconds(self, stage: Stage, distributed: bool) -> float:
         """The stage's undisturbed duration; measured on first use."""
-        distributed = distributed and bool(
-            stage.in_process
-        )  # otherwise Ray's workers run it anyway
+        # Without an argument for it, Ray's workers run the stage anyway.
+        distributed = distributed and bool(stage.in_process)
+        if distributed and self.quick:  # a worker starts and imports for as long at least
+            return self.seconds(stage, distributed=False) + WORKER_STARTS_S
         if (stage.name, distributed) not in self._seconds:
             self.prepare(stage)
             self._seconds[stage.name, distributed] = self._complete(stage, distributed)
@@ -157,7 +167,7 @@ ENVIRONMENT = {
 
 
 @contextmanager
-def open_workspace(scratch: Path, quick: bool = False) -> Iterator[Workspace]:
+def open_workspace(scratch: Path, quick: Launcher | None = None) -> Iterator[Workspace]:
     """A workspace in an emptied folder, with a Ray cluster of its own."""
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)

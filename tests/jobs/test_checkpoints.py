@@ -24,6 +24,7 @@ from jobs.training.recipes.recipe import Recipe
 from jobs.training.settings import TrainSettings
 from model.checkpoint import Checkpoint, loads
 from model.training import Training
+from pipeline.core import cluster
 from pipeline.core.errors import Incomplete
 from tests.launcher import Launcher, RunningJob
 from tests.processes import command_line, descendants, send_signal
@@ -123,7 +124,7 @@ def test_train_killed_resumes_to_the_same_bits(
 
 
 def test_train_killed_at_random_resumes_to_the_same_end(
-    tiny_shards: str, tmp_path: Path, prepared: Launcher
+    tiny_shards: str, tmp_path: Path, undisturbed: Path, prepared: Launcher
 ) -> None:
     def begin(out: Path) -> RunningJob:
         flags = (
@@ -139,7 +140,6 @@ def test_train_killed_at_random_resumes_to_the_same_end(
         )
         return prepared.start("train", ["smoke", *map(str, flags)])
 
-    assert begin(tmp_path / "whole").end().code == 0
     job = begin(tmp_path / "killed")
     while not (tmp_path / "killed" / "last.pt").exists():
         assert job.code is None
@@ -147,7 +147,7 @@ def test_train_killed_at_random_resumes_to_the_same_end(
     job.end(job.seconds + random.uniform(0, 1.5))
     time.sleep(1)  # TensorBoard orders a run's files by the second in which each was begun
     assert begin(tmp_path / "killed").end().code == 0
-    assert_same_run(tmp_path / "killed", tmp_path / "whole")
+    assert_same_run(tmp_path / "killed", undisturbed)
     assert on_board(tmp_path / "killed") == [1, 2, 3]
 
 
@@ -183,6 +183,7 @@ def on_board(out: Path) -> list[int]:
 def test_train_killed_ray_worker_is_replaced(
     tiny_shards: str, tmp_path: Path, ray_cluster: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    """The run ends with the bits of one in this process."""
     victims: list[int] = []
     out = tmp_path / "killed"
 
@@ -203,7 +204,10 @@ def test_train_killed_ray_worker_is_replaced(
     assert len(victims) == 1
     assert "lost a worker" in capfd.readouterr().err
     assert [row["epoch"] for row in rows(out)] == list(range(1, 9))
-    train(settings(tiny_shards, tmp_path / "whole", recipe=tiny(8), workers=1))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(cluster.cpus())  # as many as the worker has
+    train(settings(tiny_shards, tmp_path / "whole", recipe=tiny(8)))
+    torch.set_num_threads(threads)
     assert_same_run(out, tmp_path / "whole")
 
 

@@ -115,61 +115,20 @@ def answer(submitted: "subprocess.Popen[str]") -> str:
     return said
 
 
-def test_submit_runs_every_job_on_a_started_cluster(
+def test_submit_runs_tasks_training_and_actors(
     submit_environment: dict[str, str], tiny_shards: str, tmp_path: Path
 ) -> None:
-    """By twos and threes: most of each is its start."""
-    flights, shards, run, table, index, out = (
-        tmp_path / name for name in ("flights", "shards", "run", "table", "index", "out")
-    )
-    counts = (
-        "--train-locations",
-        4,
-        "--test-locations",
-        2,
-        "--distractors",
-        1,
-        "--views",
-        2,
-        "--size",
-        64,
-    )
-    small = (
-        "--workers",
-        1,
-        "--epochs",
-        1,
-        "--batch-size",
-        2,
-        "--part-dim",
-        16,
-        "--discriminator-channels",
-        16,
-    )
+    """A job of each kind: Ray's tasks, Ray Train, and a pool of actors that import the project."""
+    flights, run, table = (tmp_path / name for name in ("flights", "run", "table"))
+    counts = "--train-locations 4 --test-locations 2 --distractors 1 --views 2 --size 64"
+    small = "--workers 1 --epochs 1 --batch-size 2 --part-dim 16 --discriminator-channels 16"
     begin = partial(submit, submit_environment)
-    simulating = begin("simulate", "--out", flights, *counts)
-    training = begin("train", "smoke", "--shards", tiny_shards, "--out", run, *small)
-    answer(simulating)
-    packing = begin("make_shards", "--source", "university1652", "--root", flights, "--out", shards)
+    training = begin("train", "smoke", "--shards", tiny_shards, "--out", run, *small.split())
+    simulating = begin("simulate", "--out", flights, *counts.split())
     answer(training)
-    embed = (
-        "embed_gallery",
-        "--shards",
-        tiny_shards,
-        "--checkpoint",
-        run / "last.pt",
-        "--out",
-        table,
-    )
-    embedding = begin(*embed)
-    answer(packing)
+    network = ("--checkpoint", run / "last.pt", "--split", "query", "--view", "drone")
+    embedding = begin("embed_gallery", "--shards", tiny_shards, "--out", table, *network)
+    answer(simulating)
     answer(embedding)
-    indexing = begin("build_index", "--table", table, "--out", index)
-    evaluating = begin("evaluate", "--table", table, "--out", out)
-    again = begin(*embed)
-    answer(indexing)
-    answer(evaluating)
-    assert "nothing to do" in answer(again)
-    assert (shards / "manifest.json").exists()
-    assert (index / "index.json").exists()
-    assert (out / "report.html").exists()
+    assert len(list((flights / "train" / "satellite").rglob("*.jpg"))) == 4
+    assert list(table.glob("*.parquet"))
