@@ -83,6 +83,11 @@ CASES: dict[str, tuple[str, str]] = {
         "--cases smoke --steps 1 --rounds 1",
         r"streamed step .* [\d.]+ x the resident step",
     ),
+    "unlabelled": (
+        "--shards {tiny} --held places={tiny} --out {out} --rounds 1 --neighbours 9 "
+        "--round-epochs 1 --batch-size 2 --seeds 1",
+        r"with_the_adversary \| [\d.]+% \[.*\] \| [+-][\d.]+% \[.* \| \d+%",
+    ),
 }
 "Script -> arguments of its smallest size, and a line that it has to print."
 LOCATE = (
@@ -147,6 +152,8 @@ def test_script_prints_a_ratio(
     folders: dict[str, Path] = {"out": tmp_path}
     if "{images}" in arguments:
         folders["images"] = request.getfixturevalue("images")
+    if "{tiny}" in arguments:
+        folders["tiny"] = Path(request.getfixturevalue("tiny_shards"))
     if "{trained}" in arguments:
         folders["trained"] = request.getfixturevalue("trained")[0]
     output = run(prepared, name, arguments, **folders)

@@ -19,9 +19,8 @@ from ray.util.queue import Empty, Queue
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from jobs.training.checkpoints import FoundCheckpoint
 from jobs.training.settings import RunConfig, TrainSettings
-from jobs.training.state import DamageCount, WorkerContext
+from jobs.training.state import DamageCount, Shared, WorkerContext
 from jobs.training.worker import train_worker
 from model.errors import CheckpointError
 from pipeline.core import cluster
@@ -133,7 +132,7 @@ def ray_worker(config: dict[str, Any]) -> None:
     )
     if context.world_size > 1:
         context = replace(
-            context, wrap_ddp=wrap_ddp, broadcast=broadcast_checkpoint, gather=gather_damage
+            context, wrap_ddp=wrap_ddp, broadcast=broadcast_from_first, gather=gather_damage
         )
     try:
         train_worker(config["run"], context, messages.put if rank == 0 else lambda message: None)
@@ -148,9 +147,9 @@ def wrap_ddp(module: nn.Module) -> nn.Module:
     return DistributedDataParallel(module, broadcast_buffers=False)
 
 
-def broadcast_checkpoint(found: FoundCheckpoint) -> FoundCheckpoint:
-    """The checkpoint that rank 0 found."""
-    objects = [found]
+def broadcast_from_first(value: Shared) -> Shared:
+    """What rank 0 has."""
+    objects = [value]
     torch.distributed.broadcast_object_list(objects, src=0)
     return objects[0]
 

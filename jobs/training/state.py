@@ -4,9 +4,9 @@ In: a run, and the worker's context. Out: a `TrainingState`, resumed from the ru
 checkpoint where there is one, that makes the next checkpoint.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import torch
 from torch import nn
@@ -18,16 +18,31 @@ from model.checkpoint import Checkpoint
 from model.errors import CheckpointError
 from model.training import Training
 from model.weights.start import load_start
+from pipeline.batches.pseudo_labels import with_pseudo_labels
 from pipeline.batches.settings import StreamConfig
 from pipeline.batches.training import TrainingStream
 from pipeline.core import storage
 from pipeline.core.errors import Incomplete
 from pipeline.shards.shard_set import open_shards
 
+PSEUDO_LABELS = "pseudo_labels"
+"Entry of a checkpoint's state."
 Report = Callable[[dict[str, Any]], None]
 """Takes a worker's messages: `steps` taken since the last one with figures to show, or a `note`."""
 DamageCount = tuple[int, str | None]
 "How many images could not be decoded, and the key of the first."
+Shared = TypeVar("Shared")
+
+
+class Broadcast(Protocol):
+    """Gives every worker what rank 0 has."""
+
+    def __call__(self, value: Shared) -> Shared: ...
+
+
+def keep(value: Shared) -> Shared:
+    """The broadcast of a worker without others."""
+    return value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,9 +53,9 @@ class WorkerContext:
     world_size: int = 1
     device: str = "cpu"
     wrap_ddp: Callable[[nn.Module], nn.Module] = lambda module: module
-    broadcast: Callable[[FoundCheckpoint], FoundCheckpoint] = lambda found: found
-    """Gives every worker rank 0's checkpoint, so that all resume from one whatever each of them
-    sees of the storage."""
+    broadcast: Broadcast = keep
+    """Gives every worker rank 0's checkpoint and pseudo-labels, so that all train from one state
+    whatever each of them sees of the storage."""
     gather: Callable[[DamageCount], list[DamageCount]] = lambda damage: [damage]
     "Gives every worker the counts of all, by rank."
     after_epoch: Callable[[dict[str, Any]], None] = lambda row: None
@@ -57,7 +72,10 @@ class TrainingState:
         if self.training.compile_error is not None:
             reason = self.training.compile_error
             report({"note": f"not compiled, training continues uncompiled: {reason}"})
-        self.found = context.broadcast(find_checkpoint(run) if context.rank == 0 else None)
+        self.pseudo_labels: dict[str, Any] | None = None
+        "Those of the round that training is in, as a checkpoint stores them: `rounds.py`."
+        found = find_checkpoint(run) if context.rank == 0 else None
+        self.found: FoundCheckpoint = context.broadcast(found)
         self.history: list[dict[str, Any]] = []
         "The rows of the completed epochs."
         self.metrics = MetricAccumulator()
@@ -75,6 +93,7 @@ class TrainingState:
                 "expected one that jobs/train.py wrote on these shards; choose another --out, or "
                 "take it away to resume from the one before"
             ) from error
+        self.pseudo_labels = checkpoint.state.get(PSEUDO_LABELS)
         self.history = list(checkpoint.history)
         self.metrics = MetricAccumulator(checkpoint.step, checkpoint.metric_sums)
         if self.context.rank > 0:  # the checkpoint's count is rank 0's
@@ -89,7 +108,11 @@ class TrainingState:
         """All that resuming from here needs. Raises Incomplete where training has diverged."""
         self.means()
         made = make_checkpoint(self.run, self.training, self.stream, self.history)
-        return replace(made, step=self.metrics.steps, metric_sums=self.metrics.state_dict())
+        state = made.state
+        if self.pseudo_labels is not None:
+            state = state | {PSEUDO_LABELS: self.pseudo_labels}
+        sums = self.metrics.state_dict()
+        return replace(made, state=state, step=self.metrics.steps, metric_sums=sums)
 
     def means(self) -> dict[str, float]:
         """Means of the epoch's metrics so far. Raises Incomplete where one is not finite."""
@@ -111,8 +134,11 @@ class TrainingState:
         return self.metrics.steps * per_step / self.metrics.seconds
 
 
-def open_stream(run: RunConfig, context: WorkerContext) -> TrainingStream:
-    """The training images as this worker sees them.
+def open_stream(
+    run: RunConfig, context: WorkerContext, satellite_of: Mapping[str, str] | None = None
+) -> TrainingStream:
+    """The training images as this worker sees them; where the recipe makes pseudo-labels, with
+    these, and without them to be counted only.
 
     Raises InputError when the shards cannot be trained on.
     """
@@ -128,7 +154,10 @@ def open_stream(run: RunConfig, context: WorkerContext) -> TrainingStream:
         sampler=recipe.sampler,
         pair_repeats=recipe.pair_repeats,
     )
-    return TrainingStream(open_shards(run.shards), config, context.rank, context.world_size)
+    shards = open_shards(run.shards)
+    if recipe.pseudo_neighbours:
+        shards = with_pseudo_labels(shards, satellite_of)
+    return TrainingStream(shards, config, context.rank, context.world_size)
 
 
 def build_training(run: RunConfig, context: WorkerContext, locations: int) -> Training:

@@ -2,7 +2,7 @@
 after each.
 
 In: a run and this worker's context. Out: the run's folder, written by rank 0. `loop.py` has one
-epoch, `state.py` what a worker holds between epochs.
+epoch, `rounds.py` the pseudo-labels of several, `state.py` what a worker holds between epochs.
 """
 
 from contextlib import ExitStack, closing
@@ -10,6 +10,7 @@ from contextlib import ExitStack, closing
 from jobs.training.checkpoints import RunRecorder
 from jobs.training.loop import train_epoch
 from jobs.training.probes import probe
+from jobs.training.rounds import start_round
 from jobs.training.settings import RunConfig
 from jobs.training.state import Report, TrainingState, WorkerContext
 
@@ -25,7 +26,8 @@ def train_worker(run: RunConfig, context: WorkerContext, report: Report) -> None
         if context.rank == 0:
             recorder = stack.enter_context(closing(RunRecorder(run, state.found)))
         for epoch in range(len(state.history), epochs):
-            row = train_epoch(state, epoch, recorder)
+            labelled = start_round(state, epoch) if run.recipe.pseudo_neighbours else {}
+            row = train_epoch(state, epoch, recorder) | labelled
             due = run.probe_epochs and ((epoch + 1) % run.probe_epochs == 0 or epoch + 1 == epochs)
             if recorder is not None and due:
                 row |= probe(state.training.model.encoder, state.stream)

@@ -286,9 +286,10 @@ class TrainingStream:
         )
 
     def _class(self, sample: Sample, view: View) -> int:
-        """An image's class number. The key states the location too; the two are compared."""
-        location = sample.metadata["location"]
-        if location not in self.classes or not key_matches(sample.key, Split.TRAIN, view, location):
+        """An image's class number. Where the key states the location too, the two are compared."""
+        location, keyed = sample.metadata["location"], self.shards.keys_state_location
+        agrees = not keyed or key_matches(sample.key, Split.TRAIN, view, location)
+        if location not in self.classes or not agrees:
             raise InputError(
                 f"image {sample.key} of {self.shards.path} is of location {location!r}, expected "
                 f"the one of its key and of the manifest's {len(self.classes)}; "

@@ -5,7 +5,7 @@ In: a folder or URI. Out: a ShardSet with its manifest, samples, images by key a
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import pyarrow as pa
 
@@ -23,6 +23,8 @@ from pipeline.shards.tar_reader import IMAGE_SUFFIXES, read_tar
 class ShardSet:
     """A finished set of shards. It holds no open files and can be sent to other processes."""
 
+    keys_state_location: ClassVar[bool] = True
+    "Whether a sample's key names its location, so that the two can be compared."
     path: str
     "Folder or URI."
     manifest: Manifest

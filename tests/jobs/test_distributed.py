@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.multiprocessing import spawn  # type: ignore[attr-defined]
 
-from jobs.training.ray_group import broadcast_checkpoint, wrap_ddp
+from jobs.training.ray_group import broadcast_from_first, wrap_ddp
 from model.checkpoint import Checkpoint
 from model.config import Optimization, PVDAConfig
 from model.schedule import ScheduleState
@@ -78,7 +78,7 @@ def work(rank: int, port: int, out: str) -> None:
     )
     for _ in range(2):  # a second step: nothing of the first one's bookkeeping is left over
         training.step(drone, location1_B, satellite, location2_B, STILL)
-    found = broadcast_checkpoint(("last.pt", checkpoint(epoch=7)) if rank == 0 else None)
+    found = broadcast_from_first(("last.pt", checkpoint(epoch=7)) if rank == 0 else None)
     assert found is not None
     torch.save((gradients(training), found[1].epoch), f"{out}/{rank}.pt")
     torch.distributed.destroy_process_group()

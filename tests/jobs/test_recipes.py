@@ -58,6 +58,7 @@ def test_recipes_are_listed_by_their_names() -> None:
         "smoke",
         "builtin",
         "finetune",
+        "pvda_unlabelled",
         "instance_loss",
         "lcm_style",
         "lpn",

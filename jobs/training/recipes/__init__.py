@@ -24,6 +24,7 @@ from jobs.training.recipes.pvda import (
     paper_384,
     smoke,
 )
+from jobs.training.recipes.pvda_unlabelled import pvda_unlabelled
 from jobs.training.recipes.qdfl import qdfl
 from jobs.training.recipes.recipe import Recipe
 from jobs.training.recipes.sample4geo import sample4geo
@@ -40,6 +41,7 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
         smoke,
         builtin,
         finetune,
+        pvda_unlabelled,
         instance_loss,
         lcm_style,
         lpn,

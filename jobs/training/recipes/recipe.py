@@ -55,6 +55,13 @@ class Recipe:
     hold_out: float = 0.0
     """Share of the training locations that is held out, and probed every `probe_epochs` [chosen:
     none]."""
+    pseudo_neighbours: int = 0
+    """Train without the shards' labels: every `period` epochs a UAV image is paired anew with its
+    nearest satellite image where it is among the so many UAV images nearest to that one. 0: train
+    with the labels."""
+    pseudo_margin: float = 0.0
+    """And where that satellite image's cosine is at least so much above the second nearest's
+    [chosen: any]."""
 
     def __post_init__(self) -> None:
         few = "at least 2: BatchNorm needs two images of a view"
@@ -70,3 +77,11 @@ class Recipe:
         check_sampler(self.sampler, self.pair_repeats, self.augmentation)
         share = "a share of the locations, from 0 to below 1"
         require(0 <= self.hold_out < 1, "hold_out", self.hold_out, share)
+        few = "0 (the shards' labels) or more"
+        require(self.pseudo_neighbours >= 0, "pseudo_neighbours", self.pseudo_neighbours, few)
+        require(0 <= self.pseudo_margin <= 2, "pseudo_margin", self.pseudo_margin, "0 to 2")
+        if self.pseudo_neighbours:
+            every = "unique_pairs or independent: not every satellite image gets a pseudo-label"
+            require(self.sampler != "paired", "sampler", self.sampler, every)
+            none = "0 with --pseudo-neighbours, which knows no locations"
+            require(self.hold_out == 0, "hold_out", self.hold_out, none)
