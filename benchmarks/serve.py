@@ -20,8 +20,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import urllib.error
-import urllib.request
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -45,10 +43,10 @@ Measurement = tuple[list[float], float, Counter[int]]
 
 @contextmanager
 def service(args: argparse.Namespace, *flags: str) -> Iterator[str]:
-    """Start a service on a free port; yields its address once it answers."""
+    """Start a service on a free port; yields its address as soon as it listens."""
     command = [sys.executable, str(ROOT / "jobs" / "serve.py"), "--port", "0", *flags]
     command += ["--checkpoint", args.checkpoint, "--index", args.index]
-    environment = os.environ | {"RAY_ADDRESS": args.ray}
+    environment = os.environ | {"RAY_ADDRESS": "local"}
     with (
         tempfile.NamedTemporaryFile() as log,
         subprocess.Popen(command, env=environment, stderr=log, start_new_session=True) as process,
@@ -60,7 +58,6 @@ def service(args: argparse.Namespace, *flags: str) -> Iterator[str]:
                 address = LISTENS.search(Path(log.name).read_text())
             if address is None:
                 raise RuntimeError("the service has ended")
-            wait_until_ready(address[1])
             yield address[1]
         except Exception:
             print(Path(log.name).read_text()[-2000:], file=sys.stderr)
@@ -70,16 +67,14 @@ def service(args: argparse.Namespace, *flags: str) -> Iterator[str]:
             process.wait(30)
 
 
-def wait_until_ready(address: str) -> None:
+async def wait_until_ready(session: aiohttp.ClientSession, address: str) -> None:
     deadline = time.monotonic() + TIMEOUT_S
     while time.monotonic() < deadline:
-        try:
-            with urllib.request.urlopen(f"{address}/health", timeout=TIMEOUT_S):
+        async with session.get(f"{address}/health") as response:
+            if response.status == 200:
                 return
-        except urllib.error.HTTPError as error:  # 503 until then
-            error.close()
-        time.sleep(0.2)
-    raise RuntimeError(f"{address} was not ready after {TIMEOUT_S} s")
+        await asyncio.sleep(0.5)
+    raise SystemExit(f"{address} was not ready after {TIMEOUT_S} s")
 
 
 async def load(
@@ -132,6 +127,7 @@ async def measure(args: argparse.Namespace, addresses: dict[str, str]) -> None:
     mean = sum(map(len, photos)) / len(photos) / 1000
     async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(limit=0)) as session:
         for address in addresses.values():
+            await wait_until_ready(session, address)
             # The first batch of each size is slow.
             await load(session, address, photos, args.batch, args.seconds)
         print(
@@ -160,7 +156,6 @@ def main() -> None:
     add("--clients", type=int, nargs="+", default=CLIENTS, help="concurrent clients, in turn")
     add("--seconds", type=float, default=6, help="length of a measurement")
     add("--rounds", type=int, default=2, help="alternating rounds")
-    add("--ray", default="local", help="address of a Ray for both services; else each starts one")
     add("--batch", type=int, default=8, help="photos of the larger batch")
     args = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ends the services too

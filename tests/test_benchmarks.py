@@ -65,11 +65,11 @@ CASES: dict[str, tuple[str, str]] = {
         r"without_turns \| [\d.]+% \[.*\] \| [+-][\d.]+% \[",
     ),
     "own_map": (
-        "--imagery {images} --out {out} --tiles 2 --photos 2",
-        r"built-in: .* of 2 photos within 25 m, [\d.]+ x ImageNet's weights alone",
+        "--imagery {images} --out {out} --tiles 3 --photos 2 --height 12 16",
+        r"built-in, matched, pose: [\d.]+% within 1 m, .* of 2 photos, [\d.]+ x ImageNet's tiles",
     ),
     "serve": (
-        "--ray {ray} --checkpoint {trained}/run/last.pt --index {trained}/index "
+        "--checkpoint {trained}/run/last.pt --index {trained}/index "
         "--photos {trained}/flights/test/query_drone --clients 2 --seconds 0.2 --rounds 1",
         r"batching [\d.]+ x the photos/s",
     ),
@@ -99,7 +99,7 @@ LOCATE = (
 def run(launcher: Launcher, name: str, arguments: str, **folders: Path) -> str:
     """Run a benchmark to its end on the session's Ray; its output."""
     address: str = ray.get_runtime_context().gcs_address
-    words = arguments.format(**folders, ray=address).split()
+    words = arguments.format(**folders).split()
     result = launcher.start(name, words, folder="benchmarks", RAY_ADDRESS=address).end()
     assert result.code == 0, result.output[-3000:]
     return result.output

@@ -40,7 +40,8 @@ def settings(tmp_path: Path, **changes: object) -> MapFlightSettings:
 def test_fly_writes_photos_with_tags_and_the_truth(tmp_path: Path) -> None:
     write_map(tmp_path / "map.tif")
     out = fly(settings(tmp_path))
-    rows = list(csv.DictReader((out / "photos.csv").open()))
+    with (out / "photos.csv").open() as table:
+        rows = list(csv.DictReader(table))
     assert [row["path"] for row in rows] == ["photos/00000.jpg", "photos/00001.jpg"]
     for row in rows:
         assert 46.95 < float(row["lat"]) < 46.96
@@ -79,4 +80,4 @@ def test_fly_over_an_unusable_map_is_refused(tmp_path: Path) -> None:
         fly(settings(tmp_path))
     write_map(tmp_path / "map.tif")
     with pytest.raises(InputError, match="shows no place for photo 0"):
-        fly(settings(tmp_path, height=(900.0, 900.0)))
+        photo_over_map(settings(tmp_path, height=(900.0, 900.0)), 0)
