@@ -30,7 +30,9 @@ def _cells(one: LocatedPhoto) -> list[str]:
     position = f"{at.lat:.6f}, {at.lon:.6f}" if at else "no position"
     return [
         position if answer.known else "unknown",
-        f"{at.radius_m:.0f} m" if at and answer.known else "",
+        (f"{at.radius_m:.0f} m" if at.radius_m >= 10 else f"{at.radius_m:.1f} m")
+        if at and answer.known
+        else "",
         "" if answer.probability is None else f"{answer.probability:.0%}",
         (answer.location or "") if answer.known else "",
         f"{answer.candidates[0].score:.3f}" if answer.candidates else "",

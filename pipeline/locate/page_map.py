@@ -24,6 +24,9 @@ MAP_HALF_SPACINGS = 2.6
 """Half the side of a map around a position, in spacings of the gallery: shows its neighbours, and
 part of the next ones."""
 
+SMALLEST_CIRCLE_PX = 4.0
+"A position within decimetres stays visible."
+
 MAX_TILES = 64
 "Gallery images that a map shows at most."
 
@@ -96,6 +99,8 @@ class MapView:
     "x, y and radius of the circle of uncertainty."
     line: str = ""
     "Points of the flight's polyline."
+    outline: str = ""
+    "Corners of the ground that the photo shows, where it was matched; the first two are its top."
 
 
 def nearby_keys(answer: Answer, gallery: GalleryMap) -> list[str]:
@@ -117,7 +122,7 @@ def position_map(
     if position is None:
         return None
     spacing = gallery.spacing_m or position.radius_m or 1.0
-    half_m = max(MAP_HALF_SPACINGS * spacing, 1.3 * position.radius_m)
+    half_m = max(MAP_HALF_SPACINGS * spacing, 1.3 * position.radius_m, _reach_m(answer))
     frame = MapFrame(lat=position.lat, lon=position.lon, half_m=half_m)
     tiles = []
     for number in gallery.nearest(position.lat, position.lon, MAX_TILES).tolist():
@@ -131,10 +136,27 @@ def position_map(
         frame=frame,
         tiles=tuple(reversed(tiles)),
         marks=tuple(candidate_marks(answer, frame)),
-        circle=(x, y, frame.length(position.radius_m)),
+        circle=(x, y, max(frame.length(position.radius_m), SMALLEST_CIRCLE_PX)),
+        outline=_outline(answer, frame),
         summary=f"Map of {2 * half_m:.0f} m around latitude {position.lat:.5f}, longitude "
         f"{position.lon:.5f}",
     )
+
+
+def _reach_m(answer: Answer) -> float:
+    """Half the side of the square around the position that holds what the photo shows, metres."""
+    if answer.refinement is None or answer.position is None:
+        return 0.0
+    here = MapFrame(lat=answer.position.lat, lon=answer.position.lon, half_m=MAP_SIDE_PX / 2)
+    corners_42 = here.pixels(np.array(answer.refinement.footprint)) - MAP_SIDE_PX / 2
+    return 1.05 * float(np.abs(corners_42).max())  # a pixel is a metre
+
+
+def _outline(answer: Answer, frame: MapFrame) -> str:
+    if answer.refinement is None:
+        return ""
+    corners_42 = frame.pixels(np.array(answer.refinement.footprint))
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in corners_42.tolist())
 
 
 def overview_map(
