@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from jobs.encoding.photo_encoder import decode_photo
 from jobs.encoding.queries import Query, ViewMaker, read_photo
 from pipeline.camera.framing import Framing, nearest_side, views_of_photo
+from pipeline.core import storage
 from pipeline.core.arrays import Pixels
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.progress import console, progress
@@ -20,6 +21,7 @@ from pipeline.locate.refined import refine_answer, with_refinement
 from pipeline.matching.map_windows import MapWindows
 from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
 from pipeline.matching.refine import Refinement
+from pipeline.shards.manifest import MANIFEST
 from pipeline.shards.shard_set import open_shards
 from pipeline.shards.tile_reader import TileReader
 
@@ -28,12 +30,11 @@ AHEAD = 4
 
 
 def open_map(shards: str, gallery: GalleryMap) -> MapWindows | None:
-    """The windows of a map; None, with a message, where its tiles do not know their corners.
-
-    Raises InputError where there are no such shards.
-    """
-    opened = open_shards(shards)
-    reader = None if opened.external else TileReader(opened)
+    """The windows of a map; None, with a message, where its tiles do not know their corners: these
+    are in the record tables of jobs/make_shards.py, which shards of others lack."""
+    reader = None
+    if storage.exists(storage.join(shards, MANIFEST)):
+        reader = TileReader(open_shards(shards))
     if reader is None or not len(gallery.keys) or not reader.footprints([str(gallery.keys[0])]):
         console.print(
             f"the images of {shards} do not say which ground their corners show: photos are not "
