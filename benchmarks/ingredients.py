@@ -67,13 +67,32 @@ INGREDIENTS: dict[str, Callable[[Recipe], Recipe]] = {
 "Row of the table -> the recipe's change."
 
 
-def hits(checkpoint: str, shards_folder: str) -> tuple[Doubles, Strings]:
-    """Whether each photo finds its place first (Q,), and the photos' places."""
+def hits(
+    checkpoint: str,
+    shards_folder: str,
+    asked: Split = Split.QUERY,
+    searched: Split = Split.GALLERY,
+    size: int | None = None,
+) -> tuple[Doubles, Strings]:
+    """Whether each photo of split `asked` finds its place first among the satellite images of
+    `searched` (Q,), and the photos' places. `size`: side of the images, the network's where None.
+    """
     shards = open_shards(shards_folder)
-    queries, _ = embed_view(shards, Split.QUERY, View.DRONE, checkpoint, None)
-    gallery, _ = embed_view(shards, Split.GALLERY, View.SATELLITE, checkpoint, None)
-    ranking = rank(queries, gallery, top=1)
-    return hits_at(1, ranking.first_rank_Q), queries.locations
+    queries, _ = embed_view(shards, asked, View.DRONE, checkpoint, size)
+    gallery, _ = embed_view(shards, searched, View.SATELLITE, checkpoint, size)
+    return hits_at(1, rank(queries, gallery, top=1).first_rank_Q), queries.locations
+
+
+def share_cell(hit_Q: Doubles, places_Q: Strings) -> str:
+    """R@1 with its interval over places."""
+    [[low, high]] = confidence_intervals(hit_Q[:, None], places_Q).T
+    return f" {hit_Q.mean():.1%} [{low:.1%}, {high:.1%}] |"
+
+
+def change_cell(hit_Q: Doubles, baseline_Q: Doubles, places_Q: Strings) -> str:
+    """The difference to a baseline, paired by photo, with its interval."""
+    change = paired_difference(hit_Q, baseline_Q, places_Q)
+    return f" {change.mean:+.1%} [{change.low:+.1%}, {change.high:+.1%}] |"
 
 
 def named(argument: str) -> tuple[str, str]:
@@ -116,12 +135,9 @@ def main() -> None:
         line = f"| {name} |"
         for held, folder in options.held:
             hit_Q, places_Q = hits(checkpoint, folder)
-            mean = hit_Q.mean()
-            [[low, high]] = confidence_intervals(hit_Q[:, None], places_Q).T
-            line += f" {mean:.1%} [{low:.1%}, {high:.1%}] |"
+            line += share_cell(hit_Q, places_Q)
             if held in baselines:
-                change_r1 = paired_difference(hit_Q, baselines[held], places_Q)
-                line += f" {change_r1.mean:+.1%} [{change_r1.low:+.1%}, {change_r1.high:+.1%}] |"
+                line += change_cell(hit_Q, baselines[held], places_Q)
             else:
                 baselines[held] = hit_Q
                 line += " baseline |"

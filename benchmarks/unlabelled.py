@@ -16,8 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from encoders import embed_view
-from ingredients import named
+from ingredients import change_cell, hits, named, share_cell
 
 from jobs.training.driver import train
 from jobs.training.recipes.pvda_unlabelled import pvda_unlabelled
@@ -27,10 +26,7 @@ from jobs.training.settings import TrainSettings
 from model.weights.builtin import BUILTIN
 from pipeline.core import parquet
 from pipeline.core.arrays import Doubles, Strings
-from pipeline.core.records import Split, View
-from pipeline.retrieval.bootstrap import confidence_intervals, paired_difference
-from pipeline.retrieval.metrics import hits_at
-from pipeline.retrieval.ranking import rank
+from pipeline.core.records import Split
 from pipeline.shards.shard_set import open_shards
 
 OWN, START, CONTROL = "own", "start", "alpha_zero"
@@ -52,11 +48,7 @@ class Places:
         """Whether each photo of each set finds its place first."""
         found: Hits = {}
         for name, (folder, asked, searched) in self._sets.items():
-            shards = open_shards(folder)
-            queries, _ = embed_view(shards, asked, View.DRONE, checkpoint, self._size)
-            gallery, _ = embed_view(shards, searched, View.SATELLITE, checkpoint, self._size)
-            found[name] = hits_at(1, rank(queries, gallery, top=1).first_rank_Q)
-            self.places[name] = queries.locations
+            found[name], self.places[name] = hits(checkpoint, folder, asked, searched, self._size)
         return found
 
 
@@ -71,16 +63,13 @@ def right_pairs(shards: str, run: Path, rounds: int) -> Doubles:
     return np.array(shares)
 
 
-def line(places: Places, hits: Hits, *baselines: Hits) -> str:
+def line(places: Places, found: Hits, *baselines: Hits) -> str:
     """The cells of a row: of each set R@1, and the difference to each baseline."""
     cells = ""
-    for name, hit_Q in hits.items():
-        places_Q = places.places[name]
-        [[low, high]] = confidence_intervals(hit_Q[:, None], places_Q).T
-        cells += f" {hit_Q.mean():.1%} [{low:.1%}, {high:.1%}] |"
+    for name, hit_Q in found.items():
+        cells += share_cell(hit_Q, places.places[name])
         for baseline in baselines:
-            change = paired_difference(hit_Q, baseline[name], places_Q)
-            cells += f" {change.mean:+.1%} [{change.low:+.1%}, {change.high:+.1%}] |"
+            cells += change_cell(hit_Q, baseline[name], places.places[name])
         cells += " |" * (2 - len(baselines))
     return cells
 
@@ -133,11 +122,11 @@ def main() -> None:
             )  # fmt: skip
             found.append(places.hits(checkpoint))
             right.append(right_pairs(options.shards, run, options.rounds))
-        hits = {held: np.mean([one[held] for one in found], axis=0) for held in start}
+        mean = {held: np.mean([one[held] for one in found], axis=0) for held in start}
         baselines = [start] if control is None else [start, control]
         shares = ", ".join(f"{share:.0%}" for share in np.mean(right, axis=0))
-        print(f"| {name} |{line(places, hits, *baselines)} {shares} |", flush=True)
-        control = control or hits
+        print(f"| {name} |{line(places, mean, *baselines)} {shares} |", flush=True)
+        control = control or mean
 
 
 if __name__ == "__main__":

@@ -38,6 +38,7 @@ from pipeline.locate.photo_files import find_photos, parse_time, read_times
 from pipeline.locate.track import TRACK_CANDIDATES, TrackStart
 from pipeline.matching.map_windows import MapWindows
 from pipeline.shards.shard_set import open_shards
+from pipeline.shards.tile_reader import TileReader
 
 
 def locate_photos(
@@ -222,9 +223,9 @@ def make_page(located: Sequence[LocatedPhoto], context: PageContext, shards: str
 
     if shards is None:
         return render_page(located, context, load_photos, no_images)
-    opened = open_shards(shards)
-    context = replace(context, footprints=opened.footprints)
-    return render_page(located, context, load_photos, opened.fetch)
+    tiles = TileReader(open_shards(shards))
+    context = replace(context, footprints=tiles.footprints)
+    return render_page(located, context, load_photos, tiles.fetch)
 
 
 def locate(settings: LocateSettings) -> None:

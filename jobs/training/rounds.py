@@ -115,27 +115,28 @@ def is_labelled(stream: TrainingStream) -> bool:
 def pair_views(state: TrainingState) -> Ints:
     """The satellite image (U,) of each UAV training image, as the rows of `training_keys`, by the
     encoder as it is now. Training is not changed by it."""
-    recipe = state.run.recipe
-    (drone_N, drone_NE), (satellite_M, satellite_ME) = (
-        embed_training(state, view) for view in (View.DRONE, View.SATELLITE)
-    )
+    recipe, shards = state.run.recipe, open_shards(state.run.shards)
+    drones, satellites = (training_keys(shards, view) for view in (View.DRONE, View.SATELLITE))
+    drone_N, drone_NE = embed_training(state, shards, View.DRONE, drones)
+    satellite_M, satellite_ME = embed_training(state, shards, View.SATELLITE, satellites)
     found_N = mutual_neighbours(
         drone_NE, satellite_ME, recipe.pseudo_neighbours, recipe.pseudo_margin
     )
-    shards = open_shards(state.run.shards)
-    pair_U = np.full(len(training_keys(shards, View.DRONE)), UNPAIRED)
+    pair_U = np.full(len(drones), UNPAIRED)
     pair_U[drone_N] = np.where(found_N == UNPAIRED, UNPAIRED, satellite_M[found_N])
     return pair_U
 
 
-def embed_training(state: TrainingState, view: View) -> tuple[Ints, Floats]:
-    """Rows (N,) of a view's training images in `training_keys`, and their embeddings (N, E),
-    without augmentation; images that cannot be decoded are left out.
+def embed_training(
+    state: TrainingState, shards: ShardSet, view: View, keys: list[str]
+) -> tuple[Ints, Floats]:
+    """Rows (N,) of a view's training images in `keys`, and their embeddings (N, E), without
+    augmentation; images that cannot be decoded are left out.
 
     Raises InputError where none can be decoded.
     """
-    encoder, shards = state.training.model.encoder, open_shards(state.run.shards)
-    row_of = {key: row for row, key in enumerate(training_keys(shards, view))}
+    encoder = state.training.model.encoder
+    row_of = {key: row for row, key in enumerate(keys)}
     images, mirror = read_images(state, shards, view), state.run.recipe.augmentation.mirror
     rows, embedded = list[int](), list[Floats]()
     was_training = encoder.training

@@ -5,13 +5,14 @@ pose lays the photo on the ground; a heading alone turns it; without either it s
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
-import cv2
 import numpy as np
 
 from pipeline.camera.ground import apply_homography, corners, photo_to_ground
 from pipeline.camera.pose import PartialPose
+from pipeline.camera.warp import north_up, shrink_first, warp
 from pipeline.core.arrays import Doubles, Pixels
 
 Framing = Literal["ground", "scale", "north", "none"]
@@ -19,11 +20,9 @@ Framing = Literal["ground", "scale", "north", "none"]
 heading; only turned north up; or not at all."""
 FRAME_PX = 384
 "Side of a framed photo: encoders take 256 to 384 pixels."
-
-
 SCALES = (1.0, 0.7, 0.5)
 """Middles of a photo of unknown scale, as shares of its width and height: photos show one to
-four tiles' widths (docs/results.md has what each is worth)."""
+four tiles' widths (docs/decisions.md, answers)."""
 
 
 def views_of_photo(
@@ -70,10 +69,7 @@ def frame_photo(
     height, width = photo_HW3.shape[:2]
     known = None not in (pose.pitch_deg, pose.height_m, pose.fov_deg)
     if known and side_m is not None:
-        upright = PartialPose(
-            heading_deg=pose.heading_deg or 0.0, pitch_deg=pose.pitch_deg, height_m=pose.height_m,
-            fov_deg=pose.fov_deg, roll_deg=pose.roll_deg,
-        )  # fmt: skip
+        upright = replace(pose, heading_deg=pose.heading_deg or 0.0)
         to_ground_33 = photo_to_ground(upright.over(), (width, height))
         if _shows_no_sky(to_ground_33, (width, height)):
             framed = _on_ground(photo_HW3, to_ground_33, side_m)
@@ -92,15 +88,9 @@ def _on_ground(photo_HW3: Pixels, to_ground_33: Doubles, side_m: float) -> Pixel
     """The ground around the photo's middle, a square of `side_m` metres."""
     height, width = photo_HW3.shape[:2]
     middle_2 = apply_homography(to_ground_33, np.array([[width / 2, height / 2]]))[0]
-    scale = FRAME_PX / side_m
-    place_33 = np.array(
-        [
-            [scale, 0, FRAME_PX / 2 - scale * middle_2[0]],
-            [0, -scale, FRAME_PX / 2 + scale * middle_2[1]],
-            [0, 0, 1],
-        ]
-    )
-    return _warp(photo_HW3, place_33 @ to_ground_33)
+    half_m = side_m / 2
+    place_33 = north_up(FRAME_PX / side_m, middle_2[0] - half_m, middle_2[1] + half_m)
+    return _frame(photo_HW3, place_33 @ to_ground_33)
 
 
 def _turned(photo_HW3: Pixels, heading_deg: float) -> Pixels:
@@ -108,27 +98,16 @@ def _turned(photo_HW3: Pixels, heading_deg: float) -> Pixels:
     height, width = photo_HW3.shape[:2]
     scale = FRAME_PX / min(height, width)
     c, s = np.cos(np.radians(heading_deg)) * scale, np.sin(np.radians(heading_deg)) * scale
-    middle = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array(
-        [[1, 0, -width / 2], [0, 1, -height / 2], [0, 0, 1]]
-    )
-    return _warp(
-        photo_HW3, np.array([[1, 0, FRAME_PX / 2], [0, 1, FRAME_PX / 2], [0, 0, 1]]) @ middle
-    )
+    turn_33 = np.array([[c, -s, FRAME_PX / 2], [s, c, FRAME_PX / 2], [0, 0, 1]])
+    from_middle_33 = np.array([[1, 0, -width / 2], [0, 1, -height / 2], [0, 0, 1]])
+    return _frame(photo_HW3, turn_33 @ from_middle_33)
 
 
-def _warp(photo_HW3: Pixels, to_frame_33: Doubles) -> Pixels:
+def _frame(photo_HW3: Pixels, to_frame_33: Doubles) -> Pixels:
     """The photo by a homography to the frame; averaged first where it becomes much smaller."""
     height, width = photo_HW3.shape[:2]
     framed_42 = apply_homography(to_frame_33, corners((width, height)))
     shrink = float(np.linalg.norm(framed_42[2] - framed_42[3])) / width
-    if shrink < 0.75:
-        size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
-        to_frame_33 = to_frame_33 @ np.diag([width / size[0], height / size[1], 1.0])
-        photo_HW3 = np.asarray(cv2.resize(photo_HW3, size, interpolation=cv2.INTER_AREA), np.uint8)
-    half_33 = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV counts from pixels' middles
+    photo_HW3, to_photo_33 = shrink_first(photo_HW3, shrink)
     mean = tuple(float(value) for value in photo_HW3.reshape(-1, 3).mean(axis=0))
-    framed_HW3 = cv2.warpPerspective(
-        photo_HW3, np.linalg.inv(half_33) @ to_frame_33 @ half_33, (FRAME_PX, FRAME_PX),
-        flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=mean,
-    )  # fmt: skip
-    return np.asarray(framed_HW3, np.uint8)
+    return warp(photo_HW3, to_frame_33 @ to_photo_33, (FRAME_PX, FRAME_PX), mean)

@@ -12,7 +12,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.camera.ground import apply_homography, corners
 from pipeline.camera.local_plane import LocalPlane
+from pipeline.camera.warp import north_up, shrink_first
 from pipeline.core.arrays import Doubles, Pixels
 
 Footprint = npt.ArrayLike
@@ -46,16 +48,13 @@ class Tile:
     footprint: Footprint
 
 
-def tile_resolution(footprint: Footprint, size: tuple[int, int]) -> float:
-    """Metres per pixel of a tile of `size` (width, height)."""
+def tile_side_m(footprint: Footprint) -> float:
+    """Side of the ground that a tile shows, metres: of a square of the same area."""
     corners_42 = np.asarray(footprint, np.float64)
     plane = LocalPlane(lat=float(corners_42[0, 0]), lon=float(corners_42[0, 1]))
     ground_42 = plane.to_metres(corners_42)
-    across, down = (
-        np.linalg.norm(ground_42[1] - ground_42[0]),
-        np.linalg.norm(ground_42[3] - ground_42[0]),
-    )
-    return float(np.sqrt(across * down / (size[0] * size[1])))
+    across, down = (np.linalg.norm(ground_42[at] - ground_42[0]) for at in (1, 3))
+    return float(np.sqrt(across * down))
 
 
 def compose_window(
@@ -65,17 +64,19 @@ def compose_window(
     that show it; where several do, from the first."""
     side = max(1, round(2 * half_m / metres_per_pixel))
     pixels_HW3, shown_HW = np.zeros((side, side, 3), np.uint8), np.zeros((side, side), np.uint8)
+    to_window_33 = north_up(1 / metres_per_pixel, -half_m, half_m)
     for tile in tiles:
         ground_42 = plane.to_metres(np.asarray(tile.footprint, np.float64))
-        target_42 = (ground_42 * (1, -1) + half_m) / metres_per_pixel
+        target_42 = apply_homography(to_window_33, ground_42)
         least, most = np.floor(target_42.min(axis=0)), np.ceil(target_42.max(axis=0))
         (left, top), (right, bottom) = (
             np.clip(edge, 0, side).astype(int).tolist() for edge in (least, most)
         )
         if right <= left or bottom <= top or shown_HW[top:bottom, left:right].all():
             continue
-        patch_HW3, inside_HW = _warp(tile.pixels_HW3, target_42 - (left, top), right - left,
-                                     bottom - top)  # fmt: skip
+        patch_HW3, inside_HW = _draw(
+            tile.pixels_HW3, target_42 - (left, top), right - left, bottom - top
+        )
         new_HW = inside_HW & (shown_HW[top:bottom, left:right] == 0)
         pixels_HW3[top:bottom, left:right][new_HW] = patch_HW3[new_HW]
         shown_HW[top:bottom, left:right][new_HW] = 255
@@ -84,18 +85,14 @@ def compose_window(
     )  # fmt: skip
 
 
-def _warp(pixels_HW3: Pixels, target_42: Doubles, width: int, height: int) -> tuple[Pixels, Any]:
+def _draw(pixels_HW3: Pixels, target_42: Doubles, width: int, height: int) -> tuple[Pixels, Any]:
     """A tile drawn with its corners at `target_42`, and where it covers its patch."""
-    rows, columns = pixels_HW3.shape[:2]
-    shrink = np.linalg.norm(target_42[1] - target_42[0]) / columns
-    if shrink < 0.75:  # averaged first: a warp alone would alias
-        size = (max(1, round(columns * shrink)), max(1, round(rows * shrink)))
-        pixels_HW3 = np.asarray(cv2.resize(pixels_HW3, size, interpolation=cv2.INTER_AREA))
-        rows, columns = pixels_HW3.shape[:2]
-    source_42 = np.array([[0, 0], [columns, 0], [columns, rows], [0, rows]], np.float32)
+    shrink = float(np.linalg.norm(target_42[1] - target_42[0])) / pixels_HW3.shape[1]
+    pixels_HW3, _ = shrink_first(pixels_HW3, shrink)
+    source_42 = corners((pixels_HW3.shape[1], pixels_HW3.shape[0]))
     # OpenCV counts from the middle of the first pixel.
     to_patch_33 = cv2.getPerspectiveTransform(
-        source_42 - np.float32(0.5), (target_42 - 0.5).astype(np.float32)
+        (source_42 - 0.5).astype(np.float32), (target_42 - 0.5).astype(np.float32)
     )
     patch_HW3 = cv2.warpPerspective(
         pixels_HW3, to_patch_33, (width, height), flags=cv2.INTER_LINEAR,

@@ -1,6 +1,7 @@
 """Where a camera is and how it looks."""
 
 from dataclasses import dataclass
+from math import cos, radians, sin, tan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,6 +21,17 @@ class Pose:
     """Field of view across the frame's width."""
     roll_deg: float = 0.0
     "About the optical axis; above 0 the image's right side is the lower one."
+
+    @classmethod
+    def looking_at_zero(
+        cls, *, altitude_m: float, heading_deg: float, pitch_deg: float, fov_deg: float
+    ) -> "Pose":
+        """The pose, with this altitude and direction, that has the ground (0, 0) in its middle."""
+        away_m = altitude_m / tan(radians(-pitch_deg))
+        return cls(
+            x_m=-away_m * sin(radians(heading_deg)), y_m=-away_m * cos(radians(heading_deg)),
+            altitude_m=altitude_m, heading_deg=heading_deg, pitch_deg=pitch_deg, fov_deg=fov_deg,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

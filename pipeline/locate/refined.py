@@ -7,21 +7,12 @@ answer at the place that matching finds, where that holds; else as it was.
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numpy as np
-
-from pipeline.camera.ground import apply_homography, corners
 from pipeline.camera.pose import PartialPose
 from pipeline.core.arrays import Pixels
 from pipeline.locate.locate import Answer, Position
 from pipeline.matching.gate import holds
 from pipeline.matching.map_windows import MapWindows
-from pipeline.matching.refine import (
-    MatchablePhoto,
-    Refinement,
-    prepare_photo,
-    promised_ground,
-    refine,
-)
+from pipeline.matching.refine import Refinement, prepare_photo, refine
 
 MOST_WINDOWS = 3
 "Windows that a photo is matched with: around the answer, then around other candidates."
@@ -35,7 +26,7 @@ def refine_answer(
     if not answer.candidates:
         return None
     photo = prepare_photo(photo_HW3, pose)
-    near = windows.around(_positions(answer), MOST_WINDOWS, _reach_m(photo))
+    near = windows.around(_positions(answer), MOST_WINDOWS, photo.reach_m)
     return refine(photo, near)
 
 
@@ -47,14 +38,6 @@ def _positions(answer: Answer) -> Iterator[tuple[float, float, str]]:
     for hit in answer.candidates:
         if hit.lat is not None and hit.lon is not None:
             yield hit.lat, hit.lon, hit.key
-
-
-def _reach_m(photo: MatchablePhoto) -> float:
-    """Half the extent of the ground that the pose promises, metres; 0 where it promises none."""
-    to_ground_33 = promised_ground(photo.pose, photo.size)
-    if to_ground_33 is None:
-        return 0.0
-    return float(np.ptp(apply_homography(to_ground_33, corners(photo.size)), axis=0).max() / 2)
 
 
 def with_refinement(answer: Answer, refinement: Refinement | None) -> Answer:

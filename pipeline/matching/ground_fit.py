@@ -2,8 +2,8 @@
 camera above the ground can make it.
 
 In: pixels of a photo and their ground in metres. Out: a `GroundFit`. The robust estimate is
-OpenCV's RANSAC, which draws by a seed of its own. Its USAC methods end too early in OpenCV 5.0: of
-36 sets of pairs with 30 to 200 right ones, MAGSAC missed 20 (docs/decisions.md).
+OpenCV's RANSAC, which draws by a seed of its own. In OpenCV 5.0 its USAC methods often end too
+early (docs/decisions.md).
 Shapes: M pairs, K inliers, 33 = a homography.
 """
 

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from pipeline.camera.local_plane import LocalPlane
-from pipeline.camera.map_window import Tile, compose_window, tile_resolution
+from pipeline.camera.map_window import Tile, compose_window, tile_side_m
 from pipeline.core.arrays import Doubles, Ints, Pixels, Strings
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.thumbnails import ImageLoader
@@ -82,7 +82,7 @@ class MapWindows:
         count = len(self._gallery.keys)
         numbers = np.unique(np.linspace(0, count - 1, min(count, SIDES_SAMPLE)).astype(int))
         shown = self._footprints([str(key) for key in self._gallery.keys[numbers]])
-        sides = sorted(tile_resolution(footprint, (1, 1)) for footprint in shown.values())
+        sides = sorted(tile_side_m(footprint) for footprint in shown.values())
         kept: list[float] = []
         for side in sides:
             if not kept or side > 1.1 * kept[-1]:
@@ -95,7 +95,7 @@ class MapWindows:
         footprint = self._footprints([key]).get(key)
         if footprint is None:
             return None
-        half_m = max(TILES_ACROSS / 2 * tile_resolution(footprint, (1, 1)), reach_m)
+        half_m = max(TILES_ACROSS / 2 * tile_side_m(footprint), reach_m)
         return float(1.25 ** math.ceil(math.log(half_m, 1.25) - 1e-6))
 
     def _place(self, lat: float, lon: float, half_m: float) -> Place:
@@ -134,13 +134,12 @@ class MapWindows:
         ]
         if not tiles:
             return None
-        finest = min(
-            tile_resolution(tile.footprint, tile.pixels_HW3.shape[1::-1]) for tile in tiles
-        )
-        # The finest tiles first: a window shows each ground by the first tile that has it.
-        tiles.sort(key=lambda tile: tile_resolution(tile.footprint, tile.pixels_HW3.shape[1::-1]))
+        # The finest first: a window shows each ground by the first tile that has it.
+        tiles.sort(key=_resolution_m)
         return prepare_window(
-            compose_window(plane, tiles, half_m, max(finest, 2 * half_m / MOST_SIDE_PX))
+            compose_window(
+                plane, tiles, half_m, max(_resolution_m(tiles[0]), 2 * half_m / MOST_SIDE_PX)
+            )
         )
 
     def _keys_within(self, plane: LocalPlane, half_m: float) -> list[str]:
@@ -149,6 +148,12 @@ class MapWindows:
         away_N = np.abs(plane.to_metres(self._gallery.positions_N2[numbers])).max(axis=1)
         beyond_m = 2 * half_m / TILES_ACROSS
         return [str(key) for key in self._gallery.keys[numbers[away_N < half_m + beyond_m]]]
+
+
+def _resolution_m(tile: Tile) -> float:
+    """Metres per pixel of a tile."""
+    height, width = tile.pixels_HW3.shape[:2]
+    return tile_side_m(tile.footprint) / math.sqrt(width * height)
 
 
 def decode_or_none(data: bytes) -> Pixels | None:

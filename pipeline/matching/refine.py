@@ -22,6 +22,7 @@ from pipeline.camera.ground import (
 from pipeline.camera.map_window import MapWindow
 from pipeline.camera.pose import PartialPose
 from pipeline.camera.uncertainty import Ellipse, ellipse_of
+from pipeline.camera.warp import north_up, warp
 from pipeline.core.arrays import Doubles, Pixels
 from pipeline.matching.ground_fit import (
     GroundFit,
@@ -69,13 +70,6 @@ class Refinement:
     "Points of the photo and of the map that look alike."
     residual_m: float
     "Root mean square distance of the inliers on the ground."
-    pairs: tuple[tuple[float, float, float, float], ...]
-    """Up to MOST_PAIRS inliers spread over the photo: column and row as shares of the photo's width
-    and height, latitude, longitude."""
-
-
-MOST_PAIRS = 24
-"Pairs that a refinement keeps, to be drawn."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,8 +80,17 @@ class MatchablePhoto:
     "Width and height when matched."
     features: LocalFeatures
     pose: PartialPose
-    promised_N2: Doubles | None
-    "Ground (east, north) of its features below the camera, metres, where the pose is complete."
+    promised_33: Doubles | None
+    """The homography to the ground, (east, north) in metres from below the camera, that its pose
+    promises; None where that is not complete, or shows the horizon."""
+
+    @property
+    def reach_m(self) -> float:
+        """Half the extent of the ground that the pose promises, metres; 0 where it promises
+        none."""
+        if self.promised_33 is None:
+            return 0.0
+        return float(ground_extent(self.promised_33, self.size).max() / 2)
 
 
 def prepare_photo(photo_HW3: Pixels, pose: PartialPose | None = None) -> MatchablePhoto:
@@ -97,13 +100,18 @@ def prepare_photo(photo_HW3: Pixels, pose: PartialPose | None = None) -> Matchab
     size = (round(columns * scale), round(rows * scale))
     small_HW3 = np.asarray(cv2.resize(photo_HW3, size, interpolation=cv2.INTER_AREA), np.uint8)
     pose = pose or PartialPose()
-    to_ground_33 = promised_ground(pose, size)
-    if to_ground_33 is None:
-        features = find_features(small_HW3, PHOTO_FEATURES)
-        return MatchablePhoto(size=size, features=features, pose=pose, promised_N2=None)
-    features = _features_on_the_ground(small_HW3, to_ground_33)
-    promised_N2 = apply_homography(to_ground_33, features.points_N2)
-    return MatchablePhoto(size=size, features=features, pose=pose, promised_N2=promised_N2)
+    promised_33 = promised_ground(pose, size)
+    features = (
+        find_features(small_HW3, PHOTO_FEATURES)
+        if promised_33 is None
+        else _features_on_the_ground(small_HW3, promised_33)
+    )
+    return MatchablePhoto(size=size, features=features, pose=pose, promised_33=promised_33)
+
+
+def ground_extent(to_ground_33: Doubles, size: tuple[int, int]) -> Doubles:
+    """How far east and north (2,) the ground of a photo of `size` (width, height) extends."""
+    return np.asarray(np.ptp(apply_homography(to_ground_33, corners(size)), axis=0))
 
 
 def promised_ground(pose: PartialPose, size: tuple[int, int]) -> Doubles | None:
@@ -123,14 +131,11 @@ def _features_on_the_ground(photo_HW3: Pixels, to_ground_33: Doubles) -> LocalFe
     north up, an oblique view no longer foreshortened."""
     size = (photo_HW3.shape[1], photo_HW3.shape[0])
     to_flat_33, flat_size = _flat_frame(apply_homography(to_ground_33, corners(size)), to_ground_33)
-    half_33 = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV counts from pixels' middles
-    flat_HW3 = cv2.warpPerspective(
-        photo_HW3, np.linalg.inv(half_33) @ to_flat_33 @ half_33, flat_size, flags=cv2.INTER_LINEAR
-    )
+    flat_HW3 = warp(photo_HW3, to_flat_33, flat_size)
     mask_HW = np.zeros(flat_size[::-1], np.uint8)
     outline_42 = apply_homography(to_flat_33, corners(size))
     cv2.fillConvexPoly(mask_HW, np.round(outline_42).astype(np.int32), 255)
-    found = find_features(np.asarray(flat_HW3, np.uint8), PHOTO_FEATURES, mask_HW)
+    found = find_features(flat_HW3, PHOTO_FEATURES, mask_HW)
     return LocalFeatures(
         points_N2=apply_homography(np.asarray(np.linalg.inv(to_flat_33)), found.points_N2),
         descriptors_ND=found.descriptors_ND,
@@ -142,9 +147,7 @@ def _flat_frame(ground_42: Doubles, to_ground_33: Doubles) -> tuple[Doubles, tup
     least_2, most_2 = ground_42.min(axis=0), ground_42.max(axis=0)
     scale = PHOTO_PX / float((most_2 - least_2).max())
     width, height = (max(1, round(side)) for side in ((most_2 - least_2) * scale).tolist())
-    place_33 = np.array(
-        [[scale, 0, -scale * least_2[0]], [0, -scale, scale * most_2[1]], [0, 0, 1]]
-    )
+    place_33 = north_up(scale, float(least_2[0]), float(most_2[1]))
     return place_33 @ to_ground_33, (width, height)
 
 
@@ -178,20 +181,19 @@ def refine(photo: MatchablePhoto, windows: Iterable[MatchableWindow]) -> Refinem
 def refine_in(photo: MatchablePhoto, matchable: MatchableWindow) -> Refinement | None:
     """The refinement by one window; None where no homography holds, or no camera makes it."""
     window = matchable.window
-    promised_N2 = photo.promised_N2
-    ratio = ALONE_RATIO if promised_N2 is None else PROMISED_RATIO
+    ratio = ALONE_RATIO if photo.promised_33 is None else PROMISED_RATIO
     pairs_M2 = match_features(photo.features, matchable.features, ratio)
     photo_M2 = photo.features.points_N2[pairs_M2[:, 0]]
     ground_M2 = apply_homography(window.to_ground_33, matchable.features.points_N2[pairs_M2[:, 1]])
-    if promised_N2 is not None:
-        agree_M = agree_with_promise(promised_N2[pairs_M2[:, 0]], ground_M2)
+    if photo.promised_33 is not None:
+        agree_M = agree_with_promise(apply_homography(photo.promised_33, photo_M2), ground_M2)
         photo_M2, ground_M2 = photo_M2[agree_M], ground_M2[agree_M]
     fit = fit_ground(photo_M2, ground_M2, photo.size, TOLERANCE_PX * window.metres_per_pixel)
     if fit is None or not is_camera_view(fit.to_ground_33, photo.size):
         return None
     if not _fits_the_pose(fit.to_ground_33, photo):
         return None
-    return _refinement(fit, photo, window, photo_M2, ground_M2)
+    return _refinement(fit, photo, window, matches=len(photo_M2))
 
 
 def _fits_the_pose(to_ground_33: Doubles, photo: MatchablePhoto) -> bool:
@@ -201,21 +203,16 @@ def _fits_the_pose(to_ground_33: Doubles, photo: MatchablePhoto) -> bool:
         turn = (heading_of(to_ground_33, photo.size) - pose.heading_deg + 180) % 360 - 180
         if abs(turn) > MOST_TURN_DEG:
             return False
-    promised_33 = promised_ground(pose, photo.size)
-    if promised_33 is not None:
-        sides_2 = np.ptp(apply_homography(promised_33, corners(photo.size)), axis=0)
-        found_2 = np.ptp(apply_homography(to_ground_33, corners(photo.size)), axis=0)
+    if photo.promised_33 is not None:
+        sides_2 = ground_extent(photo.promised_33, photo.size)
+        found_2 = ground_extent(to_ground_33, photo.size)
         ratio = float(np.sqrt((found_2 / sides_2).prod()))
         return 1 / MOST_SCALE < ratio < MOST_SCALE
     return True
 
 
 def _refinement(
-    fit: GroundFit,
-    photo: MatchablePhoto,
-    window: MapWindow,
-    photo_M2: Doubles,
-    ground_M2: Doubles,
+    fit: GroundFit, photo: MatchablePhoto, window: MapWindow, matches: int
 ) -> Refinement:
     width, height = photo.size
     shown_52 = np.concatenate([corners(photo.size), [[width / 2, height / 2]]])
@@ -227,11 +224,6 @@ def _refinement(
         east, north, up = camera_above(fit.to_ground_33, photo.size, photo.pose.fov_deg)
         [[camera_lat, camera_lon]] = window.plane.to_degrees(np.array([[east, north]])).tolist()
         camera = (camera_lat, camera_lon, up)
-    agreeing = np.flatnonzero(fit.inliers_M)
-    drawn = agreeing[np.linspace(0, len(agreeing) - 1, min(MOST_PAIRS, len(agreeing))).astype(int)]
-    drawn_N4 = np.hstack(
-        [photo_M2[drawn] / (width, height), window.plane.to_degrees(ground_M2[drawn])]
-    )
     return Refinement(
         lat=lat,
         lon=lon,
@@ -240,7 +232,6 @@ def _refinement(
         footprint=tuple((corner[0], corner[1]) for corner in outline),
         camera=camera,
         inliers=fit.inliers,
-        matches=len(photo_M2),
+        matches=matches,
         residual_m=fit.residual_m,
-        pairs=tuple((row[0], row[1], row[2], row[3]) for row in drawn_N4.tolist()),
     )

@@ -6,12 +6,11 @@ one table for other programs, as Parquet or GeoJSON.
 """
 
 import json
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from pipeline.core import parquet, storage
 from pipeline.core.errors import InputError
@@ -84,14 +83,6 @@ def read_part(out: str, name: str, columns: list[str] | None = None) -> pa.Table
 def part_intact(out: str, name: str) -> bool:
     """Whether every byte of a record part is the one that was written."""
     return parquet.parquet_intact(_path(out, name))
-
-
-def footprints(table: pa.Table, keys: Collection[str]) -> dict[str, list[list[float]]]:
-    """The known footprints of some keys in a table with the columns key and footprint."""
-    known = table.filter(
-        pc.and_(pc.is_in(table["key"], pa.array(keys)), pc.is_valid(table["footprint"]))
-    )
-    return dict(zip(known["key"].to_pylist(), known["footprint"].to_pylist(), strict=True))
 
 
 def export(parts: Iterable[pa.Table], file: str) -> tuple[int, int]:

@@ -71,16 +71,6 @@ class ShardSet:
             found |= {key: next(iter(images.values())) for key, images in members if key in wanted}
         return found
 
-    def footprints(self, keys: Iterable[str]) -> dict[str, list[list[float]]]:
-        """Corners (lat, lon) of the ground that some images show, from the upper left clockwise;
-        unknown ones are absent.
-        """
-        wanted = set(keys)
-        found: dict[str, list[list[float]]] = {}
-        for shard in self._holding(wanted):
-            found |= record_table.footprints(self.records(shard, ["key", "footprint"]), wanted)
-        return found
-
     def records(self, shard: Shard, columns: list[str] | None = None) -> pa.Table:
         """The record table's rows of one shard.
 

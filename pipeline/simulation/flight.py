@@ -76,15 +76,9 @@ class FlightPlan:
                 first_heading_deg
                 + 360.0 * self.turns * (UNIVERSITY_VIEWS - 1) / UNIVERSITY_VIEWS * done
             ) % 360.0
-            away = altitude / tan(radians(down))
             flown.append(
-                Pose(
-                    x_m=-away * sin(radians(heading)),
-                    y_m=-away * cos(radians(heading)),
-                    altitude_m=altitude,
-                    heading_deg=heading,
-                    pitch_deg=-down,
-                    fov_deg=fov,
+                Pose.looking_at_zero(
+                    altitude_m=altitude, heading_deg=heading, pitch_deg=-down, fov_deg=fov
                 )
             )
         return flown

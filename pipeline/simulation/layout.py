@@ -146,8 +146,13 @@ def write_tables(root: Path, jobs: list[LocationJob]) -> None:
         ("locations.csv", locations),
         ("poses.csv", sorted(poses, key=lambda row: str(row["path"]))),
     ):
-        text = io.StringIO()
-        writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        storage.write_bytes(str(root / name), text.getvalue().encode())
+        write_table(root / name, rows)
+
+
+def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Write rows as CSV, atomically; their columns are the first one's keys."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    storage.write_bytes(str(path), text.getvalue().encode())

@@ -30,8 +30,11 @@ from pipeline.core.lock import locks_output
 from pipeline.core.progress import console, progress
 from pipeline.simulation.layout import LocationJob, Role, part_path, write_location, write_tables
 from pipeline.simulation.location import LocationSpec
+from pipeline.simulation.resume import begin, is_complete
 from pipeline.simulation.settings import SimulationSettings
 from pipeline.simulation.texture import usable_textures
+
+COMPLETE = "simulation.json"
 
 
 @locks_output(lambda settings: settings.out)
@@ -51,7 +54,7 @@ def simulate(settings: SimulationSettings) -> Path:
         usable_textures(storage.absolute(settings.textures)) if settings.textures else ([], 0)
     )
     metadata = _settings_metadata(settings, textures)
-    if _is_complete(root, metadata):
+    if is_complete(root, metadata, COMPLETE, "a data set", "jobs/simulate.py"):
         # A run that was killed between its last two steps leaves its parts.
         shutil.rmtree(root / ".parts", ignore_errors=True)
         console.print(f"{root} is complete already; nothing to do")
@@ -59,12 +62,11 @@ def simulate(settings: SimulationSettings) -> Path:
     jobs = plan_jobs(settings, str(root), textures)
     if skipped:
         console.print(f"{settings.textures}: skipped {skipped} files that are no usable images")
-    (root / ".parts").mkdir(parents=True, exist_ok=True)
-    json_files.write_checksummed(str(root / ".parts" / "settings.json"), metadata)
+    begin(root, metadata)
     missing = [job for job in jobs if not part_path(job).exists()]
     seconds = _run_jobs(missing, len(jobs), settings)
     write_tables(root, jobs)
-    json_files.write_checksummed(str(root / "simulation.json"), metadata)
+    json_files.write_checksummed(str(root / COMPLETE), metadata)
     shutil.rmtree(root / ".parts")
     shares = ", ".join(f"{step} {spent:.1f} s" for step, spent in seconds.items())
     console.print(
@@ -141,37 +143,3 @@ def _settings_metadata(settings: SimulationSettings, textures: list[str]) -> dic
         digest = hashlib.sha256(names.encode()).hexdigest()[:16]
         metadata["textures"] = f"{len(textures)} images, {digest}"
     return metadata
-
-
-def _is_complete(root: Path, metadata: dict[str, Any]) -> bool:
-    """Whether the folder holds the complete data set of these settings.
-
-    Raises InputError if the folder holds another data set, or something else.
-    """
-    complete, started = root / "simulation.json", root / ".parts" / "settings.json"
-    path = complete if complete.exists() else started
-    if not path.exists():
-        if root.exists() and any(root.iterdir()):
-            raise InputError(
-                f"{root} holds files that no simulation wrote, expected a new or empty folder; "
-                "choose another --out"
-            )
-        return False
-    try:
-        found = json_files.read_checksummed(str(path))
-    except ValueError as error:
-        raise InputError(
-            f"{path} is damaged ({error}), expected the settings of a simulation; "
-            f"remove {root} and run jobs/simulate.py again"
-        ) from None
-    differing = [
-        f"{name} {found.get(name)!r} instead of {metadata.get(name)!r}"
-        for name in sorted({*found, *metadata})
-        if found.get(name) != metadata.get(name)
-    ]
-    if differing:
-        raise InputError(
-            f"{root} holds a data set made with {', '.join(differing)}, expected the same settings "
-            "to resume; choose another --out or remove the folder"
-        )
-    return path == complete

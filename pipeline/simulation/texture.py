@@ -17,7 +17,7 @@ from pipeline.core.errors import InputError
 from pipeline.images.decode import PILLOW_FORMATS
 from pipeline.simulation.flight import FlightPlan
 from pipeline.simulation.town.town import TEXELS_PER_RADIUS
-from pipeline.simulation.world import FloatMap, World
+from pipeline.simulation.world import ByteMap, FloatMap, World
 
 TEXTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 DECODE_ERRORS = (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError)
@@ -88,17 +88,30 @@ def textured_world(path: str, *, metres_per_pixel: float, frame_pixels: int = 25
     side = round(TEXELS_PER_RADIUS / RADIUS_FRACTION * frame_pixels / 256)
     box = (left, top, left + square, top + square)
     texture_HW3 = np.asarray(image.resize((side, side), Image.Resampling.BICUBIC, box=box))
-    grass_HW, trees_HW = vegetation(texture_HW3.astype(np.float32))
-    return World(
-        texture_HW3=texture_HW3,
-        height_HW=_read_heights(path, image.size, box, side),
+    return photographed_world(
+        texture_HW3,
+        _read_heights(path, image.size, box, side),
         metres_per_pixel=extent_m / side,
         target_radius_m=RADIUS_FRACTION * extent_m,
+    )
+
+
+def photographed_world(
+    texture_HW3: ByteMap, height_HW: FloatMap, *, metres_per_pixel: float, target_radius_m: float
+) -> World:
+    """The world of a photograph from above, with its light, and heights in metres."""
+    grass_HW, trees_HW = _vegetation(texture_HW3.astype(np.float32))
+    shape = height_HW.shape
+    return World(
+        texture_HW3=texture_HW3,
+        height_HW=height_HW,
+        metres_per_pixel=metres_per_pixel,
+        target_radius_m=target_radius_m,
         grass_HW=(grass_HW * 255).astype(np.uint8),
         trees_HW=(trees_HW * 255).astype(np.uint8),
-        facade_HW=np.zeros((side, side), np.uint8),
-        along_HW=np.zeros((side, side), np.float32),
-        facing_HW=np.zeros((side, side), np.float32),
+        facade_HW=np.zeros(shape, np.uint8),
+        along_HW=np.zeros(shape, np.float32),
+        facing_HW=np.zeros(shape, np.float32),
         light_is_baked=True,
     )
 
@@ -129,7 +142,7 @@ def _read_heights(
     )
 
 
-def vegetation(colour_HW3: FloatMap) -> tuple[FloatMap, FloatMap]:
+def _vegetation(colour_HW3: FloatMap) -> tuple[FloatMap, FloatMap]:
     """(grass, trees), each (H, W) from 0 to 1: vegetation is green, trees darker than grass."""
     red, green, blue = (colour_HW3[..., c] for c in range(3))
     total = red + green + blue + 1

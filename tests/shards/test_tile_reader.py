@@ -1,5 +1,8 @@
 """Single images by random access are those of a pass over the tars."""
 
+import shutil
+from pathlib import Path
+
 import pytest
 
 from pipeline.core.errors import InputError
@@ -18,9 +21,7 @@ def test_tile_reader_reads_what_a_pass_reads(tiny_shards: str) -> None:
     assert TileReader(opened, View.DRONE).fetch(keys) == {}
 
 
-def test_tile_reader_of_a_damaged_tar_names_the_remedy(tiny_shards: str, tmp_path: object) -> None:
-    import shutil
-
+def test_tile_reader_of_a_damaged_tar_names_the_remedy(tiny_shards: str, tmp_path: Path) -> None:
     copy = f"{tmp_path}/shards"
     shutil.copytree(tiny_shards, copy)
     opened = open_shards(copy)

@@ -8,13 +8,10 @@
 Each photo is one task, and a rerun resumes with the missing ones.
 """
 
-import csv
-import io
 from collections.abc import Iterator
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import ray
 
@@ -22,8 +19,10 @@ from pipeline.core import cluster, json_files, storage
 from pipeline.core.errors import InputError
 from pipeline.core.lock import locks_output
 from pipeline.core.progress import console, progress
+from pipeline.simulation.layout import write_table
 from pipeline.simulation.over_map.photo import photo_over_map
 from pipeline.simulation.over_map.settings import MapFlightSettings
+from pipeline.simulation.resume import begin, is_complete
 
 TABLE, COMPLETE = "photos.csv", "flight.json"
 
@@ -39,35 +38,20 @@ def fly(settings: MapFlightSettings) -> Path:
             f"--out is {settings.out}, expected a local or mounted folder; write it there and copy"
         )
     root = Path(storage.resolve(settings.out)[1]).absolute()
-    about = {
-        name: value for name, value in asdict(settings).items() if name not in ("out", "workers")
-    }
-    about = {
-        name: list(value) if isinstance(value, tuple) else value for name, value in about.items()
-    }
-    if _is_complete(root, about):
+    others = ("out", "workers")
+    about = {name: value for name, value in asdict(settings).items() if name not in others}
+    about |= {name: list(value) for name, value in about.items() if isinstance(value, tuple)}
+    if is_complete(root, about, COMPLETE, "a flight with other settings,", "jobs/fly.py"):
         console.print(f"{root} is complete already; nothing to do")
         return root
-    (root / "photos").mkdir(parents=True, exist_ok=True)
-    (root / ".parts").mkdir(exist_ok=True)
-    settings_file = root / ".parts" / "settings.json"
-    if settings_file.exists() and _read(settings_file) != about:
-        raise InputError(
-            f"{root} holds a part of another flight, expected an empty folder or one of these "
-            "settings; name another --out"
-        )
-    json_files.write_checksummed(str(settings_file), about)
+    begin(root, about)
     numbers = range(settings.photos)
     missing = [number for number in numbers if not _part(root, number).exists()]
     with progress(len(missing), "fly", "photos") as meter:
         for _ in _take_photos(settings, root, missing):
             meter.advance()
     rows = [json_files.read_checksummed(str(_part(root, number)))["row"] for number in numbers]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    storage.write_bytes(str(root / TABLE), text.getvalue().encode())
+    write_table(root / TABLE, rows)
     json_files.write_checksummed(str(root / COMPLETE), about)
     storage.remove_folder(str(root / ".parts"))
     console.print(f"{root}: {settings.photos} photos over {settings.mosaic}", markup=False)
@@ -106,24 +90,3 @@ def write_photo(settings: MapFlightSettings, root: str, number: int) -> None:
 
 def _part(root: Path, number: int) -> Path:
     return root / ".parts" / f"{number:05d}.json"
-
-
-def _is_complete(root: Path, about: dict[str, Any]) -> bool:
-    """Raises InputError where the folder holds another flight."""
-    done = root / COMPLETE
-    if not done.exists():
-        return False
-    if _read(done) != about:
-        raise InputError(
-            f"{root} holds a flight with other settings, expected an empty folder or one of these; "
-            "name another --out"
-        )
-    return True
-
-
-def _read(path: Path) -> dict[str, Any] | None:
-    """The settings in a file; None where it is damaged."""
-    try:
-        return json_files.read_checksummed(str(path))
-    except ValueError:
-        return None

@@ -6,8 +6,7 @@ season, haze and sensor; with a surface model it has relief and parallax, withou
 Sun and shadows stay as in the map.
 """
 
-from dataclasses import dataclass
-from math import cos, radians, sin, tan
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -28,7 +27,7 @@ from pipeline.simulation.over_map.photo_tags import with_camera_tags
 from pipeline.simulation.over_map.settings import MapFlightSettings
 from pipeline.simulation.render import render_perspective
 from pipeline.simulation.scene import REACH_IN_RADII, prepare_scene
-from pipeline.simulation.texture import vegetation
+from pipeline.simulation.texture import photographed_world
 from pipeline.simulation.world import FloatMap, World
 from pipeline.sources.maps.mosaic import colours_for, open_mosaic, read_window
 from pipeline.sources.maps.placement import MosaicRejected, Placement, place_mosaic
@@ -84,7 +83,8 @@ def photo_over_map(settings: MapFlightSettings, number: int) -> MapPhoto:
     heights_HW = _heights(settings.surface, window) if settings.surface else None
     world = _world(window, heights_HW)
     middle = len(world.height_HW) // 2
-    raised = _raise(pose, float(world.height_HW[middle, middle]))
+    ground_m = float(world.height_HW[middle, middle])
+    raised = replace(pose, altitude_m=pose.altitude_m + ground_m)
     frame_SS3 = render_perspective(
         prepare_scene(world, sample_day(rng)), raised, size=settings.size, rng=rng
     )
@@ -107,14 +107,8 @@ def draw_pose(settings: MapFlightSettings, rng: np.random.Generator) -> Pose:
     fov = min(float(rng.uniform(*settings.fov)), widest)
     height = float(rng.uniform(*settings.height))
     heading = float(rng.uniform(0, 360))
-    away = height / tan(radians(-pitch))
-    return Pose(
-        x_m=-away * sin(radians(heading)),
-        y_m=-away * cos(radians(heading)),
-        altitude_m=height,
-        heading_deg=heading,
-        pitch_deg=pitch,
-        fov_deg=fov,
+    return Pose.looking_at_zero(
+        altitude_m=height, heading_deg=heading, pitch_deg=pitch, fov_deg=fov
     )
 
 
@@ -173,38 +167,20 @@ def _heights(path: str, window: MapWindow) -> FloatMap:
 
 def _world(window: MapWindow, heights_HW: FloatMap | None) -> World:
     side = len(window.pixels_HW3)
-    grass_HW, trees_HW = vegetation(window.pixels_HW3.astype(np.float32))
-    flat_HW = np.zeros((side, side), np.float32)
-    return World(
-        texture_HW3=window.pixels_HW3,
-        height_HW=flat_HW if heights_HW is None else heights_HW,
+    return photographed_world(
+        window.pixels_HW3,
+        np.zeros((side, side), np.float32) if heights_HW is None else heights_HW,
         metres_per_pixel=window.metres_per_pixel,
         # The scene's mirrored margin follows from it: none is needed.
         target_radius_m=side * window.metres_per_pixel / 2 / REACH_IN_RADII,
-        grass_HW=(grass_HW * 255).astype(np.uint8),
-        trees_HW=(trees_HW * 255).astype(np.uint8),
-        facade_HW=np.zeros((side, side), np.uint8),
-        along_HW=flat_HW,
-        facing_HW=flat_HW,
-        light_is_baked=True,
     )
-
-
-def _raise(pose: Pose, ground_m: float) -> Pose:
-    """The pose over a world whose ground is so high at (0, 0)."""
-    return Pose(
-        x_m=pose.x_m, y_m=pose.y_m, altitude_m=pose.altitude_m + ground_m,
-        heading_deg=pose.heading_deg, pitch_deg=pose.pitch_deg, fov_deg=pose.fov_deg,
-    )  # fmt: skip
 
 
 def _told(pose: Pose, settings: MapFlightSettings, rng: np.random.Generator) -> Pose:
     """The pose as the camera's sensors state it."""
-    return Pose(
-        x_m=pose.x_m,
-        y_m=pose.y_m,
+    return replace(
+        pose,
         altitude_m=pose.altitude_m * (1 + settings.height_error * rng.normal()),
         heading_deg=(pose.heading_deg + settings.heading_error * rng.normal()) % 360,
         pitch_deg=max(-90.0, pose.pitch_deg + settings.pitch_error * rng.normal()),
-        fov_deg=pose.fov_deg,
     )
