@@ -1,10 +1,10 @@
 """Import another program's features (.mat) as feature tables that jobs/evaluate.py evaluates
 
-Takes the file that University-1652's test.py and its descendants save (pytorch_result.mat).
+Takes the file that University-1652's test.py and its descendants save (pytorch_result.mat). With
+--stated R1 AP it says whether these two figures can both be true.
 """
 
 from jobs.command_line.cli import run
-from pipeline.core.progress import console
 from pipeline.features.settings import ImportSettings
 
 
@@ -12,15 +12,9 @@ def main(settings: ImportSettings) -> None:
     """Import gallery_f, gallery_label, query_f and query_label (and the paths, if there) into
     OUT/queries and OUT/gallery.
     """
-    from pipeline.features.import_mat import import_features
+    from jobs.stages.import_features import import_and_print
 
-    written = import_features(settings)
-    for table, rows in written.values():
-        console.print(f"{table}: {rows:,} rows")
-    queries, gallery = (written[name][0] for name in ("query", "gallery"))
-    console.print(
-        f"evaluate them: python jobs/evaluate.py --queries {queries} --gallery {gallery} --out DIR"
-    )
+    import_and_print(settings)
 
 
 if __name__ == "__main__":

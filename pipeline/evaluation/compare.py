@@ -18,20 +18,23 @@ from pipeline.evaluation.published import (
     PUBLISHED_ABLATION,
     PUBLISHED_MULTI_QUERY,
     PUBLISHED_TABLE,
-    impossible_ap,
+    impossible_means,
 )
 from pipeline.report.inputs import EvaluationResults, task_key
 from pipeline.retrieval.bootstrap import paired_difference
 from pipeline.retrieval.metrics import hits_at
 
 COMPARED_METRICS = ("r1", "ap")
+IMPOSSIBLE = "impossible"
+"Marks an AP that its R@1 excludes (`impossible_ap`)."
 MAIN_TASKS = ("drone->satellite", "satellite->drone")
 TASK_HEADINGS = {"drone->satellite": "UAV to satellite", "satellite->drone": "satellite to UAV"}
 
 
 def compare(runs: Sequence[EvaluationResults]) -> list[dict[str, Any]]:
-    """One row per run and task of the first run: its metrics and, for every later run, the
-    differences of R@1 and AP with their 95 % intervals and p.
+    """One row per run and task of the first run: its metrics, whether R@1 and AP contradict each
+    other (`impossible`) and, for every later run, the differences of R@1 and AP with their 95 %
+    intervals and p.
 
     Raises InputError if there are fewer than two runs, two have one name, none shares a task with
     the first, or a shared task was run on other queries or another gallery.
@@ -44,11 +47,12 @@ def compare(runs: Sequence[EvaluationResults]) -> list[dict[str, Any]]:
         )
     baseline, rows = runs[0], []
     for base in baseline.metrics:
-        rows.append({"run": baseline.name, **base})
+        rows.append({"run": baseline.name, **base} | _contradiction(baseline, base))
         for run in runs[1:]:
             own = run.metrics_for(base)
             if own is not None:
-                rows.append({"run": run.name, **own} | _differences(run, baseline, base))
+                row = {"run": run.name, **own} | _contradiction(run, base)
+                rows.append(row | _differences(run, baseline, base))
     if len(rows) == len(baseline.metrics):
         found = "; ".join(
             f"{run.name}: {', '.join(' '.join(map(str, task_key(m)[:2])) for m in run.metrics)}"
@@ -59,6 +63,12 @@ def compare(runs: Sequence[EvaluationResults]) -> list[dict[str, Any]]:
             "expected the same evaluations"
         )
     return rows
+
+
+def _contradiction(run: EvaluationResults, base: dict[str, Any]) -> dict[str, Any]:
+    table = rows_by_query(run, base)
+    figures = (metric_by_query(table, name) for name in COMPARED_METRICS)
+    return {"impossible": impossible_means(*figures)}
 
 
 def _differences(
@@ -165,7 +175,7 @@ def _tables(
         figures = [line.for_task(task) or (None, None) for task in tasks]
         cells = ["-" if value is None else f"{value:.2f}" for pair in figures for value in pair]
         gallery = ", gallery without distractors" if line.protocol == "queried-only" else ""
-        wrong = ", impossible" if impossible_ap(*line.drone_to_satellite) else ""
+        wrong = f", {IMPOSSIBLE}" if line.impossible else ""
         lines.append([f"{line.method}, {line.pixels} px (published{gallery}{wrong})", *cells])
     tables = [(f"Both directions, percent, {protocols}", heading, lines)]
     merged = {
@@ -196,9 +206,14 @@ def _tables(
 
 
 def _percent_cells(rows: Sequence[dict[str, Any] | None], measures: Sequence[str]) -> list[str]:
-    return [
-        f"{100 * float(row[measure]):.2f}" if row else "-" for row in rows for measure in measures
-    ]
+    return [_percent_cell(row, measure) for row in rows for measure in measures]
+
+
+def _percent_cell(row: dict[str, Any] | None, measure: str) -> str:
+    if row is None:
+        return "-"
+    mark = f" {IMPOSSIBLE}" if measure == "ap" and row["impossible"] else ""
+    return f"{100 * float(row[measure]):.2f}{mark}"
 
 
 def _name(row: dict[str, Any]) -> str:

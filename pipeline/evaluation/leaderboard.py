@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.core.arrays import Doubles, Strings
 from pipeline.core.errors import InputError
 from pipeline.evaluation.compare import MAIN_TASKS, TASK_HEADINGS, metric_by_query, rows_by_query
-from pipeline.evaluation.published import impossible_ap
+from pipeline.evaluation.published import impossible_means
 from pipeline.report.inputs import EvaluationResults
 from pipeline.retrieval.bootstrap import Difference, confidence_intervals, paired_difference
 
@@ -94,7 +94,7 @@ def leaderboard(
                 TaskFigures(
                     task=task, r1=r1, low=float(low), high=float(high), ap=ap,
                     by_seed=tuple(hit_SQ.mean(1).tolist()), difference=compared,
-                    impossible=_has_one_match(hit_SQ, ap_SQ) and impossible_ap(100 * r1, 100 * ap),
+                    impossible=impossible_means(hit_SQ, ap_SQ),
                 )
             )  # fmt: skip
         runs = evaluations[method]
@@ -102,11 +102,6 @@ def leaderboard(
             LeaderboardRow(method=method, seeds=len(runs), tasks=tuple(tasks), cost=costs[method])
         )
     return rows
-
-
-def _has_one_match(hit_SQ: Doubles, ap_SQ: Doubles) -> bool:
-    """Whether every query has one true match, as far as its figures tell: at rank 1 its AP is 1."""
-    return bool((ap_SQ[hit_SQ == 1] > 1 - 1e-6).all())
 
 
 def _figures(runs: Sequence[EvaluationResults]) -> dict[str, tuple[Doubles, Doubles, Strings]]:

@@ -8,6 +8,8 @@ possible at all beside its R@1 can be told by arithmetic.
 from dataclasses import dataclass
 from typing import Literal
 
+from pipeline.core.arrays import Doubles
+
 Protocol = Literal["full", "queried-only"]
 ROUNDING = 0.0101
 "Percent: figures are published with two decimals, and both are rounded."
@@ -32,6 +34,12 @@ class PublishedResult:
         }
         return figures.get(task)
 
+    @property
+    def impossible(self) -> bool:
+        """Whether R@1 and AP of drone->satellite, which has one true match, contradict each
+        other."""
+        return impossible_ap(*self.drone_to_satellite)
+
 
 def impossible_ap(r1: float, ap: float) -> bool:
     """Whether R@1 and AP in percent contradict each other where a query has one true match.
@@ -39,7 +47,21 @@ def impossible_ap(r1: float, ap: float) -> bool:
     Its AP is 1 at rank 1, and at rank 2 or later at most 1/4 (the official measure's trapezoid), so
     that R@1 <= AP <= R@1 + (100 - R@1) / 4. UAV -> satellite on University-1652 is such a task.
     """
-    return not r1 - ROUNDING <= ap <= r1 + (100 - r1) / 4 + ROUNDING
+    return not r1 - ROUNDING <= ap <= highest_ap(r1) + ROUNDING
+
+
+def highest_ap(r1: float) -> float:
+    """The AP in percent of a task of one true match a query where every miss is at rank 2."""
+    return r1 + (100 - r1) / 4
+
+
+def impossible_means(hits: Doubles, aps: Doubles) -> bool:
+    """Whether the means of hits at rank 1 and of AP, shares by query, contradict each other.
+
+    False where a query that hits has an AP below 1: it has further matches, and nothing is known.
+    """
+    one_match = bool((aps[hits == 1] > 1 - 1e-6).all())
+    return one_match and impossible_ap(100 * float(hits.mean()), 100 * float(aps.mean()))
 
 
 def _published(

@@ -65,3 +65,10 @@ class ImportSettings:
     "View of the queries, where the file has no paths that name it."
     gallery_view: ViewName = "satellite"
     "View of the gallery, where the file has no paths that name it."
+    stated: tuple[float, float] | None = None
+    """R@1 and AP in percent that are stated for these features, such as 82.73 85.19: whether both
+    can be true is told by arithmetic, where a query has one true match."""
+
+    def __post_init__(self) -> None:
+        for value in self.stated or ():
+            require(0 <= value <= 100, "stated", value, "percent, from 0 to 100")

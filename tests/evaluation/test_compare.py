@@ -81,6 +81,18 @@ def test_tables_list_runs_differences_and_published_figures() -> None:
     assert r"95 \% interval" in tex
 
 
+@pytest.mark.parametrize(("ap_of_hits", "marked"), [(1.0, True), (0.8, False)])
+def test_tables_mark_figures_that_contradict_each_other(ap_of_hits: float, marked: bool) -> None:
+    base, other = run("base", [1, 2] * 4), run("other", [1, 2] * 4)
+    aps = [ap_of_hits, 0.9] * 4  # at rank 2 one match gives 1/4
+    own = other.results.set_column(
+        other.results.column_names.index("ap"), "ap", pa.array(aps, pa.float64())
+    )
+    rows = compare([base, replace(other, results=own)])
+    assert [row["impossible"] for row in rows] == [False, marked]
+    assert ("| other | 50.00 | 62.50 impossible |" in markdown(rows)) is marked
+
+
 def test_tables_list_multi_query_apart() -> None:
     base, other = (run(name, [1, 2], multi=True) for name in "ab")
     text = markdown(compare([base, other]), published=True)

@@ -83,6 +83,18 @@ def test_impossible_ap_follows_from_one_match(r1: float, ap: float, impossible: 
     assert impossible_ap(r1, ap) is impossible
 
 
+@pytest.mark.parametrize(("ap", "marked"), [(97.77, True), (96.5, False)])
+def test_page_marks_contradictions_of_others(ap: float, marked: bool) -> None:
+    [row] = leaderboard({"a": [evaluation("a", [1, 1])]}, {"a": COST})
+    other = replace(PUBLISHED_TABLE[0], method="Other", drone_to_satellite=(95.82, ap))
+    page = render_leaderboard(
+        [row.as_dict()],
+        published=[vars(other) | {"impossible": other.impossible}],
+        data="A set", terms="few images",
+    )  # fmt: skip
+    assert ("impossible beside this R@1" in page) is marked
+
+
 def test_published_figures_are_possible() -> None:
     for row in (*PUBLISHED_TABLE, *PUBLISHED_ABLATION, *PUBLISHED_SINCE):
         assert not impossible_ap(*row.drone_to_satellite), row

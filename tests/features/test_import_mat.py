@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.io
 
+from jobs.stages.import_features import import_and_print, judge_stated
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.evaluation import exports
@@ -69,6 +70,34 @@ def test_import_mat_round_trip_keeps_measures(tmp_path: Path) -> None:
     assert [theirs[name] for name in FIGURES] == [ours[name] for name in FIGURES]
     lines = (tmp_path / "a" / "answer.txt").read_text().splitlines()
     assert [len(line.split("\t")) for line in lines] == [10] * 10
+
+
+@pytest.mark.parametrize(
+    ("stated", "judgement"),
+    [
+        ((95.82, 97.77), "impossible; with one true match a query, AP lies from 95.82 to 96.86"),
+        ((82.73, 85.19), "possible; with one true match a query, AP lies from 82.73 to 87.05"),
+        ((92.21, 90.39), "impossible"),
+    ],
+)
+def test_import_mat_judges_stated_figures(
+    tmp_path: Path, stated: tuple[float, float], judgement: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mat = saved(tmp_path / "r.mat")
+    import_and_print(ImportSettings(mat=mat, out=str(tmp_path / "out"), stated=stated))
+    printed = " ".join(capsys.readouterr().err.split())
+    assert f"stated R@1 {stated[0]:.2f} and AP {stated[1]:.2f}: {judgement}" in printed
+
+
+def test_import_mat_judges_nothing_of_several_matches(tmp_path: Path) -> None:
+    written = import_features(
+        ImportSettings(
+            mat=saved(tmp_path / "r.mat", gallery_label=[839, 839, 7], gallery_path=None),
+            out=str(tmp_path / "out"),
+        )
+    )
+    sentence = judge_stated((95.82, 97.77), written["query"][0], written["gallery"][0])
+    assert "not judged, since queries have up to 2 true matches" in sentence
 
 
 def test_import_mat_locations_from_paths_or_labels(tmp_path: Path) -> None:
