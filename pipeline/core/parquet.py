@@ -101,6 +101,20 @@ def read_table(path: str, columns: list[str] | None = None) -> pa.Table:
         return parquet.read(columns=columns)
 
 
+def select_or_null(table: pa.Table, columns: Sequence[str] | None, schema: pa.Schema) -> pa.Table:
+    """Columns of a table, all of `schema` by default; those that a file of before lacks and that
+    may be null are null.
+
+    Raises KeyError for any other that is absent.
+    """
+    names = schema.names if columns is None else columns
+    for name in names:
+        if name not in table.column_names and schema.field(name).nullable:
+            nulls = pa.nulls(len(table), schema.field(name).type)
+            table = table.append_column(schema.field(name), nulls)
+    return table.select(names)
+
+
 def verify_parquet(path: str) -> None:
     """Raise one of DAMAGE_ERRORS if any byte of a file is not what was written.
 

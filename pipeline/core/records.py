@@ -59,6 +59,9 @@ class ImageRecord:
     variant: str = ""
     """Distinguishes images of one name in one location, such as by the height that they were taken
     from."""
+    level: str = ""
+    """Which of several sizes of ground it shows, such as `60m` or `z17`, where its source cuts or
+    holds more than one."""
     geotag: GeoTag | None = None
     taken_at: str | None = None
     "When, ISO 8601; without an offset it is the camera's own clock."

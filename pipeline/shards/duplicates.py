@@ -1,5 +1,5 @@
-"""Images that a set holds already, and images that come twice: the same bytes, in one split and
-view, of one location or at one position.
+"""Images that a set holds already, and images that come twice: the same bytes, in one split, view
+and level, of one location or at one position.
 
 In: records and record tables. Out: the new records when extending, and the images to leave out. A
 blank tile of the sea may come many times, each at its own position, and University-1652's queries
@@ -19,7 +19,9 @@ from pipeline.core.records import ImageRecord, Rejection
 from pipeline.shards.shard_set import ShardSet
 from pipeline.sources.base import Source
 
-COLUMNS = ["key", "shard", "split", "view", "location", "lat", "lon", "path", "part", "sha256"]
+COLUMNS = [
+    "key", "shard", "split", "view", "level", "location", "lat", "lon", "path", "part", "sha256",
+]  # fmt: skip
 
 
 def find_duplicates(
@@ -38,7 +40,7 @@ def find_duplicates(
     for row in sorted(
         rows, key=lambda row: (row["shard"] not in settled, row["path"], row["part"])
     ):
-        bytes_in = row["split"], row["view"], row["sha256"]
+        bytes_in = row["split"], row["view"], row["level"], row["sha256"]
         same: list[tuple[Any, ...]] = [(*bytes_in, row["location"])]
         if row["lat"] is not None:
             same.append((*bytes_in, row["lat"], row["lon"]))

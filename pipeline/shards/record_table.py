@@ -28,7 +28,9 @@ SCHEMA = pa.schema(
     + [("footprint", pa.list_(pa.list_(pa.float64(), 2))), ("taken_at", pa.string())]
     + [pa.field(name, pa.string(), nullable=False) for name in ("source", "path", "part", "sha256")]
     + [pa.field(name, pa.int64(), nullable=False) for name in ("bytes", "width", "height")]
+    + [("level", pa.string())]
 )
+"A column that may be null is null where an older part lacks it."
 FOOTER = b"pvda.packed"
 
 
@@ -72,7 +74,7 @@ def read_part(out: str, name: str, columns: list[str] | None = None) -> pa.Table
     """
     path = _path(out, name)
     try:
-        return parquet.read_table(path, columns)
+        return parquet.select_or_null(parquet.read_table(path, columns), columns, SCHEMA)
     except parquet.DAMAGE_ERRORS as error:
         raise InputError(
             f"{path} cannot be read ({error}), expected the record table that packing wrote beside "

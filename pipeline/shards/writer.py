@@ -101,7 +101,7 @@ def read_member(record: ImageRecord, source: Source, check: Check) -> Member:
         data, (width, height) = _read_checked(record, source, check)
     except DecodeError:
         data, (width, height) = _read_checked(record, source, check)
-    metadata = {
+    metadata: dict[str, Any] = {
         "key": record.key,
         "location": record.location,
         "view": record.view,
@@ -114,6 +114,8 @@ def read_member(record: ImageRecord, source: Source, check: Check) -> Member:
         "width": width,
         "height": height,
     }
+    if record.level:
+        metadata["level"] = record.level
     return Member(name=f"{record.key}.{source.ending(record)}", data=data, metadata=metadata)
 
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Literal
 
 from rasterio.enums import Resampling
@@ -34,9 +35,11 @@ from pipeline.sources.maps.mosaic import (
     root_cause,
 )
 from pipeline.sources.maps.placement import MosaicRejected, Placement, place_mosaic
-from pipeline.sources.maps.tiles import Tile, count_tiles, parse_window, plan_tiles
+from pipeline.sources.maps.tiles import Tile, count_tiles, parse_window, plan_levels
 
 DEFAULT_TILE_PIXELS = 512
+LEAST_RATIO = 1.1
+"Between the sides of two levels: nearer ones show the same."
 MOSAIC_SUFFIXES = (".tif", ".tiff")
 MAX_TILES = 2_000_000
 """Of one mosaic: with their records they take a few gigabytes. A header alone may claim sides of
@@ -47,16 +50,18 @@ four thousand million pixels."""
 class GeoTiff(Source):
     """GeoTIFF mosaics, cut into tiles."""
 
-    tile_m: float | None = None
+    tile_m: float | tuple[float, ...] | None = None
     """Side of a tile on the ground, metres, measured at the mosaic's centre; instead of
-    --tile-pixels."""
-    tile_pixels: int | None = None
-    "Side of a tile in the mosaic's pixels; 512 where --tile-m is not given either."
+    --tile-pixels. Several, such as 60 120 240, cut the mosaic once for each: levels for photos
+    from different heights."""
+    tile_pixels: int | tuple[int, ...] | None = None
+    """Side of a tile in the mosaic's pixels, or several; 512 where --tile-m is not given
+    either."""
     overlap: float = 0.0
     "Share of a tile that its neighbour shows too, from 0 to below 1, along each side."
     output_pixels: int | None = None
-    """Side of a tile as it is written, pixels; None: as it is cut. Where smaller, overviews are
-    read."""
+    """Side of a tile as it is written, of every level, pixels; None: as it is cut. Where smaller,
+    overviews are read."""
     resampling: Literal["average", "bilinear", "cubic"] = "average"
     "How pixels become fewer; average does not alias."
     max_nodata: float = 0.5
@@ -86,7 +91,11 @@ class GeoTiff(Source):
             )
         for flag in ("tile_m", "tile_pixels", "output_pixels"):
             value = getattr(self, flag)
-            require(value is None or 0 < value < math.inf, flag, value, "a number above 0")
+            sides = _several(value)
+            valid = all(0 < side < math.inf for side in sides) and value != ()
+            require(valid, flag, value, "a number above 0")
+            apart = all(more >= LEAST_RATIO * less for less, more in pairwise(sides))
+            require(apart, flag, value, f"sizes that rise by {LEAST_RATIO - 1:.0%} or more")
         side, most = self.output_pixels, math.isqrt(MAX_PIXELS)
         require(side is None or side <= most, "output_pixels", side, f"at most {most}")
         require(0 <= self.overlap < 1, "overlap", self.overlap, "a share from 0 to below 1")
@@ -126,7 +135,7 @@ class GeoTiff(Source):
         try:
             placement = self._placement(path)
             if self.output_pixels is not None:  # one scale, for a mosaic smaller than a tile too
-                tile = self._tile_size(placement)
+                tile = self._levels(placement)[record.level]
                 scaled = (self.output_pixels * a / b for a, b in zip(size, tile, strict=True))
                 width, height = (max(1, round(side)) for side in scaled)
                 size = (width, height)
@@ -151,55 +160,74 @@ class GeoTiff(Source):
             found = f"{kind} values; expected integers or floats"
             raise MosaicRejected("not a picture", found)
         placement = self._placement(path)
-        planned = self._plan((dataset.width, dataset.height), self._tile_size(placement))
+        planned = self._plan((dataset.width, dataset.height), self._levels(placement))
         shown = colours_for(path, self.stretch, self.bands)
-        kept = self._without_nodata(path, planned, shown)
+        every = [tile for tiles in planned.values() for tile in tiles]
+        kept = self._without_nodata(path, every, shown)
         windows = [tile.window for tile in kept]
         tags = placement.georeference.geotags(windows, placement.flip)
-        placed = [(tile, tag) for tile, tag in zip(kept, tags, strict=True) if tag is not None]
-        left_out = f", {len(planned) - len(kept):,} left out as nodata" if shown.gaps else ""
+        placed = {tile.window: tag for tile, tag in zip(kept, tags, strict=True) if tag is not None}
+        left_out = f", {len(every) - len(kept):,} left out as nodata" if shown.gaps else ""
         if len(placed) < len(kept):
             left_out += f", {len(kept) - len(placed):,} left out as nowhere on Earth"
-        (across, down), first = placement.pixel_m, planned[0].window
+        (across, down), counted = placement.pixel_m, list[str]()
+        for tiles in planned.values():
+            count, first = sum(tile.window in placed for tile in tiles), tiles[0].window
+            counted.append(f"{count:,} tiles of {first.width} x {first.height} px")
         console.print(
             f"{name}: {dataset.width} x {dataset.height} px of {across:.3g} x {down:.3g} m, "
-            f"{placement.description}, {shown.description}, {len(placed):,} tiles of "
-            f"{first.width} x {first.height} px{left_out}",
+            f"{placement.description}, {shown.description}, {', '.join(counted)}{left_out}",
             markup=False,
         )
-        for tile, tag in placed:
-            yield ImageRecord(
-                path=path,
-                part=tile.window.part,
-                split=self.split,
-                view=self.view,
-                location=f"{name}-{tile.row}-{tile.column}",
-                geotag=tag,
-            )
+        for level, tiles in planned.items():
+            grid = f"{name}-{level}" if level else name
+            for tile in tiles:
+                if tile.window in placed:
+                    yield ImageRecord(
+                        path=path,
+                        part=tile.window.part,
+                        split=self.split,
+                        view=self.view,
+                        location=f"{grid}-{tile.row}-{tile.column}",
+                        level=level,
+                        geotag=placed[tile.window],
+                    )
 
     def _placement(self, path: str) -> Placement:
         """Raises MosaicRejected, RasterioError."""
         return _place(path, file_version(path), self.crs, self.assume_wgs84)
 
-    def _plan(self, size: tuple[int, int], tile: tuple[int, int]) -> list[Tile]:
-        """Raises MosaicRejected where a tile is larger than an image may be, or there are more
-        than MAX_TILES.
+    def _plan(
+        self, size: tuple[int, int], levels: dict[str, tuple[int, int]]
+    ) -> dict[str, list[Tile]]:
+        """The tiles by level. Raises MosaicRejected where a tile is larger than an image may be, or
+        there are more than MAX_TILES.
         """
-        asked = f"{size[0]} x {size[1]} pixels in tiles of {tile[0]} x {tile[1]}"
-        if min(tile[0], size[0]) * min(tile[1], size[1]) > MAX_PIXELS:
-            found = f"{asked}, expected tiles of at most {MAX_PIXELS} pixels: cut smaller ones"
-            raise MosaicRejected("absurd dimensions", found)
-        if (count := count_tiles(size, tile, self.overlap)) > MAX_TILES:
-            found = f"{asked} make {count}, expected at most {MAX_TILES}: "
-            raise MosaicRejected("too many tiles", f"{found}cut larger ones, or the mosaic")
-        return plan_tiles(size, tile, self.overlap)
+        count = 0
+        for tile in levels.values():
+            asked = f"{size[0]} x {size[1]} pixels in tiles of {tile[0]} x {tile[1]}"
+            if min(tile[0], size[0]) * min(tile[1], size[1]) > MAX_PIXELS:
+                found = f"{asked}, expected tiles of at most {MAX_PIXELS} pixels: cut smaller ones"
+                raise MosaicRejected("absurd dimensions", found)
+            if (count := count + count_tiles(size, tile, self.overlap)) > MAX_TILES:
+                found = f"{asked} make {count}, expected at most {MAX_TILES}: "
+                raise MosaicRejected("too many tiles", f"{found}cut larger ones, or the mosaic")
+        return plan_levels(size, levels, self.overlap)
 
-    def _tile_size(self, placement: Placement) -> tuple[int, int]:
-        """(width, height) of a full tile in the mosaic's pixels."""
-        if self.tile_m is None:
-            return (self.tile_pixels or DEFAULT_TILE_PIXELS,) * 2
+    def _levels(self, placement: Placement) -> dict[str, tuple[int, int]]:
+        """(width, height) of a full tile in the mosaic's pixels by the level's name, the smallest
+        first; a single level has no name.
+        """
         across, down = placement.pixel_m
-        return max(1, round(self.tile_m / across)), max(1, round(self.tile_m / down))
+        sides, unit = _several(self.tile_m), "m"
+        if not sides:
+            sides, unit = _several(self.tile_pixels) or (DEFAULT_TILE_PIXELS,), "px"
+            across = down = 1.0
+        sizes = [(max(1, round(side / across)), max(1, round(side / down))) for side in sides]
+        if len(sides) == 1:
+            return {"": sizes[0]}
+        names = (f"{side:g}{unit}".replace(".", "_") for side in sides)
+        return dict(zip(names, sizes, strict=True))
 
     def _without_nodata(self, path: str, tiles: list[Tile], shown: Colours) -> list[Tile]:
         """The tiles that hold enough of an image. Masks are read in threads, and only where the
@@ -218,6 +246,11 @@ class GeoTiff(Source):
                 if share <= self.max_nodata:
                     kept.append(tile)
         return kept
+
+
+def _several(value: float | tuple[float, ...] | None) -> tuple[float, ...]:
+    """The values of a flag that takes one or several."""
+    return value if isinstance(value, tuple) else () if value is None else (value,)
 
 
 @lru_cache(maxsize=256)

@@ -1,8 +1,8 @@
 """Tiles of web maps -> ImageRecords.
 
 In: folders `<zoom>/<x>/<y>.png` (jpg, webp), or an MBTiles file. Out: a record per tile of one
-zoom, with the tile's position; its bytes are packed as they are. Which end rows count from is
-compared with the bounds that a file or the files beside a folder state.
+zoom, or of several as levels, with the tile's position; its bytes are packed as they are. Which end
+rows count from is compared with the bounds that a file or the files beside a folder state.
 """
 
 import re
@@ -39,8 +39,9 @@ _LAYOUT = "<zoom>/<x>/<y>.png, .jpg or .webp"
 class Xyz(Source):
     """Tiles of web maps: z/x/y folders or an MBTiles file."""
 
-    zoom: int | None = None
-    "Zoom whose tiles are packed; None: the deepest that is there."
+    zoom: int | tuple[int, ...] | None = None
+    """Zoom whose tiles are packed; None: the deepest that is there. Several, such as 17 18 19, are
+    levels for photos from different heights."""
     tms: bool = False
     "Whether rows count from the south, as TMS does: --rows south."
     rows: Rows = "auto"
@@ -52,8 +53,10 @@ class Xyz(Source):
     "The part of the data set that the tiles become."
 
     def __post_init__(self) -> None:
-        valid = self.zoom is None or 0 <= self.zoom <= MAX_ZOOM
+        valid = all(0 <= zoom <= MAX_ZOOM for zoom in self._zooms) and self.zoom != ()
         require(valid, "zoom", self.zoom, f"a number from 0 to {MAX_ZOOM}")
+        once = len(set(self._zooms)) == len(self._zooms)
+        require(once, "zoom", self.zoom, "each zoom once")
         valid = not (self.tms and self.rows == "north")
         require(valid, "rows", self.rows, "south or auto beside --tms; leave one out")
 
@@ -94,12 +97,16 @@ class Xyz(Source):
         mbtiles.read_metadata(root)
         counts = mbtiles.count_zooms(root)
         zooms = {zoom: count for zoom, count in counts.items() if _is_zoom(zoom)}
-        zoom = self._choose_zoom(root, zooms)
+        chosen = self._choose_zooms(root, zooms)
         for stored_zoom, count in counts.items():
             if stored_zoom not in zooms:
                 found = f"{count} tiles of zoom {stored_zoom!r}, expected 0 to {MAX_ZOOM}"
                 yield Rejection(path=root, reason="outside of the map", found=found)
-        yield from _other_zooms(root, zooms, zoom)
+        yield from _other_zooms(root, zooms, chosen)
+        for zoom in chosen:
+            yield from self._scan_file_zoom(root, zoom)
+
+    def _scan_file_zoom(self, root: str, zoom: int) -> Iterator[Scanned]:
         rows = _rows_of_file(root, file_version(root), zoom, self._asked)
         for tile in mbtiles.list_tiles(root, zoom):
             if isinstance(tile, Rejection):
@@ -126,23 +133,28 @@ class Xyz(Source):
         if not tiles and any(path.lower().endswith(mbtiles.VECTOR_FORMATS) for path in files):
             raise InputError(f"{root} holds vector tiles, which show no pixels; expected {_LAYOUT}")
         zooms = Counter(zoom for zoom, *_ in tiles.values())
-        zoom = self._choose_zoom(root, zooms)
-        at_zoom = {path: tile[1:] for path, tile in tiles.items() if tile[0] == zoom}
-        rows = self._rows_of_folder(root, files, zoom, [tile[:2] for tile in at_zoom.values()])
-        largest: dict[tuple[int, int], int] = {}
-        for x, row, scale in at_zoom.values():
-            largest[x, row] = max(scale, largest.get((x, row), 0))
-        yield from _other_zooms(root, zooms, zoom)
+        chosen = self._choose_zooms(root, zooms)
+        wanted = {path: tile for path, tile in tiles.items() if tile[0] in chosen}
+        rows_of = {
+            zoom: self._rows_of_folder(
+                root, files, zoom, [tile[1:3] for tile in wanted.values() if tile[0] == zoom]
+            )
+            for zoom in chosen
+        }
+        largest: dict[tuple[int, int, int], int] = {}
+        for zoom, x, row, scale in wanted.values():
+            largest[zoom, x, row] = max(scale, largest.get((zoom, x, row), 0))
+        yield from _other_zooms(root, zooms, chosen)
         for path, size in files.items():
             full_path = storage.join(root, path)
-            if path in at_zoom:
-                x, row, scale = at_zoom[path]
+            if path in wanted:
+                zoom, x, row, scale = wanted[path]
                 if not is_on_grid(zoom, x, row):
                     yield _off_grid(full_path, zoom, x, row)
-                elif scale < largest[x, row]:
+                elif scale < largest[zoom, x, row]:
                     yield SkippedFile(path=full_path, reason="tile that is there as @2x")
                 else:
-                    y = row if rows == "north" else flip_row(zoom, row)
+                    y = row if rows_of[zoom] == "north" else flip_row(zoom, row)
                     yield self._record(full_path, "", zoom, x, y, size)
             elif path in tiles:
                 continue
@@ -166,24 +178,34 @@ class Xyz(Source):
         metadata = read_folder_metadata(root, files)
         return choose_rows(root, self._asked, "north", metadata, zoom, count)
 
-    def _choose_zoom(self, root: str, zooms: Mapping[int, int]) -> int:
-        """The zoom to pack. Raises InputError where there is no tile of it."""
+    def _choose_zooms(self, root: str, zooms: Mapping[int, int]) -> tuple[int, ...]:
+        """The zooms to pack. Raises InputError where there is no tile of one."""
         if not zooms:
             raise InputError(f"no tiles in {root}; expected {_LAYOUT} or MBTiles; check --root")
         found = sorted(zooms)
-        zoom = found[-1] if self.zoom is None else self.zoom
-        if zoom not in zooms:
-            raise InputError(
-                f"no tiles of zoom {zoom} in {root}; it holds zooms {', '.join(map(str, found))}; "
-                "choose one"
-            )
-        if self.zoom is None and len(found) > 1:
-            others = ", ".join(map(str, found[:-1]))
-            console.print(
-                f"{root}: taking zoom {zoom}, the deepest; --zoom takes another of {others}",
-                markup=False,
-            )
-        return zoom
+        if self.zoom is None:
+            *others, zoom = found
+            if others:
+                listed = ", ".join(map(str, others))
+                console.print(
+                    f"{root}: taking zoom {zoom}, the deepest; --zoom takes another of {listed}",
+                    markup=False,
+                )
+            return (zoom,)
+        for zoom in self._zooms:
+            if zoom not in zooms:
+                raise InputError(
+                    f"no tiles of zoom {zoom} in {root}; it holds zooms "
+                    f"{', '.join(map(str, found))}; choose one"
+                )
+        return self._zooms
+
+    @property
+    def _zooms(self) -> tuple[int, ...]:
+        """The zooms that were asked for."""
+        if isinstance(self.zoom, tuple):
+            return self.zoom
+        return () if self.zoom is None else (self.zoom,)
 
     def _record(
         self, path: str, part: str, zoom: int, x: int, y: int, size: int | None
@@ -195,6 +217,7 @@ class Xyz(Source):
             split=self.split,
             view=self.view,
             location=f"{zoom}-{x}-{y}",
+            level=f"z{zoom}" if len(self._zooms) > 1 else "",
             geotag=tile_geotag(zoom, x, y),
             bytes=size,
         )
@@ -218,9 +241,11 @@ def _is_zoom(value: object) -> bool:
     return isinstance(value, int) and 0 <= value <= MAX_ZOOM
 
 
-def _other_zooms(root: str, zooms: Mapping[int, int], chosen: int) -> Iterator[SkippedFile]:
+def _other_zooms(
+    root: str, zooms: Mapping[int, int], chosen: tuple[int, ...]
+) -> Iterator[SkippedFile]:
     for zoom, count in sorted(zooms.items()):
-        if zoom != chosen:
+        if zoom not in chosen:
             yield SkippedFile(path=root, reason=f"tile of zoom {zoom}", count=count)
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 from jobs import make_shards
 from jobs.stages.settings import MakeShardsSettings
-from pipeline.core import storage
+from pipeline.core import parquet, storage
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.integrity import FileChecksum, HashingStream
 from pipeline.core.records import GeoTag, ImageRecord, Rejection, Split, View, make_key
@@ -74,6 +74,17 @@ def test_export_as_parquet_and_geojson(tmp_path: Path) -> None:
         open_shards(str(out)).export(str(tmp_path / "all.shp"))
 
 
+def test_records_of_before_levels_are_read(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    [shard, *_] = pack(SOURCE, packing(imagery(tmp_path / "root"), out)).shards
+    part = str(out / f"records/{shard.name}.parquet")
+    rows = read_part(str(out), shard.name)
+    parquet.write_table(part, parquet.read_table(part).drop_columns(["level"]))
+    assert read_part(str(out), shard.name) == rows
+    assert read_part(str(out), shard.name, ["level", "key"]).to_pylist()[0]["level"] is None
+    assert open_shards(str(out)).export(str(tmp_path / "all.parquet")) == (15, 0)
+
+
 NAMES = st.text(
     st.characters(exclude_categories=["Cs"], exclude_characters="/\0"), min_size=1, max_size=150
 )
@@ -115,14 +126,22 @@ def recorded(facts: dict[str, Any], row: dict[str, Any]) -> ImageRecord:
         "split": Split(facts["split"]),
         "view": View(facts["view"]),
         "location": facts["location"],
+        "level": facts.get("level", ""),
     }
+    assert facts.get("level") == row["level"]
     return ImageRecord(path=row["path"], geotag=tag, bytes=row["bytes"], **kind)
 
 
 @settings(max_examples=25)
 @given(
     st.lists(
-        st.tuples(st.sampled_from(Split), st.sampled_from(View), NAMES, tags()),
+        st.tuples(
+            st.sampled_from(Split),
+            st.sampled_from(View),
+            NAMES,
+            tags(),
+            st.sampled_from(["", "60m"]),
+        ),
         min_size=1,
         max_size=8,
     ),
@@ -130,12 +149,12 @@ def recorded(facts: dict[str, Any], row: dict[str, Any]) -> ImageRecord:
 )
 def test_records_round_trip_through_shards(
     tmp_path_factory: pytest.TempPathFactory,
-    kinds: list[tuple[Split, View, str, GeoTag | None]],
+    kinds: list[tuple[Split, View, str, GeoTag | None, str]],
     size: int,
 ) -> None:
     folder = tmp_path_factory.mktemp("identity")
     records = []
-    for number, (split, view, location, tag) in enumerate(kinds):
+    for number, (split, view, location, tag, level) in enumerate(kinds):
         path = folder / f"{number}.png"
         Image.fromarray(np.full((9, 8 + number, 3), number, np.uint8)).save(path)
         records.append(
@@ -145,6 +164,7 @@ def test_records_round_trip_through_shards(
                 view=view,
                 location=location,
                 geotag=tag,
+                level=level,
                 bytes=path.stat().st_size,
             )
         )

@@ -12,7 +12,7 @@ from rasterio.control import GroundControlPoint
 
 from pipeline.core.errors import InputError
 from pipeline.core.records import Rejection, SkippedFile
-from pipeline.images.decode import DecodeError
+from pipeline.images.decode import DecodeError, decode
 from pipeline.sources.geotiff import GeoTiff
 from tests.sources.mosaics import (
     UTM,
@@ -162,10 +162,41 @@ def test_geotiff_terminal_line_describes_the_mosaic(
     )
 
 
+def test_geotiff_levels_are_in_key_and_record(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = mosaic(tmp_path / "o.tif", noise(3, 64, 64))
+    settings: dict[str, Any] = {"tile_m": (8.0, 16.0), "overlap": 0.5, "output_pixels": 8}
+    records = tiles(root, **settings)
+    assert "49 tiles of 16 x 16 px, 9 tiles of 32 x 32 px" in capsys.readouterr().err
+    fine = [record for record in records if record.level == "8m"]
+    coarse = [record for record in records if record.level == "16m"]
+    assert (len(fine), len(coarse)) == (49, 9)
+    assert coarse[-1].key == "gallery-satellite-o-16m-2-2-x0000032-y0000032-w32-h32"
+    assert len({record.key for record in records}) == 58
+    assert {record.location for record in fine}.isdisjoint(one.location for one in coarse)
+    source = GeoTiff(encoding="png", **settings)
+    assert all(decode(source.read(record)).shape == (8, 8, 3) for record in records)
+    alone = tiles(root, tile_m=16.0, overlap=0.5)
+    assert [one.geotag for one in alone] == [one.geotag for one in coarse]
+    assert [one.location for one in alone[:2]] == ["o-0-0", "o-0-1"]
+    assert tiles(root, tile_m=(16.0,), overlap=0.5) == alone
+
+
+def test_geotiff_smaller_than_a_level_is_cut_once(tmp_path: Path) -> None:
+    root = mosaic(tmp_path / "o.tif", noise(3, 64, 64))
+    found = [record.location for record in tiles(root, tile_pixels=(50, 64, 100, 200))]
+    assert found == [f"o-50px-{at}" for at in ("0-0", "0-1", "1-0", "1-1")] + ["o-64px-0-0"]
+
+
 WRONG_SETTINGS: list[tuple[dict[str, Any], str]] = [
     ({"tile_m": 10.0, "tile_pixels": 10}, "both given"),
     ({"tile_pixels": 0}, "--tile-pixels is 0"),
     ({"tile_m": float("nan")}, "--tile-m is nan"),
+    ({"tile_m": (60.0, -1.0)}, "--tile-m is 60.0 -1.0, expected a number above 0"),
+    ({"tile_m": ()}, "--tile-m is nothing"),
+    ({"tile_m": (60.0, 61.0)}, "--tile-m is 60.0 61.0, expected sizes that rise by 10% or more"),
+    ({"tile_pixels": (512, 256)}, "sizes that rise"),
     ({"output_pixels": -1}, "--output-pixels is -1"),
     ({"overlap": 1.0}, "--overlap is 1.0"),
     ({"max_nodata": 1.5}, "--max-nodata is 1.5"),

@@ -49,6 +49,24 @@ def test_xyz_deepest_zoom_is_packed(tmp_path: Path, capsys: pytest.CaptureFixtur
         records(root, zoom=8)
 
 
+def test_xyz_several_zooms_are_levels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = ("8/0/0.png", "9/1/1.png", "10/2/2.png", "10/2/3.png", "10/2/3@2x.png")
+    root = folder(tmp_path / "tiles", *names)
+    levels = {name: one.level for name, one in records(root, zoom=(9, 10)).items()}
+    assert levels == {"9-1-1": "z9", "10-2-2": "z10", "10-2-3": "z10"}
+    assert [one.level for one in records(root, zoom=10).values()] == ["", ""]
+    file = mbtiles(tmp_path / "a.mbtiles", {(9, 1, 1): tile(), (10, 2, 2): tile(1)})
+    levels = {name: one.level for name, one in records(file, zoom=(9, 10), rows="north").items()}
+    assert levels == {"9-1-1": "z9", "10-2-2": "z10"}
+    source = Xyz(zoom=(9, 10), rows="north")
+    read = [source.read(one) for one in records(file, zoom=(9, 10), rows="north").values()]
+    assert read == [tile(), tile(1)]
+    with pytest.raises(InputError, match=r"no tiles of zoom 11 .* it holds zooms 8, 9, 10"):
+        records(root, zoom=(10, 11))
+    with pytest.raises(InputError, match="--zoom is 9 9, expected each zoom once"):
+        Xyz(zoom=(9, 9))
+
+
 def test_xyz_wrong_folders_and_numbers_are_refused(tmp_path: Path) -> None:
     root = folder(
         tmp_path, "3/4/2.png", "3/8/2.png", "3/4/9.png", "3/west/2.png", "stray.png", "40/1/1.png"

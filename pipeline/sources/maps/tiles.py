@@ -68,6 +68,22 @@ def plan_tiles(size: tuple[int, int], tile: tuple[int, int], overlap: float) -> 
     ]
 
 
+def plan_levels(
+    size: tuple[int, int], levels: dict[str, tuple[int, int]], overlap: float
+) -> dict[str, list[Tile]]:
+    """`plan_tiles` for each of several tile sizes, by name. A window is in one level only: that of
+    an entire mosaic, which is smaller than the tiles of several, in the first.
+    """
+    planned: dict[str, list[Tile]] = {}
+    before: set[Window] = set()
+    for name, tile in levels.items():
+        new = [one for one in plan_tiles(size, tile, overlap) if one.window not in before]
+        before.update(one.window for one in new)
+        if new:
+            planned[name] = new
+    return planned
+
+
 def count_tiles(size: tuple[int, int], tile: tuple[int, int], overlap: float) -> int:
     """How many `plan_tiles` gives, known at once whatever the sizes are."""
     columns, rows = (
