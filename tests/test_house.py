@@ -35,7 +35,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "confidence": BELOW_ALL,
     "matching": BELOW_ALL,
     "locate": BELOW_ALL | {"index", "matching", "confidence"},
-    "service": BELOW_ALL | {"locate", "index"},
+    "service": BELOW_ALL | {"locate", "index", "matching"},
     "retrieval": BELOW_ALL | {"features"},
     "report": BELOW_ALL | {"retrieval"},
     "evaluation": BELOW_ALL | {"report", "retrieval", "features", "shards"},

@@ -21,6 +21,7 @@ from pipeline.locate.refined import refine_answer, with_refinement
 from pipeline.matching.map_windows import MapWindows
 from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
 from pipeline.matching.refine import Refinement
+from pipeline.service.photo_map import PhotoMap
 from pipeline.shards.manifest import MANIFEST
 from pipeline.shards.shard_set import open_shards
 from pipeline.shards.tile_reader import TileReader
@@ -32,14 +33,31 @@ AHEAD = 4
 def open_map(shards: str, gallery: GalleryMap) -> MapWindows | None:
     """The windows of a map; None, with a message, where its tiles do not know their corners: these
     are in the record tables of jobs/make_shards.py, which shards of others lack."""
-    reader = None
-    if storage.exists(storage.join(shards, MANIFEST)):
-        reader = TileReader(open_shards(shards))
-    if reader is None or not len(gallery.keys) or not reader.footprints([str(gallery.keys[0])]):
+    reader = _open_tiles(shards)
+    windows = None if reader is None else _windows_of(reader, gallery)
+    if windows is None:
         console.print(
             f"the images of {shards} do not say which ground their corners show: photos are not "
             "matched with them, and positions are those of tiles"
         )
+    return windows
+
+
+def open_photo_map(shards: str, match: bool, gallery: GalleryMap) -> PhotoMap | None:
+    """The pixels of a map for the service; None for shards of others."""
+    reader = _open_tiles(shards)
+    if reader is None:
+        return None
+    return PhotoMap(gallery, reader.fetch, _windows_of(reader, gallery), match)
+
+
+def _open_tiles(shards: str) -> TileReader | None:
+    manifest = storage.join(shards, MANIFEST)
+    return TileReader(open_shards(shards)) if storage.exists(manifest) else None
+
+
+def _windows_of(reader: TileReader, gallery: GalleryMap) -> MapWindows | None:
+    if not len(gallery.keys) or not reader.footprints([str(gallery.keys[0])]):
         return None
     return MapWindows(gallery, reader.fetch, reader.footprints)
 

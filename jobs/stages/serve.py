@@ -7,6 +7,7 @@ import os
 import signal
 from functools import partial
 
+import cv2
 import torch
 from aiohttp import web
 
@@ -16,6 +17,7 @@ from jobs.encoding.encoder import (
     require_checkpoint,
 )
 from jobs.encoding.photo_encoder import PhotoEncoder
+from jobs.stages.matching import open_photo_map
 from jobs.stages.settings import ServeSettings
 from model.errors import CheckpointError
 from pipeline.core import cluster, storage
@@ -27,13 +29,19 @@ from pipeline.service.app import Service
 from pipeline.service.batcher import ReplicaLost
 from pipeline.service.engine import NotReady
 from pipeline.service.live_index import POLL_INTERVAL_S
+from pipeline.service.photo_map import no_map
 from pipeline.service.predictor import Predictor
 from pipeline.service.replicas import Replicas
 
 
-def load_predictor(checkpoint: str, index: str, shards: str | None, threads: int) -> Predictor:
-    """Load the encoder and the index; called on each replica. Raises InputError."""
+def load_predictor(
+    checkpoint: str, index: str, shards: str | None, threads: int, match: bool = True
+) -> Predictor:
+    """Load the encoder, the index and the map's pixels; called on each replica. Raises
+    InputError."""
     torch.set_num_threads(threads)  # FAISS takes OMP_NUM_THREADS, which Ray sets to the cores
+    cv2.setNumThreads(threads)
+    open_map = no_map if shards is None else partial(open_photo_map, shards, match)
 
     def encoder_for(metadata: IndexMetadata) -> PhotoEncoder:
         try:
@@ -42,7 +50,7 @@ def load_predictor(checkpoint: str, index: str, shards: str | None, threads: int
         except CheckpointError as error:
             raise InputError(str(error)) from None
 
-    return Predictor(index, encoder_for)
+    return Predictor(index, encoder_for, open_map)
 
 
 def serve(settings: ServeSettings) -> None:
@@ -66,7 +74,9 @@ async def listen(settings: ServeSettings, token: str | None) -> None:
     shards = None if settings.shards is None else storage.absolute(settings.shards)
     checkpoint = absolute_checkpoint(settings.checkpoint)
     index = storage.absolute(settings.index)
-    make_predictor = partial(load_predictor, checkpoint, index, shards, placement.cpus)
+    make_predictor = partial(
+        load_predictor, checkpoint, index, shards, placement.cpus, settings.match
+    )
     replicas = Replicas(f"pvda-{os.getpid()}", placement, make_predictor)
     runner = Service(settings, replicas, token, concurrency=placement.workers).runner()
     stop = asyncio.Event()
@@ -99,8 +109,9 @@ async def watch_replicas(replicas: Replicas) -> None:
     """Load, then print each change of the index in use: replicas themselves print nothing."""
     known = await asyncio.to_thread(replicas.start)
     console.print(
-        f"ready: {known.rows} rows, {known.factory}, encoder {known.fingerprint[:12]}; Ctrl-C ends "
-        "it"
+        f"ready: {known.rows} rows, {known.factory}, encoder {known.fingerprint[:12]}, "
+        + ("photos are matched with the map" if known.matched else "positions are those of tiles")
+        + "; Ctrl-C ends it"
     )
     while True:
         await asyncio.sleep(POLL_INTERVAL_S)

@@ -178,7 +178,11 @@ class ServeSettings(ServiceSettings):
     index: str
     "Folder or URI of the index; the service switches to one that is built there later."
     shards: str | None = None
-    "The shards that the index was made of: needed only where it was embedded in int8."
+    """The shards that the index was made of: photos are matched with their pixels, and the page
+    shows them; needed also where the index's embeddings are int8."""
+    match: bool = True
+    """Match each photo with the map's pixels around its candidates, as jobs/locate.py does. Takes
+    --shards whose tiles know their corners; --no-match answers with tiles."""
     replicas: int = 1
     "Processes that each load encoder and index."
     threads: int | None = None

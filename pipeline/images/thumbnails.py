@@ -44,6 +44,16 @@ class ThumbnailCache:
 
 def thumbnail(data: bytes | None, pixels: int) -> str | None:
     """A small WebP as a data URI, at most so many pixels a side; None without a readable image."""
+    small = thumbnail_bytes(data, pixels)
+    return None if small is None else as_data_uri(small)
+
+
+def as_data_uri(webp: bytes) -> str:
+    return f"data:image/webp;base64,{base64.b64encode(webp).decode()}"
+
+
+def thumbnail_bytes(data: bytes | None, pixels: int) -> bytes | None:
+    """A small WebP, at most so many pixels a side; None without a readable image."""
     if data is None:
         return None
     try:
@@ -51,6 +61,10 @@ def thumbnail(data: bytes | None, pixels: int) -> str | None:
     except DecodeError:
         return None
     image.thumbnail((pixels, pixels), Image.Resampling.LANCZOS)
+    return to_webp(image)
+
+
+def to_webp(image: Image.Image) -> bytes:
     stream = io.BytesIO()
     image.save(stream, "WEBP", quality=WEBP_QUALITY, method=WEBP_EFFORT)
-    return f"data:image/webp;base64,{base64.b64encode(stream.getvalue()).decode()}"
+    return stream.getvalue()

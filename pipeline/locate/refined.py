@@ -12,7 +12,7 @@ from pipeline.core.arrays import Pixels
 from pipeline.locate.locate import Answer, Position
 from pipeline.matching.gate import holds
 from pipeline.matching.map_windows import MapWindows
-from pipeline.matching.refine import Refinement, prepare_photo, refine
+from pipeline.matching.refine import MatchablePhoto, Refinement, prepare_photo, refine
 
 MOST_WINDOWS = 3
 "Windows that a photo is matched with: around the answer, then around other candidates."
@@ -23,9 +23,13 @@ def refine_answer(
 ) -> Refinement | None:
     """The photo matched with the map around an answer and around its other candidates; None where
     no view holds that a camera can have."""
-    if not answer.candidates:
-        return None
-    photo = prepare_photo(photo_HW3, pose)
+    return refine_prepared(answer, prepare_photo(photo_HW3, pose), windows)
+
+
+def refine_prepared(
+    answer: Answer, photo: MatchablePhoto, windows: MapWindows
+) -> Refinement | None:
+    """As `refine_answer`, of a photo whose features were found before."""
     near = windows.around(_positions(answer), MOST_WINDOWS, photo.reach_m)
     return refine(photo, near)
 

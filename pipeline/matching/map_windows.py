@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from pipeline.camera.local_plane import LocalPlane
-from pipeline.camera.map_window import Tile, compose_window, tile_side_m
+from pipeline.camera.map_window import MapWindow, Tile, compose_window, tile_side_m
 from pipeline.core.arrays import Doubles, Ints, Pixels, Strings
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.thumbnails import ImageLoader
@@ -120,10 +120,17 @@ class MapWindows:
 
     def _make(self, place: Place) -> MatchableWindow | None:
         half_m, row, column = place
-        plane = LocalPlane(
-            lat=row * self._step_lat(half_m), lon=column * self._step_lon(half_m, row)
-        )
-        keys = self._keys_within(plane, half_m)
+        lat, lon = row * self._step_lat(half_m), column * self._step_lon(half_m, row)
+        window = self.compose(lat, lon, half_m, 2 * half_m / TILES_ACROSS, MOST_SIDE_PX)
+        return None if window is None else prepare_window(window)
+
+    def compose(
+        self, lat: float, lon: float, half_m: float, tile_m: float, most_px: int
+    ) -> MapWindow | None:
+        """The map within `half_m` metres of a position, of tiles up to `tile_m` wide; at most
+        `most_px` pixels wide. None where no tile shows it."""
+        plane = LocalPlane(lat=lat, lon=lon)
+        keys = self._keys_within(plane, half_m + tile_m)
         footprints = self._footprints(keys)
         images = self._fetch(footprints)
         decoded = {key: decode_or_none(data) for key, data in images.items()}
@@ -136,18 +143,14 @@ class MapWindows:
             return None
         # The finest first: a window shows each ground by the first tile that has it.
         tiles.sort(key=_resolution_m)
-        return prepare_window(
-            compose_window(
-                plane, tiles, half_m, max(_resolution_m(tiles[0]), 2 * half_m / MOST_SIDE_PX)
-            )
-        )
+        resolution_m = max(_resolution_m(tiles[0]), 2 * half_m / most_px)
+        return compose_window(plane, tiles, half_m, resolution_m)
 
-    def _keys_within(self, plane: LocalPlane, half_m: float) -> list[str]:
-        """Tiles whose middle lies within the window or a tile's side beyond it, nearest first."""
+    def _keys_within(self, plane: LocalPlane, reach_m: float) -> list[str]:
+        """Tiles whose middle lies within a square of twice this side, nearest first."""
         numbers = self._gallery.nearest(plane.lat, plane.lon, MOST_TILES)
         away_N = np.abs(plane.to_metres(self._gallery.positions_N2[numbers])).max(axis=1)
-        beyond_m = 2 * half_m / TILES_ACROSS
-        return [str(key) for key in self._gallery.keys[numbers[away_N < half_m + beyond_m]]]
+        return [str(key) for key in self._gallery.keys[numbers[away_N < reach_m]]]
 
 
 def _resolution_m(tile: Tile) -> float:

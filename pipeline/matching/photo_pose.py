@@ -25,6 +25,8 @@ class PoseSettings:
     "Angle of the camera above the horizon, degrees: -90 looks straight down."
 
     def __post_init__(self) -> None:
+        turned = self.heading is None or -360 <= self.heading <= 360
+        require(turned, "heading", self.heading, "degrees from 0 to 360")
         angles = "degrees from 1 to 170"
         require(self.fov is None or 1 <= self.fov <= 170, "fov", self.fov, angles)
         require(self.height is None or self.height > 0, "height", self.height, "metres above 0")

@@ -46,6 +46,22 @@ MOST_SCALE = 4.0
 "Between a footprint's sides and those that the pose promises: height above take-off errs."
 MOST_TURN_DEG = 45.0
 "Between a heading and the one that the pose promises."
+POINTS_KEPT = 40
+"Of the inliers, spread over all of them: enough to see what a refinement rests on."
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchedPoint:
+    """A point of the photo, and the point of the map that looks like it."""
+
+    x: float
+    "Share of the photo's width, from its left."
+    y: float
+    "Share of the photo's height, from its top."
+    lat: float
+    "Of the map's point, WGS84."
+    lon: float
+    "Degrees east."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +86,8 @@ class Refinement:
     "Points of the photo and of the map that look alike."
     residual_m: float
     "Root mean square distance of the inliers on the ground."
+    points: tuple[MatchedPoint, ...] = ()
+    "Some of the inliers, at most 40."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,7 +211,23 @@ def refine_in(photo: MatchablePhoto, matchable: MatchableWindow) -> Refinement |
         return None
     if not _fits_the_pose(fit.to_ground_33, photo):
         return None
-    return _refinement(fit, photo, window, matches=len(photo_M2))
+    inliers = fit.inliers_M
+    points = _points(photo_M2[inliers], ground_M2[inliers], photo.size, window)
+    return _refinement(fit, photo, window, len(photo_M2), points)
+
+
+def _points(
+    photo_K2: Doubles, ground_K2: Doubles, size: tuple[int, int], window: MapWindow
+) -> tuple[MatchedPoint, ...]:
+    """POINTS_KEPT of the inliers, from the photo's left to its right."""
+    order = np.argsort(photo_K2[:, 0], kind="stable")
+    kept = order[np.unique(np.linspace(0, len(order) - 1, POINTS_KEPT).round().astype(int))]
+    shares = (photo_K2[kept] / size).tolist()
+    positions = window.plane.to_degrees(ground_K2[kept]).tolist()
+    return tuple(
+        MatchedPoint(x=round(x, 4), y=round(y, 4), lat=round(lat, 7), lon=round(lon, 7))
+        for (x, y), (lat, lon) in zip(shares, positions, strict=True)
+    )
 
 
 def _fits_the_pose(to_ground_33: Doubles, photo: MatchablePhoto) -> bool:
@@ -212,7 +246,11 @@ def _fits_the_pose(to_ground_33: Doubles, photo: MatchablePhoto) -> bool:
 
 
 def _refinement(
-    fit: GroundFit, photo: MatchablePhoto, window: MapWindow, matches: int
+    fit: GroundFit,
+    photo: MatchablePhoto,
+    window: MapWindow,
+    matches: int,
+    points: tuple[MatchedPoint, ...],
 ) -> Refinement:
     width, height = photo.size
     shown_52 = np.concatenate([corners(photo.size), [[width / 2, height / 2]]])
@@ -234,4 +272,5 @@ def _refinement(
         inliers=fit.inliers,
         matches=matches,
         residual_m=fit.residual_m,
+        points=points,
     )

@@ -6,6 +6,7 @@ Begin in `app.py`, the routes and limits of one request. Its way: `uploads.py` r
 `request.py` validates it, `batcher.py` collects requests into batches, `replicas.py` sends a batch
 to a process with a `Predictor` (`predictor.py`), which answers from a `LiveIndex` (`live_index.py`)
 that may be replaced meanwhile. `engine.py` is the interface between the HTTP side and replicas.
-`responses.py` defines the bodies of responses; `openapi.py` derives their schemas from it, and
-`pages.py` serves the files of `web/`.
+`photo_map.py` matches photos with the pixels of that index's gallery. `pictures.py` serves these
+pixels. `responses.py` defines the bodies of responses; `openapi.py` derives their schemas from it,
+and `pages.py` serves the files of `web/`.
 """

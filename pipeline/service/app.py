@@ -19,6 +19,7 @@ from pipeline.service.batcher import Batcher, PoisonedItem, ReplicaLost
 from pipeline.service.engine import Engine, NotReady
 from pipeline.service.metrics import CONTENT_TYPE, ServiceMetrics
 from pipeline.service.pages import SECURITY_HEADERS, page_routes
+from pipeline.service.pictures import PictureRoutes
 from pipeline.service.predictor import Outcome
 from pipeline.service.request import (
     LocateRequest,
@@ -68,6 +69,7 @@ class Service:
         self._in_flight = 0
         self.app = web.Application(middlewares=[self._middleware])
         self.app.add_routes(page_routes(settings))
+        self.app.add_routes(PictureRoutes(engine, settings.timeout_s).routes())
         self.app.router.add_get("/health", self._health)
         self.app.router.add_get("/metrics", self._metrics)
         self.app.router.add_post("/locate", self._locate, expect_handler=self._expect)
@@ -152,6 +154,13 @@ class Service:
             self._in_flight -= 1
         if isinstance(outcome, Rejection):
             raise undecodable_photo(outcome.reason, outcome.found)
+        self.metrics.answer(outcome)
+        if outcome.match_error is not None:
+            console.print(
+                f"a photo was not matched, its answer is a tile's: {outcome.match_error}",
+                style="yellow",
+                markup=False,
+            )
         return web.json_response(answer_body(outcome, time.monotonic() - began))
 
     async def _predict(self, parsed: LocateRequest) -> Outcome:

@@ -18,6 +18,7 @@ from pipeline.index.metadata import METADATA_FILE
 from pipeline.index.searcher import Index
 from pipeline.locate.calibration import CALIBRATION_FILE, Calibration, find_calibration
 from pipeline.locate.gallery_map import read_gallery_map
+from pipeline.service.photo_map import MapOpener, PhotoMap, no_map
 
 POLL_INTERVAL_S = 2.0
 "Seconds between two checks of the files at the path."
@@ -39,29 +40,38 @@ class OpenedIndex:
     "None where the index was not calibrated."
     spacing_m: float | None
     "The gallery's spacing, which sets the agreement radius without a calibration; else None."
+    photo_map: PhotoMap | None
+    "The gallery's pixels; None where they are not at hand."
 
 
-def open_verified(path: str) -> OpenedIndex:
-    """Open an index and verify every byte of it.
+def open_verified(path: str, open_map: MapOpener = no_map) -> OpenedIndex:
+    """Open an index and verify every byte of it; open its gallery's pixels.
 
-    Raises InputError when there is no index at `path`, or a calibration of another encoder.
+    Raises InputError when there is no index at `path`, or a calibration of another encoder, and
+    what `open_map` raises.
     """
     index = Index(path, verify=True)  # few searches would meet a damaged inverted list, and late
     calibration = find_calibration(path, index.metadata.fingerprint)
-    spacing_m = None if calibration else read_gallery_map(index).spacing_m
-    return OpenedIndex(index=index, calibration=calibration, spacing_m=spacing_m)
+    gallery = read_gallery_map(index)
+    return OpenedIndex(
+        index=index,
+        calibration=calibration,
+        spacing_m=None if calibration else gallery.spacing_m,
+        photo_map=open_map(gallery),
+    )
 
 
 class LiveIndex:
     """`current` is the index in use; `refused` is why the newest one at the path is not, or
     None."""
 
-    def __init__(self, path: str) -> None:
-        """Raises InputError when there is no index at `path` that can be used."""
-        self._path = path
+    def __init__(self, path: str, open_map: MapOpener = no_map) -> None:
+        """`open_map` opens the pixels of each index's gallery. Raises InputError when there is no
+        index at `path` that can be used."""
+        self._path, self._open_map = path, open_map
         # Read before the index is opened: the next poll finds a change made meanwhile.
         self._current_files = self._seen_files = self._read_files()
-        self.current = open_verified(path)
+        self.current = open_verified(path, open_map)
         self.refused: str | None = None
         self._refused_at = 0.0
 
@@ -80,7 +90,7 @@ class LiveIndex:
             self._seen_files, self.refused = files, None
             return
         try:
-            opened = open_verified(self._path)
+            opened = open_verified(self._path, self._open_map)
             validate_index(opened.index, self.current.index)
         except Exception as error:  # FAISS, Arrow, JSON and file systems each raise their own
             self._refuse(files, error)

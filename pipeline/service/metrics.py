@@ -11,6 +11,8 @@ from prometheus_client import (
     generate_latest,
 )
 
+from pipeline.service.photo_map import Located
+
 LATENCY_BUCKETS_S = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 BATCH_BUCKETS = (1, 2, 4, 8, 16, 32, 64)
 CONTENT_TYPE = CONTENT_TYPE_LATEST
@@ -41,6 +43,21 @@ class ServiceMetrics:
             buckets=BATCH_BUCKETS,
             registry=registry,
         )
+        self._matching = Histogram(
+            "pvda_match_seconds",
+            "Seconds of framing a photo and matching it with the map.",
+            buckets=LATENCY_BUCKETS_S,
+            registry=registry,
+        )
+        self._answers = Counter(
+            "pvda_answers",
+            "Answers by how their positions came about: tile, refined, none.",
+            ["how"],
+            registry=registry,
+        )
+        self._match_failures = Counter(
+            "pvda_match_failures", "Photos whose matching failed.", registry=registry
+        )
         queue = Gauge("pvda_waiting_photos", "Photos waiting for a batch.", registry=registry)
         queue.set_function(waiting)
 
@@ -52,6 +69,15 @@ class ServiceMetrics:
     def batch(self, photos: int) -> None:
         """Count one batch of this many photos."""
         self._batches.observe(photos)
+
+    def answer(self, located: Located) -> None:
+        """Count one answer and how it was matched."""
+        position = located.answer.position
+        self._answers.labels(position.how if position else "none").inc()
+        if located.match_seconds is not None:
+            self._matching.observe(located.match_seconds)
+        if located.match_error is not None:
+            self._match_failures.inc()
 
     def text(self) -> bytes:
         return generate_latest(self._registry)

@@ -10,9 +10,10 @@ from pydantic import BaseModel, ConfigDict
 from pydantic.json_schema import GenerateJsonSchema
 
 from pipeline.locate.locate import Answer
+from pipeline.service.pictures import MAX_HALF_M
 from pipeline.service.predictor import ServiceStatus
 from pipeline.service.request import DEFAULT_TOP, MAX_TOP
-from pipeline.service.responses import AnswerTiming, ErrorBody, Readiness
+from pipeline.service.responses import AnswerContext, ErrorBody, Readiness
 from pipeline.service.settings import ServiceSettings
 
 REF = "#/components/schemas/"
@@ -53,6 +54,30 @@ FORM_FIELDS: dict[str, dict[str, Any]] = {
         "default": DEFAULT_TOP,
         "description": "Candidates in the answer.",
     },
+    "fov": {
+        "type": "number",
+        "minimum": 1,
+        "maximum": 170,
+        "description": "Field of view across the photo's width, degrees; overrules its tags, as "
+        "the next three do.",
+    },
+    "height": {
+        "type": "number",
+        "exclusiveMinimum": 0,
+        "description": "Height of the camera above the ground, metres.",
+    },
+    "heading": {
+        "type": "number",
+        "minimum": -360,
+        "maximum": 360,
+        "description": "Direction of the camera, degrees clockwise from north.",
+    },
+    "pitch": {
+        "type": "number",
+        "minimum": -90,
+        "exclusiveMaximum": 0,
+        "description": "Angle of the camera above the horizon, degrees: -90 looks straight down.",
+    },
 }
 
 
@@ -68,6 +93,8 @@ def openapi_document(settings: ServiceSettings) -> dict[str, Any]:
         "paths": {
             "/locate": {"post": _locate(settings)},
             "/health": {"get": _health()},
+            "/tile": {"get": _tile()},
+            "/map": {"get": _map()},
             "/metrics": {"get": _metrics()},
         },
         "components": {"schemas": response_schemas()},
@@ -124,11 +151,51 @@ def _health() -> dict[str, Any]:
     }
 
 
+def _tile() -> dict[str, Any]:
+    key = {"type": "string", "description": "Key of a candidate."}
+    return {
+        "summary": "A gallery image, small",
+        "description": "Where the service was started with --shards.",
+        "parameters": [_query_parameter("key", key) | {"required": True}],
+        "responses": _picture("The image, at most 180 pixels a side."),
+    }
+
+
+def _map() -> dict[str, Any]:
+    degrees: dict[str, Any] = {"type": "number", "description": "Of the middle, degrees, WGS84."}
+    half_m: dict[str, Any] = {
+        "type": "number",
+        "minimum": 1,
+        "maximum": MAX_HALF_M,
+        "description": "Half of its side, metres.",
+    }
+    parameters = {"lat": degrees, "lon": degrees, "half_m": half_m}
+    return {
+        "summary": "The map around a position",
+        "description": "A square of ground, north up, put together from the gallery's images; "
+        "transparent where none shows it. For shards whose images know their corners.",
+        "parameters": [
+            _query_parameter(name, schema) | {"required": True}
+            for name, schema in parameters.items()
+        ],
+        "responses": _picture("The square, at most 640 pixels a side."),
+    }
+
+
+def _picture(description: str) -> dict[str, Any]:
+    content = {"image/webp": {"schema": {"type": "string", "format": "binary"}}}
+    reasons = {status: REASONS[status] for status in ("400", "401", "403", "500", "503", "504")}
+    reasons |= {"404": "The gallery has no such image, or shows no ground there."}
+    errors = {status: _json(reason, "Error") for status, reason in sorted(reasons.items())}
+    return {"200": {"description": description, "content": content}} | errors
+
+
 def _metrics() -> dict[str, Any]:
     content = {"text/plain": {"schema": {"type": "string"}}}
     return {
         "summary": "Counters",
-        "description": "Requests by status, latency, sizes of batches, photos waiting.",
+        "description": "Requests by status, latency, sizes of batches, photos waiting, answers by "
+        "how they came about, seconds of matching.",
         "responses": {"200": {"description": "Prometheus' text format.", "content": content}},
     }
 
@@ -146,7 +213,7 @@ class _Bodies(BaseModel):
     )
 
     answer: Answer
-    timing: AnswerTiming
+    context: AnswerContext
     readiness: Readiness
     status: ServiceStatus
     error: ErrorBody
@@ -164,9 +231,9 @@ def response_schemas() -> dict[str, Any]:
     schemas: dict[str, Any] = _Bodies.model_json_schema(
         ref_template=REF + "{model}", schema_generator=_WithoutTitles, mode="serialization"
     )["$defs"]
-    answer, timing = schemas.pop("Answer"), schemas.pop("AnswerTiming")
+    answer, context = schemas.pop("Answer"), schemas.pop("AnswerContext")
     readiness, status = schemas.pop("Readiness"), schemas.pop("ServiceStatus")
-    bodies = {"Answer": _merge(answer, timing), "Health": _merge(readiness, status)}
+    bodies = {"Answer": _merge(answer, context), "Health": _merge(readiness, status)}
     bodies["Health"]["required"] = ["ready"]  # without the token, or a reason, only that is sent
     return bodies | {"Error": schemas.pop("ErrorBody")} | schemas
 

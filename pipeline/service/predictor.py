@@ -1,31 +1,53 @@
 """Requests -> answers: what a replica does with a batch.
 
-In: validated requests. Out: for each an Answer, or the rejection of its photo where decoding fails.
-Shapes: Q photos that can be decoded, D dimensions.
+In: validated requests. Out: for each an answer, or the rejection of its photo where decoding fails.
+Shapes: Q photos that can be decoded, B their views, D dimensions.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
-from pipeline.core.arrays import Floats
+import numpy as np
+
+from pipeline.core.arrays import Floats, Pixels
 from pipeline.core.filters import Filter
 from pipeline.core.geo import Circle
+from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import Rejection
+from pipeline.images.decode import DecodeError, decode
 from pipeline.index.metadata import IndexMetadata
-from pipeline.locate.locate import Answer, locate_embeddings
-from pipeline.service.live_index import LiveIndex
+from pipeline.locate.locate import (
+    CONSENSUS_CANDIDATES,
+    Answer,
+    answers_from_hits,
+    search_views,
+)
+from pipeline.locate.photo_files import read_photo_tags
+from pipeline.service.live_index import LiveIndex, OpenedIndex
+from pipeline.service.photo_map import (
+    FramedPhoto,
+    Located,
+    MapOpener,
+    PhotoMap,
+    PictureRequest,
+    no_map,
+)
 from pipeline.service.request import LocateRequest
 
-Outcome = Answer | Rejection
+Outcome = Located | Rejection
+DECODE_THREADS = 2
+"The network computes on all cores beside them."
 
 
 class Encoder(Protocol):
     """Embeds photos as the images of the index were embedded."""
 
-    def encode(self, photos: Sequence[bytes]) -> tuple[Floats, list[Rejection | None]]:
-        """Unit embeddings (Q, D) of the photos that can be decoded, in order; and per photo None,
-        or why it has no row."""
+    def to_input(self, image_HW3: Pixels) -> Pixels:
+        """Pixels at the network's size."""
+
+    def forward(self, images: Sequence[Pixels]) -> Floats:
+        """Unit embeddings (B, D) of images of the network's size."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,44 +62,76 @@ class ServiceStatus:
     "FAISS factory string of the index."
     calibrated: bool
     "Whether answers have a probability."
+    matched: bool
+    "Whether photos are matched with the map's pixels."
     refused: str | None
     "Why the newest index at the path is not in use; null where it is."
 
 
 class Predictor:
-    """The encoder and the index, loaded."""
+    """The encoder, the index and the map's pixels, loaded."""
 
-    def __init__(self, index: str, encoder_for: Callable[[IndexMetadata], Encoder]) -> None:
+    def __init__(
+        self,
+        index: str,
+        encoder_for: Callable[[IndexMetadata], Encoder],
+        open_map: MapOpener = no_map,
+    ) -> None:
         """`encoder_for` makes the encoder that fits an index with this metadata.
 
-        Raises InputError when either cannot be used.
+        Raises InputError when any cannot be used.
         """
-        self.live = LiveIndex(index)
+        self.live = LiveIndex(index, open_map)
         self._encoder = encoder_for(self.live.current.index.metadata)
 
     def predict(self, requests: Sequence[LocateRequest]) -> list[Outcome]:
         """One outcome per request, in order. The whole batch is one forward pass and one index."""
         opened = self.live.current
-        embeddings_QD, rejections = self._encoder.encode([request.photo for request in requests])
-        outcomes: dict[int, Outcome] = {
-            number: rejection for number, rejection in enumerate(rejections) if rejection
-        }
-        decoded = [number for number in range(len(requests)) if number not in outcomes]
-        searches: dict[tuple[Circle | None, int], list[int]] = {}  # rows that share one search
-        for row, number in enumerate(decoded):
-            searches.setdefault((requests[number].near, requests[number].top), []).append(row)
-        for (near, top), rows in searches.items():
+        ahead = min(len(requests), DECODE_THREADS)
+        photos = list(
+            prefetch_map(lambda one: self._open(one, opened.photo_map), requests, ahead, 2 * ahead)
+        )
+        framed = {at: one for at, one in enumerate(photos) if isinstance(one, FramedPhoto)}
+        answers = self._answer(requests, framed, opened)
+        return [
+            one if isinstance(one, Rejection) else _refined(opened, answers[at], one, requests[at])
+            for at, one in enumerate(photos)
+        ]
+
+    def _open(self, request: LocateRequest, photo_map: PhotoMap | None) -> FramedPhoto | Rejection:
+        """The photo's views at the network's size, and its features."""
+        try:
+            photo_HW3 = decode(request.photo)
+        except DecodeError as error:
+            return Rejection(path="photo", reason=error.reason, found=error.found)
+        framed = FramedPhoto(views=[photo_HW3])
+        if photo_map is not None:
+            framed = photo_map.frame(photo_HW3, read_photo_tags(request.photo), request.pose)
+        return replace(framed, views=[self._encoder.to_input(view) for view in framed.views])
+
+    def _answer(
+        self, requests: Sequence[LocateRequest], framed: dict[int, FramedPhoto], opened: OpenedIndex
+    ) -> dict[int, Answer]:
+        """The answers of retrieval, by the numbers of their requests."""
+        rows_BD = self._encoder.forward([view for one in framed.values() for view in one.views])
+        ends = np.cumsum([len(one.views) for one in framed.values()])[:-1]
+        embeddings = dict(zip(framed, np.split(rows_BD, ends), strict=True)) if framed else {}
+        searches: dict[tuple[Circle | None, int], list[int]] = {}  # photos that share one search
+        for at in framed:
+            k = max(requests[at].top, CONSENSUS_CANDIDATES)  # matching tries more than are listed
+            searches.setdefault((requests[at].near, k), []).append(at)
+        answers: dict[int, Answer] = {}
+        for (near, k), group in searches.items():
             where = None if near is None else Filter(near=near)
-            answers = locate_embeddings(
-                opened.index,
-                embeddings_QD[rows],
-                top,
-                where,
-                opened.calibration,
-                opened.spacing_m,
-            )
-            outcomes |= {decoded[row]: answer for row, answer in zip(rows, answers, strict=True)}
-        return [outcomes[number] for number in range(len(requests))]
+            hits = search_views(opened.index, [embeddings[at] for at in group], k, where)
+            found = answers_from_hits(hits, k, opened.calibration, opened.spacing_m)
+            answers |= dict(zip(group, found, strict=True))
+        return answers
+
+    def picture(self, wanted: PictureRequest) -> bytes | None:
+        """A WebP of the gallery's pixels; None where they are not at hand."""
+        photo_map = self.live.current.photo_map
+        return None if photo_map is None else photo_map.picture(wanted)
 
     def status(self) -> ServiceStatus:
         opened = self.live.current
@@ -86,5 +140,17 @@ class Predictor:
             rows=len(opened.index),
             factory=opened.index.metadata.factory,
             calibrated=opened.calibration is not None,
+            matched=opened.photo_map is not None and opened.photo_map.matches,
             refused=self.live.refused,
         )
+
+
+def _refined(
+    opened: OpenedIndex, answer: Answer, photo: FramedPhoto, request: LocateRequest
+) -> Located:
+    """The answer as it is sent: matched with the map, and with the candidates asked for."""
+    located = Located(answer=replace(answer, framing=photo.framing))
+    if opened.photo_map is not None:
+        located = opened.photo_map.refine(located.answer, photo)
+    listed = located.answer.candidates[: request.top]
+    return replace(located, answer=replace(located.answer, candidates=listed))

@@ -23,6 +23,7 @@ from pipeline.core.errors import InputError
 from pipeline.service.batcher import ReplicaLost
 from pipeline.service.engine import NotReady
 from pipeline.service.live_index import RETRY_S
+from pipeline.service.photo_map import PictureRequest
 from pipeline.service.predictor import Outcome, Predictor, ServiceStatus
 from pipeline.service.request import LocateRequest
 
@@ -34,11 +35,12 @@ MAX_ONGOING_REQUESTS = 16
 
 
 class Replica:
-    """One process with the encoder and the index. One thread computes batches one after another."""
+    """One process with the encoder and the index. One thread computes batches one after another,
+    another one the pictures of pages."""
 
     def __init__(self, make_predictor: Callable[[], Predictor]) -> None:
         self._make_predictor = make_predictor
-        self._thread = ThreadPoolExecutor(1)
+        self._thread, self._pictures = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
         self._batch_began: float | None = None
         self._predictor: Predictor | None = None
         self._load_error = ""
@@ -69,6 +71,10 @@ class Replica:
             return self._loaded().predict(requests)
         finally:
             self._batch_began = None
+
+    async def picture(self, wanted: PictureRequest) -> bytes | None:
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._pictures, self._loaded().picture, wanted)
 
     async def status(self) -> ServiceStatus:
         return self._loaded().status()
@@ -130,6 +136,11 @@ class Replicas:
         """Raises NotReady, and ReplicaLost where the replica has died."""
         outcomes: list[Outcome] = await self._call("predict", list(requests))
         return outcomes
+
+    async def picture(self, wanted: PictureRequest) -> bytes | None:
+        """Raises NotReady, and ReplicaLost where the replica has died."""
+        found: bytes | None = await self._call("picture", wanted)
+        return found
 
     async def status(self) -> ServiceStatus:
         """Raises NotReady, and ReplicaLost where the replica has died."""

@@ -12,6 +12,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.geo import Circle
 from pipeline.images.decode import DecodeError
 from pipeline.images.inspect import inspect
+from pipeline.matching.photo_pose import PoseSettings
 
 JPEG = b"\xff\xd8\xff"
 SIGNATURES = ((JPEG, b""), (b"\x89PNG\r\n\x1a\n", b""), (b"RIFF", b"WEBP"))
@@ -26,7 +27,11 @@ preview within a header may contain the same two bytes by chance."""
 DEFAULT_TOP, MAX_TOP = 5, 50
 "Candidates in an answer."
 
-FIELDS = ("lat", "lon", "radius_m", "top")
+CAMERA_FIELDS = ("fov", "height", "heading", "pitch")
+"Fields of what is known of the camera; they overrule the photo's tags."
+NOTHING_KNOWN = PoseSettings()
+"Of the camera: the tags alone."
+FIELDS = ("lat", "lon", "radius_m", "top", *CAMERA_FIELDS)
 
 
 class RequestError(Exception):
@@ -48,6 +53,8 @@ class LocateRequest:
     "Only gallery images within this circle are candidates."
     top: int = DEFAULT_TOP
     "Candidates in the answer."
+    pose: PoseSettings = NOTHING_KNOWN
+    "What is known of the camera beside the photo's tags."
 
 
 def parse_request(photo: bytes, fields: Mapping[str, str], max_pixels: int) -> LocateRequest:
@@ -57,7 +64,7 @@ def parse_request(photo: bytes, fields: Mapping[str, str], max_pixels: int) -> L
     Raises RequestError.
 
     """
-    request = LocateRequest(photo=photo, near=_near(fields), top=_top(fields))
+    request = LocateRequest(photo=photo, near=_near(fields), top=_top(fields), pose=_pose(fields))
     _check_photo(photo, max_pixels)
     return request
 
@@ -77,6 +84,20 @@ def _near(fields: Mapping[str, str]) -> Circle | None:
         return Circle(**{name: _number(name, text) for name, text in given.items()})
     except InputError as error:
         raise RequestError(400, str(error)) from None
+
+
+def _pose(fields: Mapping[str, str]) -> PoseSettings:
+    given = {name: fields[name] for name in CAMERA_FIELDS if fields.get(name, "").strip()}
+    try:
+        known = {name: _number(name, text) for name, text in given.items()}
+        return PoseSettings(
+            fov=known.get("fov"),
+            height=known.get("height"),
+            heading=known.get("heading"),
+            pitch=known.get("pitch"),
+        )
+    except InputError as error:
+        raise RequestError(400, str(error).removeprefix("--")) from None
 
 
 def _number(name: str, text: str) -> float:

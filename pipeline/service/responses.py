@@ -7,16 +7,20 @@ published schemas and the responses cannot differ.
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from pipeline.locate.locate import Answer
+from pipeline.service.photo_map import Located, Pictures
 from pipeline.service.predictor import ServiceStatus
 
 
 @dataclass(frozen=True, kw_only=True)
-class AnswerTiming:
-    """How long an answer took."""
+class AnswerContext:
+    """How long an answer took, and what can be shown with it."""
 
     seconds: float
     "Seconds within the service, from the request's head to the answer."
+    match_seconds: float | None
+    "Seconds of framing the photo and matching it with the map; null where it was not matched."
+    pictures: Pictures
+    "Which pixels of the gallery /tile and /map have: none, tiles, or a map of them as well."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,8 +41,14 @@ class ErrorBody:
     "One sentence: what was found, what was expected, what to do."
 
 
-def answer_body(answer: Answer, seconds: float) -> dict[str, Any]:
-    return asdict(answer) | asdict(AnswerTiming(seconds=round(seconds, 4)))
+def answer_body(located: Located, seconds: float) -> dict[str, Any]:
+    match_s = located.match_seconds
+    context = AnswerContext(
+        seconds=round(seconds, 4),
+        match_seconds=None if match_s is None else round(match_s, 4),
+        pictures=located.pictures,
+    )
+    return asdict(located.answer) | asdict(context)
 
 
 def health_body(status: ServiceStatus | None, why: str | None, trusted: bool) -> dict[str, Any]:

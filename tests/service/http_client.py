@@ -17,9 +17,11 @@ from pipeline.locate.locate import NO_ANSWER, Answer, Position
 from pipeline.service.app import Service
 from pipeline.service.batcher import ReplicaLost
 from pipeline.service.engine import NotReady
+from pipeline.service.photo_map import Located, PictureRequest, TilePicture
 from pipeline.service.predictor import Outcome, ServiceStatus
 from pipeline.service.request import LocateRequest
 from pipeline.service.settings import ServiceSettings
+from tests.service.photos import photo
 
 TOKEN = "a-token-of-some-length"
 Client = TestClient[Any, Any]
@@ -55,8 +57,10 @@ class FakeEngine:
     """Answers at once, or when `gate` opens. A photo of 13 pixels' width kills the replica, one of
     14 cannot be decoded, and for one of 15 the search finds nothing."""
 
-    def __init__(self) -> None:
+    def __init__(self, outcome: Located | None = None) -> None:
+        self.outcome = outcome
         self.batches: list[Sequence[LocateRequest]] = []
+        self.pictures: list[PictureRequest] = []
         self.gate = asyncio.Event()
         self.gate.set()
         self.ready = True
@@ -75,14 +79,27 @@ class FakeEngine:
             if opened.width == 14:
                 return Rejection(path="photo 1", reason="damaged image", found="99 bytes")
             if opened.width == 15:
-                return NO_ANSWER
-        return fake_answer(request)
+                return Located(answer=NO_ANSWER)
+        return self.outcome or Located(answer=fake_answer(request))
+
+    async def picture(self, wanted: PictureRequest) -> bytes | None:
+        """That of the candidate `gallery-0`, and no other."""
+        if not self.ready:
+            raise NotReady("the encoder is being loaded")
+        self.pictures.append(wanted)
+        await self.gate.wait()
+        return photo("WEBP") if wanted == TilePicture(key="gallery-0") else None
 
     async def status(self) -> ServiceStatus:
         if not self.ready:
             raise NotReady("the encoder is being loaded")
         return ServiceStatus(
-            fingerprint="f" * 64, rows=3, factory="Flat", calibrated=True, refused=None
+            fingerprint="f" * 64,
+            rows=3,
+            factory="Flat",
+            calibrated=True,
+            matched=False,
+            refused=None,
         )
 
 
@@ -100,12 +117,13 @@ class Server(BaseTestServer):
 def run_with_service(
     test: Callable[[Client, FakeEngine], Coroutine[Any, Any, None]],
     token: str | None = None,
+    outcome: Located | None = None,
     **settings: Any,
 ) -> None:
     """Run a test against a service of its own on a socket."""
 
     async def main() -> None:
-        engine = FakeEngine()
+        engine = FakeEngine(outcome)
         service = Service(ServiceSettings(**settings), engine, token)
         client: Client = TestClient(Server(service))
         async with client:

@@ -181,7 +181,7 @@ def test_pages_fit_every_width_and_scheme(
     assert dark == (scheme == "dark")
     page.goto(f"{served.address}api")
     assert page.evaluate("document.documentElement.scrollWidth") <= width
-    assert page.locator("section.call").count() == 3 + 8  # paths, schemas
+    assert page.locator("section.call").count() == 5 + 9  # paths, schemas
     page.close()
 
 

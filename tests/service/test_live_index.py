@@ -13,17 +13,17 @@ import pytest
 from aiohttp.test_utils import TestClient, TestServer
 
 from pipeline.core import json_files
-from pipeline.core.arrays import Floats
+from pipeline.core.arrays import Floats, Pixels
 from pipeline.core.errors import InputError
 from pipeline.core.records import Rejection
 from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.index.build import build_index
 from pipeline.index.metadata import IndexMetadata
 from pipeline.index.settings import IndexSettings
-from pipeline.locate.locate import Answer
 from pipeline.service import live_index
 from pipeline.service.app import Service
 from pipeline.service.live_index import LiveIndex
+from pipeline.service.photo_map import Located, MapOpener, PictureRequest, no_map
 from pipeline.service.predictor import Outcome, Predictor, ServiceStatus
 from pipeline.service.request import LocateRequest
 from pipeline.service.settings import ServiceSettings
@@ -64,26 +64,18 @@ def replace(path: Path, new: Path) -> None:
 
 
 class WidthEncoder:
-    """Encodes a photo 16 + n pixels wide as location n; one of 15 cannot be decoded."""
+    """Encodes a photo 16 + n pixels wide as location n."""
 
     def __init__(self, metadata: IndexMetadata | None = None) -> None:
         self.batches: list[int] = []
 
-    def encode(self, photos: Sequence[bytes]) -> tuple[Floats, list[Rejection | None]]:
-        self.batches.append(len(photos))
-        numbers = [self.width(data) - 16 for data in photos]
-        decoded = [number for number in numbers if number >= 0]
-        refused = [
-            None if number >= 0 else Rejection(path="p", reason="damaged image", found="f")
-            for number in numbers
-        ]
-        return np.eye(DIMENSION, dtype=np.float32)[decoded].reshape(-1, DIMENSION), refused
+    def to_input(self, image_HW3: Pixels) -> Pixels:
+        return image_HW3
 
-    @staticmethod
-    def width(data: bytes) -> int:
-        from pipeline.images.inspect import inspect
-
-        return inspect(data)[0]
+    def forward(self, images: Sequence[Pixels]) -> Floats:
+        self.batches.append(len(images))
+        numbers = [image_HW3.shape[1] - 16 for image_HW3 in images]
+        return np.eye(DIMENSION, dtype=np.float32)[numbers].reshape(-1, DIMENSION)
 
 
 def locate_request(number: int, **where: Any) -> LocateRequest:
@@ -177,8 +169,8 @@ def test_live_index_changed_while_opened_waits_for_next_poll(
     newer = make_index(tmp_path / "newer", 5)
     opened = live_index.open_verified
 
-    def slow(at: str) -> live_index.OpenedIndex:
-        found = opened(at)
+    def slow(at: str, open_map: MapOpener = no_map) -> live_index.OpenedIndex:
+        found = opened(at, open_map)
         if newer.joinpath("index.json").exists():
             replace(path, newer)
         return found
@@ -199,26 +191,26 @@ def test_predictor_batch_is_one_forward_pass(path: Path) -> None:
     predictor = Predictor(str(path), WidthEncoder)
     requests = [
         locate_request(2),
-        LocateRequest(photo=photo(size=(15, 15))),
+        LocateRequest(photo=photo()[:-40]),
         locate_request(0, top=1),
         locate_request(1),
         locate_request(2, top=1),
     ]
     found = predictor.predict(requests)
     assert isinstance(found[1], Rejection)
-    answers = [one for one in found if isinstance(one, Answer)]
+    answers = [one.answer for one in found if isinstance(one, Located)]
     assert [one.location for one in answers] == ["place2", "place0", "place1", "place2"]
     assert [len(one.candidates) for one in answers] == [3, 1, 3, 1]
-    assert predictor._encoder.batches == [5]  # type: ignore[attr-defined]
+    assert predictor._encoder.batches == [4]  # type: ignore[attr-defined]
 
 
 def test_predictor_without_calibration_uses_gallery_spacing(path: Path) -> None:
     """Locations are 1,000 m apart: half of it is the radius, as `locate` answers."""
     predictor = Predictor(str(path), WidthEncoder)
-    (answer,) = predictor.predict([locate_request(1)])
-    assert isinstance(answer, Answer)
-    assert answer.position is not None
-    assert answer.position.radius_m == pytest.approx(0.009 / 2 * 111_195, rel=1e-3)
+    (located,) = predictor.predict([locate_request(1)])
+    assert isinstance(located, Located)
+    assert located.answer.position is not None
+    assert located.answer.position.radius_m == pytest.approx(0.009 / 2 * 111_195, rel=1e-3)
 
 
 def test_service_answers_while_index_is_replaced(
@@ -231,6 +223,9 @@ def test_service_answers_while_index_is_replaced(
     class InThisProcess:
         async def predict(self, requests: Sequence[LocateRequest]) -> list[Outcome]:
             return await asyncio.to_thread(predictor.predict, requests)
+
+        async def picture(self, wanted: PictureRequest) -> bytes | None:
+            return predictor.picture(wanted)
 
         async def status(self) -> ServiceStatus:
             return predictor.status()

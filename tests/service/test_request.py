@@ -3,6 +3,7 @@
 import pytest
 
 from pipeline.core.geo import Circle
+from pipeline.matching.photo_pose import PoseSettings
 from pipeline.service.request import MAX_SCANS, RequestError, parse_request
 from tests.service.photos import bomb, photo
 
@@ -46,6 +47,24 @@ def test_request_invalid_circle_is_refused(lon: str, radius: str) -> None:
 
 def test_request_incomplete_position_is_refused() -> None:
     assert "found only lat and lon" in refused(photo(), lat="1", lon="2").sentence
+
+
+def test_request_camera_fields() -> None:
+    fields = {"fov": "73.7", "height": "80", "heading": "12.5", "pitch": "-60"}
+    request = parse_request(photo(), fields, MEGAPIXELS)
+    assert request.pose == PoseSettings(fov=73.7, height=80.0, heading=12.5, pitch=-60.0)
+    assert parse_request(photo(), {"fov": " "}, MEGAPIXELS).pose == PoseSettings()
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("fov", "0"), ("fov", "wide"), ("height", "-3"), ("heading", "900"), ("pitch", "10")],
+)
+def test_request_invalid_camera_field_is_refused(name: str, text: str) -> None:
+    refusal = refused(photo(), **{name: text})
+    assert refusal.status == 400
+    assert refusal.sentence.startswith(f"{name} is ")
+    assert "expected" in refusal.sentence
 
 
 @pytest.mark.parametrize("top", ["0", "51", "-1", "2.5", "all", "9" * 50, "٣"])
