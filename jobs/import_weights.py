@@ -1,8 +1,8 @@
 """Import public weights as a checkpoint: `import_weights.py (--torchvision | --lpn | --fsra |
---sample4geo) FILE --out FILE`
+--sample4geo | --mccg | --qdfl) FILE --out FILE`
 
-Takes a torchvision ResNet's state dict, or that of the public code of LPN, FSRA or Sample4Geo. The
-backbone, its size, the parts and the numbers per part are read off the file.
+Takes a torchvision ResNet's state dict, or that of the public code of LPN, FSRA, Sample4Geo, MCCG
+or QDFL. The backbone, its size, the parts and the numbers per part are read off the file.
 jobs/embed_gallery.py takes the checkpoint.
 """
 
@@ -11,7 +11,7 @@ from jobs.stages.settings import ImportWeightsSettings
 
 
 def main(settings: ImportWeightsSettings) -> None:
-    """Import the weights of torchvision's ResNet, LPN, FSRA or Sample4Geo into a checkpoint."""
+    """Import the weights of torchvision's ResNet or a method's public code into a checkpoint."""
     from jobs.stages.import_weights import import_weights
 
     import_weights(settings)

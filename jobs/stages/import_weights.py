@@ -1,12 +1,13 @@
 """Public weights as a checkpoint.
 
-In: a torchvision ResNet's state dict, or that of LPN's, FSRA's or Sample4Geo's public code. Out: a
-checkpoint that jobs/embed_gallery.py takes. The backbone, its size, the parts and the numbers per
-part are read off the file.
+In: a torchvision ResNet's state dict, or that of LPN's, FSRA's, Sample4Geo's, MCCG's or QDFL's
+public code. Out: a checkpoint that jobs/embed_gallery.py takes. The backbone, its size, the parts
+and the numbers per part are read off the file.
 """
 
 import hashlib
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -19,7 +20,9 @@ from model.errors import CheckpointError
 from model.pvda import FeatureEncoder
 from model.weights.fsra import convert_fsra
 from model.weights.load import TORCHVISION_HINT, infer_backbone, load_backbone, parse_state_dict
-from model.weights.lpn import convert_lpn
+from model.weights.lpn import ConvertedWeights, convert_lpn
+from model.weights.mccg import convert_mccg
+from model.weights.qdfl import convert_qdfl
 from model.weights.sample4geo import convert_sample4geo
 from pipeline.core import storage
 from pipeline.core.errors import InputError
@@ -59,7 +62,7 @@ def import_weights(settings: ImportWeightsSettings) -> str:
     storage.write_bytes(out, dumps(checkpoint))
     network = checkpoint.network
     console.print(
-        f"{out}: {network.backbone}, {network.parts} rings of {network.part_dim} numbers, "
+        f"{out}: {network.backbone}, {network.parts} parts of {network.part_dim} numbers, "
         f"{network.image_size} px, {len(checkpoint.locations)} locations"
     )
     return out
@@ -109,21 +112,18 @@ def from_lpn(
     return make_checkpoint(converted.network, converted.modules, names, made_of)
 
 
-def from_fsra(
-    state: dict[str, Tensor], settings: ImportWeightsSettings, made_of: dict[str, Any]
+def from_authors(
+    convert: Callable[[dict[str, Tensor], str, int], ConvertedWeights],
+    state: dict[str, Tensor],
+    settings: ImportWeightsSettings,
+    made_of: dict[str, Any],
 ) -> Checkpoint:
-    """FSRA's encoder and classifier."""
-    converted = convert_fsra(state, settings.source, settings.side)
-    names = unnamed(converted.locations)
+    """Encoder and classifier of a method's public code; Sample4Geo has no classifier."""
+    converted = convert(state, settings.source, settings.side)
+    if converted.left_out:
+        console.print(f"{converted.left_out} is left out: the network of street images")
+    names = unnamed(converted.locations) if converted.locations else []
     return make_checkpoint(converted.network, converted.modules, names, made_of)
-
-
-def from_sample4geo(
-    state: dict[str, Tensor], settings: ImportWeightsSettings, made_of: dict[str, Any]
-) -> Checkpoint:
-    """Sample4Geo's encoder; it has no classifier."""
-    converted = convert_sample4geo(state, settings.source, settings.side)
-    return make_checkpoint(converted.network, converted.modules, [], made_of)
 
 
 def unnamed(locations: int) -> list[str]:
@@ -153,13 +153,17 @@ def make_checkpoint(
 CONVERTERS: dict[str, Callable[..., Checkpoint]] = {
     "torchvision": from_torchvision,
     "lpn": from_lpn,
-    "fsra": from_fsra,
-    "sample4geo": from_sample4geo,
+    "fsra": partial(from_authors, convert_fsra),
+    "sample4geo": partial(from_authors, convert_sample4geo),
+    "mccg": partial(from_authors, convert_mccg),
+    "qdfl": partial(from_authors, convert_qdfl),
 }
 EXPECTED = {
     "torchvision": TORCHVISION_HINT,
     "lpn": "the net_*.pth of a training run of the LPN code",
     "fsra": "the net_*.pth of a training run of the FSRA code",
     "sample4geo": "the weights_*.pth of a training run of the Sample4Geo code",
+    "mccg": "the net_*.pth of a training run of the MCCG code (mode-str/crossview)",
+    "qdfl": "the .ckpt of a training run of the QDFL code",
 }
 "What a kind of weights is read from."

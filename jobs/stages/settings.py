@@ -194,6 +194,10 @@ class ServeSettings(ServiceSettings):
         require(self.threads is None or self.threads >= 1, "threads", self.threads, "at least 1")
 
 
+SIDES = {"sample4geo": 384, "qdfl": 280}
+"Image size of a test by the authors' code in pixels; 256 for all others."
+
+
 @dataclass(frozen=True, kw_only=True)
 class ImportWeightsSettings:
     """Which public weights are imported, and where to."""
@@ -208,9 +212,13 @@ class ImportWeightsSettings:
     "State dict of FSRA's two_view_net (its net_119.pth)."
     sample4geo: str | None = None
     "State dict of Sample4Geo's TimmModel, a ConvNeXt of timm (its weights_*.pth)."
+    mccg: str | None = None
+    "State dict of MCCG's two_view_net, a ConvNeXt-T (its net_*.pth)."
+    qdfl: str | None = None
+    "Checkpoint of QDFL's U1652_model, DINOv2 with adapters (of Lightning, .ckpt)."
     image_size: int | None = None
     """Side of the network's input images in pixels: `h` in LPN's opts.yaml. By default 256, for
-    Sample4Geo 384."""
+    Sample4Geo 384, for QDFL the 280 of its test."""
 
     def __post_init__(self) -> None:
         if len(self._given) != 1:
@@ -218,7 +226,9 @@ class ImportWeightsSettings:
             found = " and ".join(f"--{kind}" for kind in self._given) or "none"
             raise InputError(f"{found} given, expected one of {flags}")
 
-    KINDS: ClassVar[tuple[str, ...]] = ("torchvision", "lpn", "fsra", "sample4geo")
+    KINDS: ClassVar[tuple[str, ...]] = (
+        "torchvision", "lpn", "fsra", "sample4geo", "mccg", "qdfl",
+    )  # fmt: skip
     "What can be imported: flags."
 
     @property
@@ -236,7 +246,7 @@ class ImportWeightsSettings:
 
     @property
     def side(self) -> int:
-        return self.image_size or (384 if self.kind == "sample4geo" else 256)
+        return self.image_size or SIDES.get(self.kind, 256)
 
 
 @dataclass(frozen=True, kw_only=True)

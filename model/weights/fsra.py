@@ -14,7 +14,7 @@ from model.config import PVDAConfig
 from model.errors import CheckpointError
 from model.two_views import EncoderWithClassifier
 from model.weights.load import load_renamed
-from model.weights.lpn import ConvertedWeights, linear_outputs
+from model.weights.lpn import ConvertedWeights, classifier_names, linear_outputs
 
 TOKEN = "classifier1"
 PATCHES, FIRST_LINEAR = "patch_embed.proj.weight", f"{TOKEN}.add_block.0.weight"
@@ -52,12 +52,9 @@ def convert_fsra(state: dict[str, Tensor], name: str, image_size: int = 256) -> 
         r"encoder\.backbone\.embed\.": "",
         r"encoder\.backbone\.": "",
     }
-    for part, classifier in enumerate(names):
-        table[rf"encoder\.refine\.{part}\."] = f"{classifier}.add_block."
-        table[rf"classifier\.branches\.{part}\."] = f"{classifier}.classifier.0."
     load_renamed(
         model, model.encoder.backbone.adapt(given), f"{name} is no two_view_net of FSRA",
-        "give the net_*.pth of a training run of FSRA", table,
+        "give the net_*.pth of a training run of FSRA", table | classifier_names(tuple(names)),
     )  # fmt: skip
     modules = {
         "encoder": model.encoder.state_dict(),

@@ -140,3 +140,12 @@ def linear_outputs(state: dict[str, Tensor], key: str, name: str) -> int:
             f"{name} is no three_view_net of LPN: {key} is {found}, expected a Linear's weight"
         )
     return len(state[key])
+
+
+def classifier_names(classifiers: tuple[str, ...]) -> dict[str, str]:
+    """Beginnings of our parts' names -> those of the lineage's classifier blocks, by part."""
+    names = {}
+    for part, classifier in enumerate(classifiers):
+        names[rf"encoder\.refine\.{part}\."] = f"{classifier}.add_block."
+        names[rf"classifier\.branches\.{part}\."] = f"{classifier}.classifier.0."
+    return names

@@ -165,7 +165,7 @@ JOBS: dict[str, tuple[list[str], list[str], list[str], list[str]]] = {
     ),
     "compare": ([], ["out"], [], []),
     "import_features": (["mat"], ["out"], [], ["query-view"]),
-    "import_weights": (["torchvision", "lpn"], ["out"], ["image-size"], []),
+    "import_weights": (["torchvision", "lpn", "mccg", "qdfl"], ["out"], ["image-size"], []),
     "export_weights": (["checkpoint"], ["out"], [], []),
 }
 SOURCES = {

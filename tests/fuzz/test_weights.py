@@ -230,7 +230,7 @@ def test_damaged_weights_file_is_read_or_rejected(
     folder = tmp_path_factory.mktemp("weights")
     path = folder / f"x.{form}"
     path.write_bytes(data.draw(damaged(tensors(form), head=300)))
-    for flag in ("torchvision", "lpn"):
+    for flag in ("torchvision", "lpn", "mccg", "qdfl"):
         with bounded(CheckpointError, InputError):
             import_weights(
                 ImportWeightsSettings(

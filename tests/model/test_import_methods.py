@@ -1,5 +1,6 @@
 """Weights of FSRA and Sample4Geo by their authors' names embed as their own test loops do."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,29 @@ from model.inference.embed import embed
 from pipeline.core.errors import InputError
 
 MEAN, STD = (torch.tensor(v)[:, None, None] for v in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)))
+
+
+def class_block(head: str, channels: int) -> dict[str, Tensor]:
+    """The lineage's classifier block with 16 numbers and 5 places, at the prefix `head`."""
+    return {
+        f"{head}add_block.0.weight": torch.randn(16, channels) / channels**0.5,
+        f"{head}add_block.0.bias": torch.randn(16),
+        f"{head}add_block.1.weight": torch.rand(16) + 0.5,
+        f"{head}add_block.1.bias": torch.randn(16),
+        f"{head}add_block.1.running_mean": torch.randn(16),
+        f"{head}add_block.1.running_var": torch.rand(16) + 0.5,
+        f"{head}classifier.0.weight": torch.randn(5, 16),
+        f"{head}classifier.0.bias": torch.randn(5),
+    }
+
+
+def class_block_twin(state: dict[str, Tensor], head: str, part: Tensor) -> Tensor:
+    """What the block makes of a part (B, C) in eval mode: (B, 16)."""
+    b = f"{head}add_block"
+    y = F.linear(part, state[f"{b}.0.weight"], state[f"{b}.0.bias"])
+    deviation = (state[f"{b}.1.running_var"] + 1e-5).sqrt()
+    scaled = (y - state[f"{b}.1.running_mean"]) / deviation * state[f"{b}.1.weight"]
+    return scaled + state[f"{b}.1.bias"]
 
 
 def fsra_state() -> dict[str, Tensor]:
@@ -39,17 +63,7 @@ def fsra_state() -> dict[str, Tensor]:
             trunk[f"blocks.{block}.{layer}.bias"] = torch.randn(out) / 10
     state = {f"model_1.transformer.{key}": tensor for key, tensor in trunk.items()}
     for name in ("classifier1", "classifier_heat1", "classifier_heat2", "classifier_heat3"):
-        head = f"model_1.{name}."
-        state |= {
-            f"{head}add_block.0.weight": torch.randn(16, 768) / 28,
-            f"{head}add_block.0.bias": torch.randn(16),
-            f"{head}add_block.1.weight": torch.rand(16) + 0.5,
-            f"{head}add_block.1.bias": torch.randn(16),
-            f"{head}add_block.1.running_mean": torch.randn(16),
-            f"{head}add_block.1.running_var": torch.rand(16) + 0.5,
-            f"{head}classifier.0.weight": torch.randn(5, 16),
-            f"{head}classifier.0.bias": torch.randn(5),
-        }
+        state |= class_block(f"model_1.{name}.", 768)
     return state
 
 
@@ -83,17 +97,10 @@ def fsra_twin(state: dict[str, Tensor], images: Tensor) -> Tensor:
             means.append(image[order[ends[0] : ends[1]]].mean(0))
         parts.append((f"classifier_heat{region + 1}", torch.stack(means)))
     parts.append(("classifier1", x[:, 0]))
-    found = []
-    for name, part in parts:
-        b = f"{name}.add_block"
-        y = F.linear(part, s[f"{b}.0.weight"], s[f"{b}.0.bias"])
-        deviation = (s[f"{b}.1.running_var"] + 1e-5).sqrt()
-        y = (y - s[f"{b}.1.running_mean"]) / deviation * s[f"{b}.1.weight"] + s[f"{b}.1.bias"]
-        found.append(y)
-    return torch.stack(found, 1)
+    return torch.stack([class_block_twin(s, f"{name}.", part) for name, part in parts], 1)
 
 
-def imported(tmp_path: Path, state: dict[str, Tensor], kind: str) -> Path:
+def imported(tmp_path: Path, state: Mapping[str, object], kind: str) -> Path:
     torch.save(state, tmp_path / "net.pth")
     flags = {kind: str(tmp_path / "net.pth"), "out": str(tmp_path / "out.pt")}
     return Path(import_weights(ImportWeightsSettings(**flags)))  # type: ignore[arg-type]
@@ -145,8 +152,8 @@ def timm_state() -> dict[str, Tensor]:
     return named | {"logit_scale": torch.tensor(2.7)}
 
 
-def timm_twin(state: dict[str, Tensor], images: Tensor) -> Tensor:
-    """The 768 numbers of a ConvNeXt-T of timm without its classifier: plain functions."""
+def convnext_maps(state: dict[str, Tensor], images: Tensor) -> Tensor:
+    """The maps (B, 768, H/32, W/32) of a ConvNeXt-T of timm: plain functions."""
     s = {key.removeprefix("model."): tensor for key, tensor in state.items()}
 
     def norm(x: Tensor, name: str) -> Tensor:
@@ -167,8 +174,13 @@ def timm_twin(state: dict[str, Tensor], images: Tensor) -> Tensor:
             y = F.gelu(F.linear(y, s[f"{b}.mlp.fc1.weight"].flatten(1), s[f"{b}.mlp.fc1.bias"]))
             y = F.linear(y, s[f"{b}.mlp.fc2.weight"], s[f"{b}.mlp.fc2.bias"]) * s[f"{b}.gamma"]
             x = x + y.permute(0, 3, 1, 2)
-    x = x.mean((2, 3))
-    return F.layer_norm(x, (768,), s["head.norm.weight"], s["head.norm.bias"], 1e-6)
+    return x
+
+
+def timm_twin(state: dict[str, Tensor], images: Tensor) -> Tensor:
+    """The 768 numbers of a ConvNeXt-T of timm without its classifier."""
+    weight, bias = state["model.head.norm.weight"], state["model.head.norm.bias"]
+    return F.layer_norm(convnext_maps(state, images).mean((2, 3)), (768,), weight, bias, 1e-6)
 
 
 @torch.no_grad()

@@ -87,7 +87,7 @@ def test_import_lpn_records_its_source(tmp_path: Path, capsys: pytest.CaptureFix
     said = capsys.readouterr().err
     assert "model_2 is left out" in said
     assert "stride 1 and average pooling" in said
-    assert "ours.pt: resnet18, 4 rings of 24 numbers, 128 px, 5 locations" in said
+    assert "ours.pt: resnet18, 4 parts of 24 numbers, 128 px, 5 locations" in said
 
 
 def test_import_lpn_variants_of_backbones_are_equal(
