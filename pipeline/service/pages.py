@@ -24,7 +24,7 @@ SECURITY_HEADERS = {
 }
 "Headers of every response."
 
-PAGE_PATHS = ("/", "/page.js", "/style.css", "/api", "/openapi.json")
+PAGE_PATHS = ("/", "/map.js", "/page.js", "/style.css", "/api", "/openapi.json")
 
 
 def page_routes(settings: ServiceSettings) -> list[web.RouteDef]:
@@ -32,6 +32,7 @@ def page_routes(settings: ServiceSettings) -> list[web.RouteDef]:
     document = openapi_document(settings)
     pages = (
         ((WEB_FOLDER / "index.html").read_text(), "text/html"),
+        ((WEB_FOLDER / "map.js").read_text(), "text/javascript"),
         ((WEB_FOLDER / "page.js").read_text(), "text/javascript"),
         ((WEB_FOLDER / "style.css").read_text(), "text/css"),
         (api_page(document, settings.port), "text/html"),

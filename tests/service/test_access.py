@@ -33,7 +33,7 @@ def test_token_is_required_except_for_public_paths() -> None:
             assert TOKEN not in await error_sentence(response, 401)
         assert (await client.get("/metrics")).status == 401
         assert (await post(client, photo(), Authorization=f"Bearer {TOKEN}")).status == 200
-        for path in ("/", "/page.js", "/style.css", "/api", "/openapi.json", "/health"):
+        for path in ("/", "/map.js", "/page.js", "/style.css", "/api", "/openapi.json", "/health"):
             assert (await client.get(path)).status == 200
         assert await (await client.get("/health")).json() == {"ready": True}
         assert (await client.get("/health", headers={"Host": "drones.example"})).status == 200

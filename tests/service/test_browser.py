@@ -3,19 +3,28 @@ dark."""
 
 import asyncio
 import base64
+import io
 import threading
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import pytest
 from aiohttp import web
+from PIL import Image
 
+from pipeline.core.arrays import Pixels
+from pipeline.images.camera_tags import CameraTags
+from pipeline.matching.photo_pose import PoseSettings
 from pipeline.service.app import Service
+from pipeline.service.photo_map import PictureRequest
 from pipeline.service.settings import ServiceSettings
+from tests.matching.test_refine import made_map, photo_of, window_of
 from tests.report.test_browser import ARGUMENTS, CHROMIUM, sync_api
 from tests.service.http_client import TOKEN, FakeEngine
 from tests.service.photos import photo
+from tests.service.test_photo_map import MadeMap
 
 pytestmark = pytest.mark.skipif(
     CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"
@@ -36,9 +45,9 @@ PASTE = DROP.replace(
 class Served:
     """A service in a thread of its own."""
 
-    def __init__(self, token: str | None = None) -> None:
+    def __init__(self, token: str | None = None, engine: FakeEngine | None = None) -> None:
         self._loop = asyncio.new_event_loop()
-        self.engine = FakeEngine()
+        self.engine = engine or FakeEngine()
         self._runner = Service(ServiceSettings(max_megabytes=1), self.engine, token).runner()
         self._thread = threading.Thread(target=self._loop.run_forever)
         self._thread.start()
@@ -104,9 +113,12 @@ def test_page_dropped_photo_shows_answer_and_map(
     assert page.inner_text("#radius") == "± 25 m"
     assert page.inner_text("#confidence") == "80 %"
     assert page.inner_text("#say").startswith("Found in")
-    rows = page.locator("#candidates tr")
-    assert rows.count() == 5
-    assert rows.nth(1).inner_text().split() == ["2", "0001", "gallery-1", "0.890", "111", "m"]
+    cards = page.locator("#candidates li")
+    assert cards.count() == 5
+    assert cards.nth(1).inner_text().split() == ["2", "0001", "0.890", "111", "m", "away"]
+    assert cards.nth(1).get_attribute("title") == "gallery-1"
+    assert page.locator("#candidates img").count() == 0  # this service has no pixels
+    assert not page.is_visible("#controls label")
     assert page.locator("#map circle.dot").count() == 5
     assert page.locator("#map circle.dot.best").count() == 1
     assert page.evaluate("document.querySelector('#preview').naturalWidth") == 40
@@ -153,8 +165,13 @@ def test_page_fields_by_keyboard(page: Any, served: Served) -> None:
     for text in ("47,5", "8.5", "2000", "3"):
         page.keyboard.press("Tab")
         page.keyboard.type(text)
+    page.keyboard.press("Tab")
     page.keyboard.press("Enter")
-    page.wait_for_function("() => document.querySelectorAll('#candidates tr').length === 3")
+    for text in ("80", "73,7", "12", "-60"):
+        page.keyboard.press("Tab")
+        page.keyboard.type(text)
+    page.keyboard.press("Enter")
+    page.wait_for_function("() => document.querySelectorAll('#candidates li').length === 3")
     question = served.engine.batches[-1][0]
     assert question.near is not None
     assert (question.near.lat, question.near.lon, question.near.radius_m, question.top) == (
@@ -163,7 +180,56 @@ def test_page_fields_by_keyboard(page: Any, served: Served) -> None:
         2000,
         3,
     )
+    assert question.pose == PoseSettings(height=80, fov=73.7, heading=12, pitch=-60)
     assert page.locator("#map circle.near").count() == 1
+
+
+class MatchingEngine(FakeEngine):
+    """Matches every photo with a made map."""
+
+    def __init__(self) -> None:
+        made = MadeMap()
+        self.photo_map = made.photo_map()
+        framed = self.photo_map.frame(map_photo(), CameraTags(), PoseSettings(fov=55))
+        super().__init__(self.photo_map.refine(made.tile_answer(), framed))
+
+    async def picture(self, wanted: PictureRequest) -> bytes | None:
+        return self.photo_map.picture(wanted)
+
+
+def map_photo() -> Pixels:
+    return photo_of(window_of(made_map(0)))
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_page_lays_photo_over_map_where_it_belongs(browser: Any, width: int) -> None:
+    """With the photo laid over it, the map looks as it does without it."""
+    service = Served(engine=MatchingEngine())
+    page = browser.new_page(viewport={"width": width, "height": 900})
+    page.goto(service.address)
+    stream = io.BytesIO()
+    Image.fromarray(map_photo()).save(stream, "PNG")
+    give(page, DROP, stream.getvalue(), "photo.png", "image/png")
+    page.wait_for_selector("#stage.over")
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert page.evaluate("document.querySelector('#candidates img').naturalWidth") > 0
+    assert "points within" in page.inner_text("#matches")
+    assert page.inner_text("#heading-found") == "30°"
+    page.uncheck("#with-matches")
+    shots = []
+    for opacity in (0, 100):
+        page.evaluate(
+            "opacity => { $('opacity').value = opacity; "
+            "$('opacity').dispatchEvent(new Event('input')); }", opacity
+        )  # fmt: skip
+        shot = Image.open(io.BytesIO(page.locator("#stage").screenshot())).convert("L")
+        shots.append(np.asarray(shot, np.float64))
+    changed_HW = np.abs(shots[1] - shots[0]) > 3
+    assert changed_HW.mean() > 0.1
+    alike = np.corrcoef(shots[0][changed_HW], shots[1][changed_HW])[0, 1]
+    page.close()
+    service.stop()
+    assert alike > 0.9
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def test_openapi_document_lists_every_path() -> None:
         assert document["openapi"].startswith("3.1")
         router = client.server.service.app.router  # type: ignore[attr-defined]
         routes = {(one.method.lower(), one.resource.canonical) for one in router.routes()}
-        pages = {"/", "/page.js", "/style.css", "/api", "/openapi.json"}
+        pages = {"/", "/map.js", "/page.js", "/style.css", "/api", "/openapi.json"}
         described = {(verb, path) for path, calls in document["paths"].items() for verb in calls}
         assert described == {
             (verb, path) for verb, path in routes if path not in pages and verb != "head"
