@@ -42,9 +42,9 @@ from pipeline.features.table import open_table
 from pipeline.index.build import build_index
 from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings
-from pipeline.locate.calibrate import CalibrationExample
 from pipeline.locate.calibration import Calibration
-from pipeline.locate.calibration_data import LabelledImages, make_examples
+from pipeline.locate.fitting.calibrate import CalibrationExample
+from pipeline.locate.fitting.calibration_data import LabelledImages, make_examples
 from pipeline.locate.flight import apply_track, motion_for_gallery
 from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
 from pipeline.locate.locate import Answer, answers_from_hits

@@ -2,16 +2,20 @@
 --index INDEX`
 
 Searches the index for photos of locations that the encoder was not trained on, once with their
-location in the gallery and once without. Writes INDEX/calibration.json, which locate.py and
-serve.py read from there, and the reliability diagram beside it.
+location in the gallery and once without. With --flight, for photos over the map whose places are
+known, which are then matched with the map as locate.py matches them. Writes INDEX/calibration.json,
+which locate.py and serve.py read from there, and the reliability diagram beside it.
 """
 
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
 
 from jobs.encoding.encoder import read_checkpoint_bytes
 from jobs.encoding.photo_encoder import PhotoEncoder
+from jobs.stages.calibrate_flight import flight_of, match_flight, search_flight, selection_of
+from jobs.stages.matching import open_map
 from jobs.stages.settings import CalibrateSettings
 from model.checkpoint import loads
 from pipeline.confidence.reliability import reliability_diagram
@@ -20,14 +24,15 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import console, progress, results
 from pipeline.core.records import View
 from pipeline.index.searcher import Index
-from pipeline.locate.calibrate import CalibrationContext, fit_calibration
 from pipeline.locate.calibration import (
     CALIBRATION_FILE,
     Calibration,
     read_calibration,
     write_calibration,
 )
-from pipeline.locate.calibration_data import LabelledImages, make_examples
+from pipeline.locate.fitting.calibrate import CalibrationContext, fit_calibration
+from pipeline.locate.fitting.calibration_data import LabelledImages, make_examples
+from pipeline.locate.fitting.fit_matching import fit_matching
 from pipeline.locate.gallery_map import read_gallery_map
 from pipeline.locate.settings import CalibrationCriteria
 from pipeline.shards.shard_set import open_or_scan
@@ -46,6 +51,8 @@ def calibrate_index(settings: CalibrateSettings) -> Calibration:
     index = Index(settings.index)
     views = f"{settings.split} {settings.view} -> {settings.gallery_view}"
     selection = f"{views}, at most {settings.photos} photos"
+    if settings.flight:
+        selection = selection_of(settings.flight, settings.photos)
     if done := load_if_done(out, index, selection, settings):
         console.print(f"{out} is complete; nothing to do")
         return done
@@ -57,25 +64,51 @@ def calibrate_index(settings: CalibrateSettings) -> Calibration:
         index.metadata.encoding,
         settings.shards,
     )
-    trained_on = frozenset(loads(data, settings.checkpoint).locations)
-    photos = embed_view(settings, encoder, settings.view, trained_on, settings.photos)
-    overhead = embed_view(settings, encoder, settings.gallery_view, trained_on, None)
-    spacing_m = read_gallery_map(index).spacing_m
-    examples = make_examples(photos, overhead, index, spacing_m, settings.tolerance)
+    gallery = read_gallery_map(index)
     context = CalibrationContext(
         fingerprint=encoder.fingerprint,
         gallery_rows=len(index),
-        spacing_m=spacing_m,
+        spacing_m=gallery.spacing_m,
         photo_selection=selection,
     )
-    calibration = fit_calibration(examples, settings, context)
+    if settings.flight:
+        calibration = _calibrate_on_flight(settings, settings.flight, encoder, index, context)
+    else:
+        trained_on = frozenset(loads(data, settings.checkpoint).locations)
+        photos = embed_view(settings, encoder, settings.view, trained_on, settings.photos)
+        overhead = embed_view(settings, encoder, settings.gallery_view, trained_on, None)
+        examples = make_examples(photos, overhead, index, gallery.spacing_m, settings.tolerance)
+        calibration = fit_calibration(examples, settings, context)
     write_calibration(out, calibration)
     picture = f"{out.removesuffix('.json')}.svg"
-    title = f"Reliability over {calibration.photos} photos"
-    storage.write_bytes(picture, reliability_diagram(calibration.bins, title).encode())
-    console.print(summary(calibration))
+    diagram = calibration.matching or calibration
+    title = f"Reliability over {diagram.photos} photos"
+    storage.write_bytes(picture, reliability_diagram(diagram.bins, title).encode())
+    console.print(matching_summary(calibration) if calibration.matching else summary(calibration))
     results.print(f"calibration: {out}, diagram: {picture}", soft_wrap=True)
     return calibration
+
+
+def _calibrate_on_flight(
+    settings: CalibrateSettings,
+    flight: str,
+    encoder: PhotoEncoder,
+    index: Index,
+    context: CalibrationContext,
+) -> Calibration:
+    gallery = read_gallery_map(index)
+    windows = open_map(settings.shards, gallery)
+    if windows is None:
+        raise InputError(
+            f"the tiles of {settings.shards} do not know their corners, expected such as a "
+            "GeoTIFF's, to match photos with; pack the map with jobs/make_shards.py, or leave out "
+            "--flight"
+        )
+    photos = flight_of(flight, settings.photos)
+    searched = search_flight(photos, encoder, index, gallery, windows)
+    calibration = fit_calibration([one.example for one in searched], settings, context)
+    matched = match_flight(searched, windows, calibration)
+    return replace(calibration, matching=fit_matching(matched, calibration, settings.within))
 
 
 def load_if_done(
@@ -91,6 +124,8 @@ def load_if_done(
         return None
     wanted = (selection, len(index), criteria.tolerance, criteria.outside)
     same = (found.photo_selection, found.gallery_rows, found.tolerance_m, found.outside) == wanted
+    if found.matching and found.matching.gate.within_m != criteria.within:
+        return None
     return found if same else None
 
 
@@ -136,4 +171,18 @@ def summary(calibration: Calibration) -> str:
         f"an answer is unknown, which keeps {calibration.right_kept:.1%} of the right answers and "
         f"answers unknown for {calibration.outside_unknown:.1%} of the photos without their "
         "location"
+    )
+
+
+def matching_summary(calibration: Calibration) -> str:
+    """The figures of a calibration with matching in one sentence."""
+    matching = calibration.matching
+    assert matching is not None
+    return (
+        f"{matching.photos} framed photos: {matching.refined:.1%} refined within "
+        f"{matching.gate.within_m:g} m; {matching.known:.1%} answered, of which "
+        f"{matching.known_right:.1%} rightly (a tile's answer within {calibration.tolerance_m:g} "
+        f"m); expected calibration error {matching.calibration_error:.3f}; unknown for "
+        f"{matching.outside_unknown:.1%} of the photos without their place in the gallery; "
+        f"ellipses grow {matching.gate.ellipse_scale:.1f} times to hold 95 % of the places"
     )

@@ -75,7 +75,9 @@ def locate_photos(
         decoded = with_times(decoded, settings)
     answers = answer_queries(decoded, index, gallery, calibration, settings)
     if windows:
-        answers = refine_answers(decoded, answers, windows, settings)
+        answers = refine_answers(
+            decoded, answers, windows, settings, calibration, of_flight=settings.track
+        )
     by_name = {
         query.name: _located(query, answer, settings.top)
         for query, answer in zip(decoded, answers, strict=True)

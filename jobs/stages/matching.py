@@ -15,6 +15,7 @@ from pipeline.core.prefetch import prefetch_map
 from pipeline.core.progress import console, progress
 from pipeline.core.records import Rejection
 from pipeline.images.camera_tags import CameraTags
+from pipeline.locate.calibration import Calibration
 from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.locate import Answer
 from pipeline.locate.refined import refine_answer, with_refinement
@@ -87,8 +88,11 @@ def refine_answers(
     answers: Sequence[Answer],
     windows: MapWindows,
     pose: PoseSettings,
+    calibration: Calibration | None,
+    of_flight: bool,
 ) -> list[Answer]:
-    """The answers of single photos, in their order, refined where that holds."""
+    """The answers of single photos, in their order, refined where that holds; `of_flight`: they
+    know of the whole flight."""
     refined: list[Answer] = []
     with progress(len(queries), "matching", "photos") as meter:
         contents = prefetch_map(read_photo, [query.photos[0] for query in queries], AHEAD, AHEAD)
@@ -96,6 +100,6 @@ def refine_answers(
             found = None
             if not isinstance(data, Rejection):  # else it was removed since it was embedded
                 found = match_photo(decode_photo(data), query.tags, answer, windows, pose)
-            refined.append(with_refinement(answer, found))
+            refined.append(with_refinement(answer, found, calibration, of_flight))
             meter.advance()
     return refined

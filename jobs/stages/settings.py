@@ -149,7 +149,11 @@ class CalibrateSettings(CalibrationCriteria):
     "The encoder that the index was made with."
     shards: str
     """Folder or URI of shards with photos of locations that the encoder was not trained on, and the
-    gallery's view of them."""
+    gallery's view of them; with --flight, the shards that the index was made of."""
+    flight: str | None = None
+    """Table of photos over the map with the places that they show, such as photos.csv of
+    jobs/fly.py (columns path, lat, lon): they are searched and matched, with and without the
+    camera's tags, instead of the shards' photos."""
     index: str
     "Folder or URI of the index."
     out: str | None = None

@@ -4,6 +4,7 @@ In: a pose and the standard deviations of its parts. Out: a covariance of (east,
 ellipse. First order: the errors' effect is linear within them.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,6 +40,20 @@ class Ellipse:
     "Half the shorter axis."
     direction_deg: float
     "Of the longer axis, degrees clockwise from north, 0 to 180."
+
+    def scaled(self, factor: float) -> "Ellipse":
+        """The ellipse with axes longer by `factor`."""
+        return replace(self, major_m=self.major_m * factor, minor_m=self.minor_m * factor)
+
+    def scale_to_hold(self, east_m: float, north_m: float) -> float:
+        """The factor by which it must grow to hold a point so far from its middle; infinite where
+        it has no extent."""
+        direction = np.radians(self.direction_deg)
+        along = east_m * np.sin(direction) + north_m * np.cos(direction)
+        across = east_m * np.cos(direction) - north_m * np.sin(direction)
+        if not self.minor_m or not self.major_m:
+            return math.inf
+        return math.hypot(along / self.major_m, across / self.minor_m)
 
 
 def looked_at_covariance(pose: Pose, errors: PoseErrors) -> Doubles:

@@ -1,8 +1,8 @@
 """The calibration of an index: candidates of a photo -> the probability that its answer is right.
 
 In: the consensus of a photo's candidates. Out: a probability, by a small logistic model that
-`pipeline/locate/calibrate.py` fits and that is stored in `calibration.json` beside an index. It
-belongs to one encoder and one gallery: that of another encoder is refused.
+`pipeline/locate/fitting/` fits and that is stored in `calibration.json` beside an index. It belongs
+to one encoder and one gallery: that of another encoder is refused.
 Shapes: K candidates, F features.
 """
 
@@ -17,6 +17,7 @@ from pipeline.core.arrays import Doubles
 from pipeline.core.errors import InputError
 from pipeline.core.json_files import from_json
 from pipeline.locate.consensus import Consensus
+from pipeline.matching.gate import GATE_FEATURES, Gate
 
 SCHEMA_VERSION = 2
 CALIBRATION_FILE = "calibration.json"
@@ -30,6 +31,33 @@ def confidence_features(consensus: Consensus, scores_K: Doubles) -> Doubles:
     best = float(scores_K[consensus.leader])
     margin = best - consensus.best_other_score
     return np.array([best, margin, best - scores_K.mean(), consensus.members_K.mean()])
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchingCalibration:
+    """What matching with the map's pixels says of an answer. The figures are measured in
+    cross-validation: each photo by models that were fitted without its location."""
+
+    gate: Gate
+    "Which refinements hold, and how probably they are right."
+    tile_model: LogisticModel
+    "Of the tiles' answers for the photos whose refinement does not hold, by FEATURE_NAMES."
+    tile_threshold: float
+    "Such answers below it are `unknown`."
+    photos: int
+    "Photos that it was fitted on, each as often as there were ways to frame it."
+    refined: float
+    "Share of them that were refined rightly."
+    known: float
+    "Share of them that were answered, refined or by a tile."
+    known_right: float
+    "Share of the answered ones that were right."
+    outside_unknown: float
+    "Share of the photos without their place in the gallery that are answered `unknown`."
+    calibration_error: float
+    "Expected calibration error."
+    bins: tuple[ReliabilityBin, ...]
+    "Bins of the reliability diagram."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +103,8 @@ class Calibration:
     "Expected calibration error."
     bins: tuple[ReliabilityBin, ...]
     "Bins of the reliability diagram."
+    matching: MatchingCalibration | None = None
+    "Of photos that are matched with the map; None where it was fitted without a map."
 
     def probability(self, consensus: Consensus, scores_K: Doubles) -> float:
         """Probability that the consensus is the photo's location."""
@@ -114,16 +144,20 @@ def read_calibration(path: str, fingerprint: str) -> Calibration:
 
 
 def _check_model(calibration: Calibration) -> None:
-    """Raise ValueError where the numbers of the model cannot be computed with."""
-    model = calibration.model
-    vectors = (model.mean_F, model.scale_F, model.coefficient_F)
-    if any(len(vector_F) != len(FEATURE_NAMES) for vector_F in vectors):
-        raise ValueError("another number of features")
-    flat = [value for vector_F in vectors for value in vector_F]
-    if not np.isfinite([*flat, model.intercept, calibration.threshold]).all():
-        raise ValueError("numbers that are not finite")
-    if not all(model.scale_F):
-        raise ValueError("a scale of 0")
+    """Raise ValueError where the numbers of its models cannot be computed with."""
+    models: list[tuple[LogisticModel, tuple[str, ...]]] = [(calibration.model, FEATURE_NAMES)]
+    if calibration.matching:
+        models.append((calibration.matching.tile_model, FEATURE_NAMES))
+        models.append((calibration.matching.gate.model, GATE_FEATURES))
+    for model, names in models:
+        vectors = (model.mean_F, model.scale_F, model.coefficient_F)
+        if any(len(vector_F) != len(names) for vector_F in vectors):
+            raise ValueError("another number of features")
+        flat = [value for vector_F in vectors for value in vector_F]
+        if not np.isfinite([*flat, model.intercept, calibration.threshold]).all():
+            raise ValueError("numbers that are not finite")
+        if not all(model.scale_F):
+            raise ValueError("a scale of 0")
 
 
 def find_calibration(index: str, fingerprint: str) -> Calibration | None:

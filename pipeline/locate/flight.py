@@ -83,7 +83,7 @@ def _apply_smoothed(answer: Answer, smoothed: SmoothedPhoto, calibration: Calibr
     at_location_K = np.array([hit.location == location for hit in hits], np.bool_)
     probability = float(smoothed.p_K[at_location_K].sum())
     if chosen is None:
-        return replace(answer, probability=probability, known=False)
+        return replace(answer, probability=probability, within_m=None, known=False)
     lat, lon = hits[chosen].lat, hits[chosen].lon
     position = None
     if lat is not None and lon is not None:
@@ -94,6 +94,7 @@ def _apply_smoothed(answer: Answer, smoothed: SmoothedPhoto, calibration: Calibr
         position=position,
         location=location,
         probability=probability,
+        within_m=None,
         agreeing=int(at_location_K.sum()),
         known=probability >= TRACK_THRESHOLD,
     )

@@ -23,6 +23,8 @@ class GalleryMap:
     """Rows of an index with their positions."""
 
     keys: Strings
+    locations: Strings
+    "Names of their locations (N,)."
     positions_N2: Doubles
     rows: int
     "Rows of the whole index, of which these may be a sample."
@@ -71,6 +73,7 @@ def read_gallery_map(index: Index) -> GalleryMap:
     lat_lon = [names[name].to_numpy().astype(np.float64) for name in ("lat", "lon")]
     return GalleryMap(
         keys=np.asarray(names["key"].to_pylist(), dtype=np.str_)[kept_N],
+        locations=location_N[kept_N],
         positions_N2=np.stack(lat_lon, axis=1)[kept_N],
         rows=len(index),
     )

@@ -20,6 +20,7 @@ PROPERTIES = (
     "taken_at",
     "known",
     "probability",
+    "within_m",
     "lat",
     "lon",
     "radius_m",
@@ -133,7 +134,7 @@ def _row(one: LocatedPhoto) -> dict[str, Any]:
     if answer := one.answer:
         row |= {
             name: getattr(answer, name)
-            for name in ("known", "probability", "location", "agreeing", "framing")
+            for name in ("known", "probability", "within_m", "location", "agreeing", "framing")
         }
         if position := answer.position:
             row |= {name: getattr(position, name) for name in ("lat", "lon", "radius_m", "how")}

@@ -65,6 +65,10 @@ class Answer:
     "Name of the location: that of its best candidate; null where the search found nothing."
     probability: float | None
     "Probability that the location is right, 0 to 1; null without a calibration."
+    within_m: float | None = None
+    """The position counts as right within so many metres of the ground that the photo's middle
+    shows; null without a probability, and for a flight's photos, whose probability is that of the
+    location."""
     known: bool
     "False (unknown) where the probability is below the threshold, or nothing was found."
     candidates: tuple[Hit, ...]
@@ -151,6 +155,7 @@ def _answer(
     spacing: float,
 ) -> Answer:
     probability, threshold, position = None, 0.0, None
+    within_m = calibration.tolerance_m if calibration else None
     if calibration:
         probability = calibration.probability(consensus, consensus_scores(hits))
         threshold = calibration.threshold
@@ -161,6 +166,7 @@ def _answer(
         position=position,
         location=hits[consensus.leader].location,
         probability=probability,
+        within_m=within_m,
         known=probability is None or probability >= threshold,
         candidates=tuple(hits[:k]),
         agreeing=int(consensus.members_K.sum()),

@@ -9,7 +9,8 @@ from dataclasses import replace
 
 from pipeline.camera.pose import PartialPose
 from pipeline.core.arrays import Pixels
-from pipeline.locate.locate import Answer, Position
+from pipeline.locate.calibration import Calibration, confidence_features
+from pipeline.locate.locate import Answer, Position, consensus_of, consensus_scores
 from pipeline.matching.gate import holds
 from pipeline.matching.map_windows import MapWindows
 from pipeline.matching.refine import MatchablePhoto, Refinement, prepare_photo, refine
@@ -44,16 +45,41 @@ def _positions(answer: Answer) -> Iterator[tuple[float, float, str]]:
             yield hit.lat, hit.lon, hit.key
 
 
-def with_refinement(answer: Answer, refinement: Refinement | None) -> Answer:
-    """The answer at the refined place, if the refinement holds. Its probability is then unknown: a
-    calibration knows that of the tile only."""
-    if refinement is None or not holds(refinement):
+def with_refinement(
+    answer: Answer,
+    refinement: Refinement | None,
+    calibration: Calibration | None = None,
+    of_flight: bool = False,
+) -> Answer:
+    """The answer at the refined place, if the refinement holds.
+
+    Its probability is that of the calibration's gate, and null where the calibration knows nothing
+    of matching. Where the refinement does not hold, that speaks against the tile too: its
+    probability becomes that of such photos; not so if the answer is `of_flight`, which knows more
+    than this photo.
+    """
+    matching = calibration.matching if calibration else None
+    gate = matching.gate if matching else None
+    if refinement is not None and holds(refinement, gate):
+        ellipse = gate.ellipse(refinement) if gate else refinement.ellipse
+        position = Position(
+            lat=refinement.lat,
+            lon=refinement.lon,
+            radius_m=ellipse.major_m,
+            how="refined",
+            ellipse=ellipse,
+        )
+        return replace(
+            answer,
+            position=position,
+            probability=gate.probability(refinement) if gate else None,
+            within_m=gate.within_m if gate else None,
+            known=True,
+            refinement=refinement,
+        )
+    if calibration is None or matching is None or not answer.candidates or of_flight:
         return answer
-    position = Position(
-        lat=refinement.lat,
-        lon=refinement.lon,
-        radius_m=refinement.ellipse.major_m,
-        how="refined",
-        ellipse=refinement.ellipse,
-    )
-    return replace(answer, position=position, probability=None, known=True, refinement=refinement)
+    consensus = consensus_of(answer.candidates, calibration.agreement_radius_m)
+    x_1F = confidence_features(consensus, consensus_scores(answer.candidates))[None]
+    probability = float(matching.tile_model.probabilities(x_1F)[0])
+    return replace(answer, probability=probability, known=probability >= matching.tile_threshold)

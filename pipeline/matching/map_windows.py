@@ -89,14 +89,19 @@ class MapWindows:
                 kept.append(side)
         return kept
 
+    def apart_m(self) -> float:
+        """How far apart two places are at least, if no window around the one shows the ground that
+        a photo of the other does: a window's half side, its grid's step, and half a photo of some
+        tiles."""
+        return 2 * _on_the_grid(TILES_ACROSS / 2 * max(self.tile_sides_m(), default=0.0))
+
     def _half_side(self, key: str, reach_m: float) -> float | None:
         """Half the side of the window for a tile, metres, in steps of a quarter more; None where
         the tile's ground is not known."""
         footprint = self._footprints([key]).get(key)
         if footprint is None:
             return None
-        half_m = max(TILES_ACROSS / 2 * tile_side_m(footprint), reach_m)
-        return float(1.25 ** math.ceil(math.log(half_m, 1.25) - 1e-6))
+        return _on_the_grid(max(TILES_ACROSS / 2 * tile_side_m(footprint), reach_m))
 
     def _place(self, lat: float, lon: float, half_m: float) -> Place:
         row = round(lat / self._step_lat(half_m))
@@ -151,6 +156,11 @@ class MapWindows:
         numbers = self._gallery.nearest(plane.lat, plane.lon, MOST_TILES)
         away_N = np.abs(plane.to_metres(self._gallery.positions_N2[numbers])).max(axis=1)
         return [str(key) for key in self._gallery.keys[numbers[away_N < reach_m]]]
+
+
+def _on_the_grid(half_m: float) -> float:
+    """Half a window's side, metres, in steps of a quarter more."""
+    return float(1.25 ** math.ceil(math.log(max(half_m, 1.0), 1.25) - 1e-6))
 
 
 def _resolution_m(tile: Tile) -> float:

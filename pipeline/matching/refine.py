@@ -86,6 +86,8 @@ class Refinement:
     "Points of the photo and of the map that look alike."
     residual_m: float
     "Root mean square distance of the inliers on the ground."
+    promised: bool
+    "Whether the camera's pose promised the ground: doubtful matches come then too."
     points: tuple[MatchedPoint, ...] = ()
     "Some of the inliers, at most 40."
 
@@ -272,5 +274,6 @@ def _refinement(
         inliers=fit.inliers,
         matches=matches,
         residual_m=fit.residual_m,
+        promised=photo.promised_33 is not None,
         points=points,
     )

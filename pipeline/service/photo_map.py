@@ -17,6 +17,7 @@ from pipeline.camera.framing import Framing, nearest_side, views_of_photo
 from pipeline.core.arrays import Pixels
 from pipeline.images.camera_tags import CameraTags
 from pipeline.images.thumbnails import ImageLoader, thumbnail_bytes, to_webp
+from pipeline.locate.calibration import Calibration
 from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.locate import Answer
 from pipeline.locate.refined import refine_prepared, with_refinement
@@ -109,15 +110,18 @@ class PhotoMap:
         seconds = time.perf_counter() - began
         return FramedPhoto(views=views, framing=framing, matchable=matchable, seconds=seconds)
 
-    def refine(self, answer: Answer, photo: FramedPhoto) -> Located:
-        """The answer at the place that matching finds, where that holds; else as it was."""
+    def refine(
+        self, answer: Answer, photo: FramedPhoto, calibration: Calibration | None = None
+    ) -> Located:
+        """The answer at the place that matching finds, where that holds; else as it was, with the
+        probability that the index's calibration gives such photos."""
         located = Located(answer=answer, pictures=self.pictures, match_error=photo.error)
         if photo.matchable is None or self._windows is None:
             return located
         began = time.perf_counter()
         try:
             found = refine_prepared(answer, photo.matchable, self._windows)
-            located = replace(located, answer=with_refinement(answer, found))
+            located = replace(located, answer=with_refinement(answer, found, calibration))
         except Exception as error:  # a damaged tar, a folder that went away, OpenCV's own
             located = replace(located, match_error=_sentence(error))
         return replace(located, match_seconds=photo.seconds + time.perf_counter() - began)

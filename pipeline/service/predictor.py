@@ -151,6 +151,6 @@ def _refined(
     """The answer as it is sent: matched with the map, and with the candidates asked for."""
     located = Located(answer=replace(answer, framing=photo.framing))
     if opened.photo_map is not None:
-        located = opened.photo_map.refine(located.answer, photo)
+        located = opened.photo_map.refine(located.answer, photo, opened.calibration)
     listed = located.answer.candidates[: request.top]
     return replace(located, answer=replace(located.answer, candidates=listed))

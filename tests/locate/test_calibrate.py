@@ -1,26 +1,27 @@
 """Fitting a calibration on made-up galleries: right answers, the threshold, the agreement
 radius."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from pipeline.confidence.cross_validation import cross_validated_probabilities, youden_threshold
 from pipeline.confidence.logistic import sigmoid
 from pipeline.core.arrays import Floats
 from pipeline.core.errors import InputError
 from pipeline.core.filters import Filter
 from pipeline.core.records import View
 from pipeline.index.searcher import Hit
-from pipeline.locate.calibrate import (
+from pipeline.locate.calibration import Calibration
+from pipeline.locate.fitting.calibrate import (
     CalibrationContext,
     CalibrationExample,
     choose_agreement_radius,
-    cross_validated_probabilities,
     fit_calibration,
     is_correct,
-    youden_threshold,
 )
-from pipeline.locate.calibration import Calibration
-from pipeline.locate.calibration_data import LabelledImages, make_examples
+from pipeline.locate.fitting.calibration_data import LabelledImages, make_examples
 from pipeline.locate.locate import answers_from_hits, consensus_of, consensus_scores
 from pipeline.locate.settings import CalibrationCriteria
 from pipeline.locate.track import TRACK_CANDIDATES
@@ -190,8 +191,12 @@ def test_calibration_unusable_examples_are_refused() -> None:
         )
         for n in range(20)
     ]
-    with pytest.raises(InputError, match="20 of 20 photos are answered rightly"):
-        fit_calibration(sure, CalibrationCriteria(), GALLERY)
+    assert fit_calibration(sure, CalibrationCriteria(), GALLERY).accuracy == 1
+    lost = [replace(one, location=f"x{n}", lat=-9.0) for n, one in enumerate(sure)]
+    with pytest.raises(InputError, match="none of 20 photos is answered rightly"):
+        fit_calibration(lost, CalibrationCriteria(), GALLERY)
+    with pytest.raises(InputError, match="no gallery image lies beyond"):
+        fit_calibration([replace(one, outside=()) for one in sure], CalibrationCriteria(), GALLERY)
 
 
 @pytest.mark.parametrize(
@@ -210,7 +215,7 @@ class Rows:
     def __init__(self, own: int, others: int) -> None:
         names = ["own"] * own + [f"o{n}" for n in range(others)]
         self.hits = [
-            hit(name, 1 - n / 1000, 0.0 if name == "own" else 5000.0 * n)
+            replace(hit(name, 1 - n / 1000, 0.0 if name == "own" else 5000.0 * n), key=f"row {n}")
             for n, name in enumerate(names)
         ]
         self.dimension = 2

@@ -24,7 +24,9 @@ def on_a_grid(side: int, rows: int | None = None) -> GalleryMap:
     positions = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
     positions = np.concatenate([positions, positions, [[np.nan, np.nan]]])
     names = np.array([f"{number}" for number in range(len(positions))])
-    return GalleryMap(keys=names, positions_N2=positions, rows=rows or len(positions))
+    return GalleryMap(
+        keys=names, locations=names, positions_N2=positions, rows=rows or len(positions)
+    )
 
 
 def test_gallery_map_spacing_of_a_grid() -> None:
@@ -43,7 +45,7 @@ def test_gallery_map_spacing_needs_two_positions() -> None:
 def test_gallery_map_nearest_across_180_degrees() -> None:
     positions = np.array([[0, 179.9], [0, -179.99], [0, 170.0], [np.nan, np.nan]])
     names = np.array(list("abcd"))
-    gallery = GalleryMap(keys=names, positions_N2=positions, rows=4)
+    gallery = GalleryMap(keys=names, locations=names, positions_N2=positions, rows=4)
     assert gallery.nearest(0, 179.99, 3).tolist() == [1, 0, 2]
     assert gallery.nearest(0, 179.99, 1).tolist() == [1]
 

@@ -51,7 +51,7 @@ def gallery(lon: float = 8.0) -> GalleryMap:
         for column in (-1, 0, 1)
     ]
     names = np.array([f"gallery-satellite-{number}" for number in range(9)])
-    return GalleryMap(keys=names, positions_N2=np.array(at), rows=9)
+    return GalleryMap(keys=names, locations=names, positions_N2=np.array(at), rows=9)
 
 
 def answer(known: bool = True, lat: float = 0.0, lon: float = 8.0, location: str = "4") -> Answer:

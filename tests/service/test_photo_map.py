@@ -56,7 +56,10 @@ class MadeMap:
                 self.corners[key] = PLANE.to_degrees(corners).tolist()
                 middles.append(PLANE.to_degrees(corners.mean(axis=0)[None])[0])
         self.gallery = GalleryMap(
-            keys=np.array(list(self.images)), positions_N2=np.array(middles), rows=len(middles)
+            keys=np.array(list(self.images)),
+            locations=np.array(list(self.images)),
+            positions_N2=np.array(middles),
+            rows=len(middles),
         )
 
     def fetch(self, keys: Iterable[str]) -> dict[str, bytes]:

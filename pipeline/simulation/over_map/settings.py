@@ -54,3 +54,23 @@ class MapFlightSettings:
             require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
         this = "0 (this process) or more"
         require(self.workers is None or self.workers >= 0, "workers", self.workers, this)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TownMapSettings:
+    """The size of a procedural town, and which."""
+
+    out: str
+    "Folder of the maps; a local or mounted path."
+    side: float = 1000.0
+    "Side of the square that the map shows, metres."
+    resolution: float = 0.25
+    "Metres per pixel."
+    seed: int = 0
+    "Another seed makes another town."
+
+    def __post_init__(self) -> None:
+        require(100 <= self.side <= 4000, "side", self.side, "100 to 4000 metres")
+        metres = "metres per pixel from 0.1 to 2"
+        require(0.1 <= self.resolution <= 2, "resolution", self.resolution, metres)
+        require(self.seed >= 0, "seed", self.seed, "0 or more")

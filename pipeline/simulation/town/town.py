@@ -25,10 +25,17 @@ def make_town(rng: np.random.Generator, *, frame_pixels: int = 256) -> World:
     """A town with the detail of frames of `frame_pixels`; the plan is the same at every size."""
     radius_m = float(rng.uniform(27, 46))
     metres_per_pixel = radius_m / TEXELS_PER_RADIUS * 256 / frame_pixels
+    return build_town(rng, radius_m, EXTENT_IN_RADII * radius_m, metres_per_pixel)
+
+
+def build_town(
+    rng: np.random.Generator, radius_m: float, extent_m: float, metres_per_pixel: float
+) -> World:
+    """A town of `extent_m` a side around a campus of `radius_m`."""
     # Separate streams: draws that depend on the map's resolution must not change the plan.
     plan, grain = rng.spawn(2)
     canvas = Canvas(
-        extent_m=EXTENT_IN_RADII * radius_m,
+        extent_m=extent_m,
         metres_per_pixel=metres_per_pixel,
         ground=pick_colour(plan, GRASS),
         rng=plan,

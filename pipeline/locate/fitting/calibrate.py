@@ -6,15 +6,15 @@ Calibration. Never fitted on the test set, whose figures it would then describe.
 Shapes: N examples, F features, K candidates, A agreement factors, L locations.
 """
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.confidence.cross_validation import cross_validated_probabilities, youden_threshold
 from pipeline.confidence.logistic import fit_choice_model, fit_logistic
 from pipeline.confidence.reliability import expected_calibration_error, reliability_bins
-from pipeline.core.arrays import Doubles, Strings
+from pipeline.core.arrays import Doubles
 from pipeline.core.errors import InputError
 from pipeline.core.geo import haversine_m
 from pipeline.index.searcher import Hit
@@ -28,8 +28,6 @@ AGREEMENT_FACTORS = (0.5, 1.5, 2.5)
 """Agreement radii that are tried, in spacings of the gallery. 0.5: only images of one location;
 1.5: the neighbours on a grid, diagonal ones too; 2.5: two steps away. Which is best depends on
 whether neighbouring images overlap."""
-
-CROSS_VALIDATION_FOLDS = 5
 
 MIN_LOCATIONS = 10
 "Fewer locations say little about unseen ones."
@@ -46,7 +44,8 @@ class CalibrationExample:
     inside: tuple[Hit, ...]
     "Candidates, best first, from a gallery that contains the location."
     outside: tuple[Hit, ...]
-    "Candidates from a gallery that does not contain it."
+    """Candidates from a gallery that does not contain it; empty where no image lies far enough
+    away."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,8 +68,8 @@ def fit_calibration(
 ) -> Calibration:
     """Fit the confidence model, its threshold and the track's choice model.
 
-    Raises InputError where the examples show too few locations, or where all answers are right or
-    all wrong.
+    Raises InputError where the examples show too few locations, where no answer is right, or where
+    no example has candidates from outside.
     """
     locations_N = np.array([one.location for one in examples], dtype=np.str_)
     location_count = len(np.unique(locations_N))
@@ -82,25 +81,32 @@ def fit_calibration(
         )
     radius_m = choose_agreement_radius(examples, criteria.tolerance, context.spacing_m)
     inside = [consensus_of(one.inside, radius_m) for one in examples]
-    outside = [consensus_of(one.outside, radius_m) for one in examples]
+    strangers = [one for one in examples if one.outside]
+    outside = [consensus_of(one.outside, radius_m) for one in strangers]
     right_N = np.array(
         [is_correct(at, one, criteria.tolerance) for at, one in zip(inside, examples, strict=True)]
     )
-    if right_N.all() or not right_N.any():
+    if not right_N.any():
         raise InputError(
-            f"{right_N.sum()} of {len(right_N)} photos are answered rightly, expected some right "
-            "and some wrong; calibrate on more photos, or check that --shards and --index are of "
-            "one data set"
+            f"none of {len(right_N)} photos is answered rightly, expected some; calibrate on more "
+            "photos, or check that the photos and --index are of one data set"
         )
-    hits = [one.inside for one in examples] + [one.outside for one in examples]
+    if not strangers:
+        raise InputError(
+            f"no gallery image lies beyond the surroundings of any of {len(examples)} photos, "
+            "expected some, to learn what a photo from elsewhere looks like; calibrate over a "
+            "larger gallery"
+        )
+    hits = [one.inside for one in examples] + [one.outside for one in strangers]
     pairs = zip([*inside, *outside], hits, strict=True)
     x_NF = np.array([confidence_features(at, consensus_scores(best)) for at, best in pairs])
-    yes_N = np.concatenate([right_N, np.zeros(len(examples))])
-    weight_N = 2 * np.repeat([1 - criteria.outside, criteria.outside], len(examples))
-    p_N = cross_validated_probabilities(x_NF, yes_N, weight_N, np.tile(locations_N, 2))
+    yes_N = np.concatenate([right_N, np.zeros(len(strangers))])
+    weight_N = example_weights(len(examples), len(strangers), criteria.outside)
+    both_N = np.array([one.location for one in [*examples, *strangers]], dtype=np.str_)
+    p_N = cross_validated_probabilities(x_NF, yes_N, weight_N, both_N)
     bins = reliability_bins(p_N, yes_N, weight_N)
     threshold = youden_threshold(p_N, yes_N, weight_N)
-    inverse_temperature, none_log_odds = fit_track_choice(examples, weight_N)
+    inverse_temperature, none_log_odds = fit_track_choice(examples, strangers, weight_N)
     return Calibration(
         fingerprint=context.fingerprint,
         gallery_rows=context.gallery_rows,
@@ -165,41 +171,23 @@ def choose_agreement_radius(
     return AGREEMENT_FACTORS[best] * spacing_m
 
 
-def cross_validated_probabilities(
-    x_NF: Doubles, yes_N: Doubles, weight_N: Doubles, locations_N: Strings
-) -> Doubles:
-    """Each example's probability (N,) by a model that was fitted without its location."""
-    folds = {
-        name: hashlib.sha256(name.encode()).digest()[0] % CROSS_VALIDATION_FOLDS
-        for name in np.unique(locations_N).tolist()
-    }
-    fold_N = np.array([folds[name] for name in locations_N.tolist()])
-    p_N = np.empty(len(x_NF))
-    for fold in np.unique(fold_N):
-        left_out_N = fold_N == fold
-        model = fit_logistic(x_NF[~left_out_N], yes_N[~left_out_N], weight_N[~left_out_N])
-        p_N[left_out_N] = model.probabilities(x_NF[left_out_N])
-    return p_N
-
-
-def youden_threshold(p_N: Doubles, yes_N: Doubles, weight_N: Doubles) -> float:
-    """The lowest probability to answer at: there the share of right answers kept, less the share of
-    wrong answers kept, is greatest (Youden 1950). Each share is of its own kind's total, so that
-    neither kind is given up for being rare."""
-    order_N = np.argsort(-p_N, kind="stable")
-    right_N, wrong_N = (weight_N * yes_N)[order_N], (weight_N * (1 - yes_N))[order_N]
-    gain_N = np.cumsum(right_N) / right_N.sum() - np.cumsum(wrong_N) / wrong_N.sum()
-    return float(p_N[order_N][int(np.argmax(gain_N))])
+def example_weights(inside: int, outside: int, share: float) -> Doubles:
+    """Weights (inside + outside,) under which the examples from outside are a `share` of all; their
+    mean is about 1."""
+    weights_2 = 2 * inside * np.array([(1 - share) / inside, share / max(outside, 1)])
+    return np.repeat(weights_2, [inside, outside])
 
 
 def fit_track_choice(
-    examples: Sequence[CalibrationExample], weight_N: Doubles
+    examples: Sequence[CalibrationExample],
+    strangers: Sequence[CalibrationExample],
+    weight_N: Doubles,
 ) -> tuple[float, float]:
     """(inverse_temperature, none_log_odds) of the choice among TRACK_CANDIDATES under which the
-    true candidates are likeliest."""
+    true candidates are likeliest: those of `examples` inside, and of `strangers` outside."""
     rows, chosen = [], []
-    inside, outside = [one.inside for one in examples], [one.outside for one in examples]
-    for hits, example in zip([*inside, *outside], [*examples, *examples], strict=True):
+    hits_of = [one.inside for one in examples] + [one.outside for one in strangers]
+    for hits, example in zip(hits_of, [*examples, *strangers], strict=True):
         hits = hits[:TRACK_CANDIDATES]
         x_K = np.full(TRACK_CANDIDATES, -np.inf)
         x_K[: len(hits)] = relative_scores(hits)

@@ -1,12 +1,12 @@
 """Photos of known locations -> the candidates of a gallery with their location in it, and without.
 
 In: embeddings of photos and of their locations' own gallery images, and an index. Out: examples for
-`pipeline/locate/calibrate.py`. The index need not contain the locations: their own images are
-ranked among its rows as if it did.
+`calibrate.py`. The index need not contain the locations: their own images are ranked among its rows
+as if it did.
 Shapes: Q photos, N gallery images of their locations, D dimensions, K candidates.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,8 +16,8 @@ from pipeline.core.arrays import Floats
 from pipeline.core.geo import haversine_m
 from pipeline.core.records import View
 from pipeline.index.searcher import Hit, Searchable
-from pipeline.locate.calibrate import CalibrationExample
-from pipeline.locate.locate import coordinates
+from pipeline.locate.fitting.calibrate import CalibrationExample
+from pipeline.locate.locate import coordinates, search_views
 from pipeline.locate.track import TRACK_CANDIDATES
 
 OWN_LOCATION_SPACINGS = 2.0
@@ -46,41 +46,58 @@ def make_examples(
     spacing_m: float | None,
     tolerance_m: float,
 ) -> list[CalibrationExample]:
-    """One example per photo, in order.
-
-    Searches with a growing number of candidates until each photo has TRACK_CANDIDATES of other
-    locations: some locations have many rows.
-    """
+    """One example per photo, in order."""
     own_rows: dict[str, list[int]] = {}
     for row, record in enumerate(overhead.records):
         own_rows.setdefault(record["location"], []).append(row)
     radius_m = max(tolerance_m, OWN_LOCATION_SPACINGS * (spacing_m or 0.0))
-    examples: dict[int, CalibrationExample] = {}
-    pending, k = list(range(len(photos.records))), 2 * TRACK_CANDIDATES
-    while pending:
-        found = index.search(photos.embeddings_QD[pending], k)
-        for number, hits in zip(pending, found, strict=True):
-            location, (lat, lon) = photos.records[number]["location"], photos.position(number)
-            others = [
-                hit
-                for hit in hits_outside_radius(hits, lat, lon, radius_m)
-                if hit.location != location
-            ]
-            if len(others) < TRACK_CANDIDATES and k < len(index):
-                continue
-            own = _own_hits(photos.embeddings_QD[number], overhead, own_rows.get(location, []))
-            indexed = {hit.key for hit in hits}
-            inside = [*hits, *(hit for hit in own if hit.key not in indexed)]
-            inside.sort(key=lambda hit: -hit.score)
-            examples[number] = CalibrationExample(
+
+    def others(number: int, hits: Sequence[Hit]) -> list[Hit]:
+        location = photos.records[number]["location"]
+        away = hits_outside_radius(hits, *photos.position(number), radius_m)
+        return [hit for hit in away if hit.location != location]
+
+    views = list(photos.embeddings_QD[:, None])
+    examples = []
+    for number, (hits, away) in enumerate(search_near_and_away(index, views, others)):
+        location, (lat, lon) = photos.records[number]["location"], photos.position(number)
+        own = _own_hits(photos.embeddings_QD[number], overhead, own_rows.get(location, []))
+        indexed = {hit.key for hit in hits}
+        inside = [*hits, *(hit for hit in own if hit.key not in indexed)]
+        inside.sort(key=lambda hit: -hit.score)
+        examples.append(
+            CalibrationExample(
                 location=location,
                 lat=lat,
                 lon=lon,
                 inside=tuple(inside[:TRACK_CANDIDATES]),
-                outside=tuple(others[:TRACK_CANDIDATES]),
+                outside=tuple(away[:TRACK_CANDIDATES]),
             )
-        pending, k = [number for number in pending if number not in examples], 4 * k
-    return [examples[number] for number in range(len(photos.records))]
+        )
+    return examples
+
+
+def search_near_and_away(
+    index: Searchable,
+    views_of_photos: Sequence[Floats],
+    others: Callable[[int, Sequence[Hit]], list[Hit]],
+) -> list[tuple[list[Hit], list[Hit]]]:
+    """For each photo by its views (V, D): its candidates, and those of them that `others` takes for
+    such of elsewhere, by the photo's number.
+
+    Searches with a growing number of candidates until there are TRACK_CANDIDATES of these, or no
+    more rows.
+    """
+    found: dict[int, tuple[list[Hit], list[Hit]]] = {}
+    pending, k = list(range(len(views_of_photos))), 2 * TRACK_CANDIDATES
+    while pending:
+        hits_of = search_views(index, [views_of_photos[number] for number in pending], k)
+        for number, hits in zip(pending, hits_of, strict=True):
+            away = others(number, hits)
+            if len(away) >= TRACK_CANDIDATES or k >= len(index):
+                found[number] = hits, away
+        pending, k = [number for number in pending if number not in found], 4 * k
+    return [found[number] for number in range(len(views_of_photos))]
 
 
 def hits_outside_radius(

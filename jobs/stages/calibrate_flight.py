@@ -1,0 +1,150 @@
+"""Photos over a map, with the places that they show -> examples to calibrate retrieval and matching
+on.
+
+In: a table of photos (that of jobs/fly.py, or of a flight with GPS), an index and the shards of its
+tiles. Each photo is searched and matched twice, with what its tags say of the camera and without.
+Out: examples for `pipeline/locate/fitting/`.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from jobs.encoding.photo_encoder import PhotoEncoder, decode_photo
+from jobs.encoding.queries import Query, encode_photos, read_photo
+from jobs.stages.matching import AHEAD, match_photo, view_maker
+from pipeline.core import storage
+from pipeline.core.errors import InputError
+from pipeline.core.prefetch import prefetch_map
+from pipeline.core.progress import progress
+from pipeline.core.records import GeoTag, ImageRecord, Rejection
+from pipeline.index.searcher import Hit, Index
+from pipeline.locate.calibration import Calibration
+from pipeline.locate.fitting.calibrate import CalibrationExample
+from pipeline.locate.fitting.calibration_data import hits_outside_radius, search_near_and_away
+from pipeline.locate.fitting.fit_matching import MatchedExample
+from pipeline.locate.gallery_map import GalleryMap
+from pipeline.locate.locate import CONSENSUS_CANDIDATES, answers_from_hits
+from pipeline.locate.track import TRACK_CANDIDATES
+from pipeline.matching.map_windows import MapWindows
+from pipeline.matching.photo_pose import PoseSettings
+from pipeline.matching.refine import Refinement
+from pipeline.sources.table import Table
+
+WAYS = (PoseSettings(pose=True), PoseSettings(pose=False))
+"What is known of the cameras: their tags, or nothing."
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightPhoto:
+    """A photo with the ground that its middle shows."""
+
+    path: str
+    truth: GeoTag
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchedPhoto:
+    """A photo's query, framed in one of the WAYS, with its candidates."""
+
+    query: Query
+    way: PoseSettings
+    example: CalibrationExample
+
+
+def flight_of(table: str, most: int) -> list[FlightPhoto]:
+    """The first photos of a table that have a position, at most `most`.
+
+    Raises InputError where there are none.
+    """
+    rows = Table().scan(table)
+    found = [
+        FlightPhoto(path=row.path, truth=row.geotag)
+        for row in rows
+        if isinstance(row, ImageRecord) and row.geotag is not None
+    ]
+    if not found:
+        raise InputError(
+            f"{table} has no photo with a position, expected columns path, lat and lon of the "
+            "ground that each photo's middle shows; see docs/sources.md"
+        )
+    return found[:most]
+
+
+def selection_of(table: str, most: int) -> str:
+    """Which photos a table gives, in words; other rows give other words."""
+    digest = hashlib.sha256(storage.read_bytes(table)).hexdigest()[:12]
+    return f"{table} ({digest}), at most {most} photos, with and without the camera's tags"
+
+
+def search_flight(
+    photos: Sequence[FlightPhoto],
+    encoder: PhotoEncoder,
+    index: Index,
+    gallery: GalleryMap,
+    windows: MapWindows,
+) -> list[SearchedPhoto]:
+    """The candidates of each photo that can be decoded, in each of the WAYS. The location that it
+    shows is the nearest gallery image's; a candidate is of elsewhere if no window around it shows
+    the photo's ground."""
+    away_m = windows.apart_m()
+    truth = {photo.path: photo.truth for photo in photos}
+    searched = []
+    for way in WAYS:
+        queries = encode_photos(list(truth), encoder, view_maker(windows, way))
+        decoded = [(one, one.views_VD) for one in queries if one.views_VD is not None]
+
+        def others(
+            number: int, hits: Sequence[Hit], decoded: Sequence[tuple[Query, object]] = decoded
+        ) -> list[Hit]:
+            tag = truth[decoded[number][0].name]
+            return hits_outside_radius(hits, tag.lat, tag.lon, away_m)
+
+        found = search_near_and_away(index, [views_VD for _, views_VD in decoded], others)
+        for (query, _), (hits, away) in zip(decoded, found, strict=True):
+            tag = truth[query.name]
+            example = CalibrationExample(
+                location=_nearest_location(gallery, tag),
+                lat=tag.lat,
+                lon=tag.lon,
+                inside=tuple(hits[:TRACK_CANDIDATES]),
+                outside=tuple(away[:TRACK_CANDIDATES]),
+            )
+            searched.append(SearchedPhoto(query=query, way=way, example=example))
+    return searched
+
+
+def _nearest_location(gallery: GalleryMap, tag: GeoTag) -> str:
+    [row] = gallery.nearest(tag.lat, tag.lon, 1).tolist()
+    return str(gallery.locations[row])
+
+
+def match_flight(
+    searched: Sequence[SearchedPhoto], windows: MapWindows, calibration: Calibration
+) -> list[MatchedExample]:
+    """Each photo matched around its candidates, and around those of elsewhere."""
+    examples = []
+    with progress(len(searched), "matching", "photos") as meter:
+        contents = prefetch_map(read_photo, [one.query.name for one in searched], AHEAD, AHEAD)
+        for one, data in zip(searched, contents, strict=True):
+            if not isinstance(data, Rejection):  # else it was removed since it was embedded
+                inside, outside = (
+                    _match(one, data, hits, windows, calibration)
+                    for hits in (one.example.inside, one.example.outside)
+                )
+                examples.append(
+                    MatchedExample(searched=one.example, inside=inside, outside=outside)
+                )
+            meter.advance()
+    return examples
+
+
+def _match(
+    one: SearchedPhoto,
+    data: bytes,
+    hits: Sequence[Hit],
+    windows: MapWindows,
+    calibration: Calibration,
+) -> Refinement | None:
+    [answer] = answers_from_hits([hits], CONSENSUS_CANDIDATES, calibration)
+    return match_photo(decode_photo(data), one.query.tags, answer, windows, one.way)

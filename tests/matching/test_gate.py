@@ -1,0 +1,61 @@
+"""The fitted gate: its probability follows the inliers, its ellipse the errors."""
+
+import numpy as np
+import pytest
+
+from pipeline.camera.uncertainty import Ellipse
+from pipeline.matching.fit_gate import LEAST_RIGHT, GateExamples, error_of, fit_gate
+from pipeline.matching.gate import holds
+from tests.matching.refinements import METRE_LAT, make_refinement
+
+
+def examples(count: int = 200) -> GateExamples:
+    """Half are right and have 30 to 200 inliers and an error of twice their ellipse, the others are
+    a kilometre off and have 8 to 15."""
+    rng = np.random.default_rng(0)
+    right = np.arange(count) % 2 == 0
+    inliers = np.where(right, rng.integers(30, 200, count), rng.integers(8, 16, count))
+    return GateExamples(
+        refinements=[make_refinement(inliers=int(one)) for one in inliers],
+        errors_N2=np.where(right[:, None], [[1.0, 0.0]], [[1000.0, 0.0]]),
+        weight_N=np.ones(count),
+        locations_N=np.array([f"p{n}" for n in range(count)], dtype=np.str_),
+    )
+
+
+def test_gate_separates_by_inliers() -> None:
+    fitted = fit_gate(examples(), within_m=5.0)
+    assert fitted is not None
+    gate, p_N = fitted
+    assert p_N[::2].mean() > 0.95
+    assert p_N[1::2].mean() < 0.05
+    assert gate.probability(make_refinement(inliers=100)) > 0.95
+    assert holds(make_refinement(inliers=100), gate)
+    assert not holds(make_refinement(inliers=10), gate)
+
+
+def test_gate_ellipse_grows_to_hold_the_errors() -> None:
+    """Errors of 1 m to the east and ellipses of half a metre there: twice as wide."""
+    fitted = fit_gate(examples(), within_m=5.0)
+    assert fitted is not None
+    assert fitted[0].ellipse_scale == pytest.approx(2.0)
+    assert fitted[0].ellipse(make_refinement(inliers=50)).minor_m == pytest.approx(1.0)
+
+
+def test_gate_needs_right_refinements() -> None:
+    few = examples(2 * LEAST_RIGHT - 2)
+    assert fit_gate(few, within_m=5.0) is None
+    assert fit_gate(few, within_m=0.5) is None
+
+
+def test_ellipse_scale_to_hold_by_hand() -> None:
+    ellipse = Ellipse(major_m=3.0, minor_m=1.0, direction_deg=90.0)
+    assert ellipse.scale_to_hold(6.0, 0.0) == pytest.approx(2.0)
+    assert ellipse.scale_to_hold(0.0, 2.0) == pytest.approx(2.0)
+    assert Ellipse(major_m=0.0, minor_m=0.0, direction_deg=0.0).scale_to_hold(1, 1) == np.inf
+
+
+def test_error_of_refinement_in_metres() -> None:
+    refinement = make_refinement(inliers=50)
+    error = error_of(refinement, refinement.lat + 10 * METRE_LAT, refinement.lon)
+    assert np.allclose(error, [0, 10], rtol=0.01, atol=1e-6)
