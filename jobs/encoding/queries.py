@@ -6,13 +6,13 @@ Shapes: V views, B views of several photos, D dimensions.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
 
 from jobs.encoding.photo_encoder import DECODE_THREADS, PhotoEncoder, decode_photo
-from pipeline.camera.framing import Framing
+from pipeline.camera.framing import Framing, Level, PhotoViews
 from pipeline.core import storage
 from pipeline.core.arrays import Floats, Pixels
 from pipeline.core.prefetch import prefetch_map
@@ -30,13 +30,13 @@ READ_THREADS = 4
 "Files that are read at once: enough to hide a network's latency."
 
 
-ViewMaker = Callable[[Pixels, CameraTags], tuple[list[Pixels], Framing]]
+ViewMaker = Callable[[Pixels, CameraTags], PhotoViews]
 "The views of a photo by which an index is searched, by what its tags say of the camera."
 
 
-def one_view(photo_HW3: Pixels, tags: CameraTags) -> tuple[list[Pixels], Framing]:
+def one_view(photo_HW3: Pixels, tags: CameraTags) -> PhotoViews:
     """The photo as it is."""
-    return [photo_HW3], "none"
+    return PhotoViews(images=[photo_HW3])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +52,8 @@ class Query:
     tags: CameraTags
     "Of the camera; of the first photo, where there are several."
     framing: Framing = "none"
+    level: Level | None = None
+    "The gallery's level that shows as much ground, where the photo's is known."
 
     @property
     def taken_at(self) -> str | None:
@@ -59,11 +61,10 @@ class Query:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Views:
-    """A photo's views at the network's size."""
+class _Opened:
+    """A photo's views, at the network's size."""
 
-    images: list[Pixels]
-    framing: Framing
+    views: PhotoViews
     tags: CameraTags
 
 
@@ -85,14 +86,16 @@ def encode_photos(
                     4 * DECODE_THREADS,
                 )
             )
-            images = [image for one in opened if isinstance(one, _Views) for image in one.images]
+            images = [
+                image for one in opened if isinstance(one, _Opened) for image in one.views.images
+            ]
             rows_BD = np.concatenate(
                 [encoder.forward(images[at : at + READ_BATCH])
                  for at in range(0, max(len(images), 1), READ_BATCH)]
             )  # fmt: skip
             first = 0
             for name, one in zip(names, opened, strict=True):
-                count = len(one.images) if isinstance(one, _Views) else 0
+                count = len(one.views.images) if isinstance(one, _Opened) else 0
                 queries.append(_query(name, one, rows_BD[first : first + count]))
                 first += count
             meter.advance(len(names))
@@ -101,23 +104,24 @@ def encode_photos(
 
 def _open_views(
     name: str, data: bytes | Rejection, encoder: PhotoEncoder, make_views: ViewMaker
-) -> _Views | Rejection:
+) -> _Opened | Rejection:
     if isinstance(data, Rejection):
         return data
     try:
         tags = read_photo_tags(data)
-        views, framing = make_views(decode_photo(data), tags)
+        views = make_views(decode_photo(data), tags)
     except DecodeError as error:
         return _by_name(Rejection(path=name, reason=error.reason, found=error.found))
-    return _Views(images=[encoder.to_input(view) for view in views], framing=framing, tags=tags)
+    resized = [encoder.to_input(view) for view in views.images]
+    return _Opened(views=replace(views, images=resized), tags=tags)
 
 
-def _query(name: str, one: _Views | Rejection, rows_VD: Floats) -> Query:
+def _query(name: str, one: _Opened | Rejection, rows_VD: Floats) -> Query:
     if isinstance(one, Rejection):
         return Query(name=name, photos=(name,), views_VD=None, rejected=(one,), tags=CameraTags())
     return Query(
         name=name, photos=(name,), views_VD=rows_VD, rejected=(), tags=one.tags,
-        framing=one.framing,
+        framing=one.views.framing, level=one.views.level,
     )  # fmt: skip
 
 

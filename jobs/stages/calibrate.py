@@ -69,6 +69,7 @@ def calibrate_index(settings: CalibrateSettings) -> Calibration:
         fingerprint=encoder.fingerprint,
         gallery_rows=len(index),
         spacing_m=gallery.spacing_m,
+        finest_side_m=gallery.finest_side_m,
         photo_selection=selection,
     )
     if settings.flight:
@@ -77,7 +78,9 @@ def calibrate_index(settings: CalibrateSettings) -> Calibration:
         trained_on = frozenset(loads(data, settings.checkpoint).locations)
         photos = embed_view(settings, encoder, settings.view, trained_on, settings.photos)
         overhead = embed_view(settings, encoder, settings.gallery_view, trained_on, None)
-        examples = make_examples(photos, overhead, index, gallery.spacing_m, settings.tolerance)
+        examples = make_examples(
+            photos, overhead, index, gallery.spacing_m, settings.tolerance, gallery.finest_side_m
+        )
         calibration = fit_calibration(examples, settings, context)
     write_calibration(out, calibration)
     picture = f"{out.removesuffix('.json')}.svg"

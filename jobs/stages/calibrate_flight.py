@@ -10,6 +10,8 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from jobs.encoding.photo_encoder import PhotoEncoder, decode_photo
 from jobs.encoding.queries import Query, encode_photos, read_photo
 from jobs.stages.matching import AHEAD, match_photo, view_maker
@@ -87,7 +89,6 @@ def search_flight(
     """The candidates of each photo that can be decoded, in each of the WAYS. The location that it
     shows is the nearest gallery image's; a candidate is of elsewhere if no window around it shows
     the photo's ground."""
-    away_m = windows.apart_m()
     truth = {photo.path: photo.truth for photo in photos}
     searched = []
     for way in WAYS:
@@ -98,9 +99,11 @@ def search_flight(
             number: int, hits: Sequence[Hit], decoded: Sequence[tuple[Query, object]] = decoded
         ) -> list[Hit]:
             tag = truth[decoded[number][0].name]
-            return hits_outside_radius(hits, tag.lat, tag.lon, away_m)
+            away_K = np.array([windows.apart_m(hit.side_m) for hit in hits])
+            return hits_outside_radius(hits, tag.lat, tag.lon, away_K)
 
-        found = search_near_and_away(index, [views_VD for _, views_VD in decoded], others)
+        views, levels = [one for _, one in decoded], [query.level for query, _ in decoded]
+        found = search_near_and_away(index, views, others, levels)
         for (query, _), (hits, away) in zip(decoded, found, strict=True):
             tag = truth[query.name]
             example = CalibrationExample(

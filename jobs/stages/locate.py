@@ -112,15 +112,17 @@ def answer_queries(
     settings: LocateSettings,
 ) -> list[Answer]:
     """One answer per query; with --track given the whole flight."""
-    views = [query.views_VD for query in queries if query.views_VD is not None]
+    decoded = [(one.views_VD, one.level) for one in queries if one.views_VD is not None]
+    views, levels = [views_VD for views_VD, _ in decoded], [level for _, level in decoded]
     near = settings.near
     if not settings.track or calibration is None:
         # Matching tries more candidates than are listed.
         k, where = max(settings.top, CONSENSUS_CANDIDATES), Filter(near=near) if near else None
-        hits = search_views(index, views, k, where)
-        return _framed(queries, answers_from_hits(hits, k, calibration, gallery.spacing_m))
+        hits = search_views(index, views, k, where, levels)
+        found = answers_from_hits(hits, k, calibration, gallery.spacing_m, gallery.finest_side_m)
+        return _framed(queries, found)
     k = max(settings.top, TRACK_CANDIDATES)
-    hits = search_views(index, views, k)
+    hits = search_views(index, views, k, None, levels)
     single = _framed(queries, answers_from_hits(hits, k, calibration))
     start = TrackStart(lat=near.lat, lon=near.lon, radius_m=near.radius_m) if near else None
     motion = motion_for_gallery(gallery, settings.max_speed, settings.elsewhere)

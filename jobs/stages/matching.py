@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from jobs.encoding.photo_encoder import decode_photo
 from jobs.encoding.queries import Query, ViewMaker, read_photo
-from pipeline.camera.framing import Framing, nearest_side, views_of_photo
+from pipeline.camera.framing import PhotoViews, views_of_photo
 from pipeline.core import storage
 from pipeline.core.arrays import Pixels
 from pipeline.core.prefetch import prefetch_map
@@ -67,10 +67,9 @@ def view_maker(windows: MapWindows, pose: PoseSettings) -> ViewMaker:
     """Frames photos as the tiles of a map, as far as tags and flags tell the camera."""
     sides_m = windows.tile_sides_m()
 
-    def make_views(photo_HW3: Pixels, tags: CameraTags) -> tuple[list[Pixels], Framing]:
-        size = (photo_HW3.shape[1], photo_HW3.shape[0])
-        known = pose_of_photo(tags, size, pose)
-        return views_of_photo(photo_HW3, known, nearest_side(known, size, sides_m))
+    def make_views(photo_HW3: Pixels, tags: CameraTags) -> PhotoViews:
+        known = pose_of_photo(tags, (photo_HW3.shape[1], photo_HW3.shape[0]), pose)
+        return views_of_photo(photo_HW3, known, sides_m)
 
     return make_views
 

@@ -5,7 +5,8 @@ pose lays the photo on the ground; a heading alone turns it; without either it s
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -18,6 +19,8 @@ from pipeline.core.arrays import Doubles, Pixels
 Framing = Literal["ground", "scale", "north", "none"]
 """How a photo was framed: laid on the ground north up; likewise, as it was turned, without a
 heading; only turned north up; or not at all."""
+LEVEL_RATIO = 1.1
+"Of the sides of two tiles' ground: up to it they are of one level."
 FRAME_PX = 384
 "Side of a framed photo: encoders take 256 to 384 pixels."
 SCALES = (1.0, 0.7, 0.5)
@@ -25,15 +28,47 @@ SCALES = (1.0, 0.7, 0.5)
 four tiles' widths (docs/decisions.md, answers)."""
 
 
-def views_of_photo(
-    photo_HW3: Pixels, pose: PartialPose, side_m: float | None
-) -> tuple[list[Pixels], Framing]:
-    """The views of a photo by which a gallery of tiles of `side_m` metres is searched, and how they
-    were framed: one where the scale is known, else one for each of SCALES."""
+Level = tuple[float, float]
+"Least and greatest side of the ground that a level's tiles show, metres."
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotoViews:
+    """The views of a photo by which a gallery is searched."""
+
+    images: list[Pixels]
+    framing: Framing = "none"
+    level: Level | None = None
+    """The gallery's level whose tiles show as much ground as they do; None where theirs is not
+    known, or all tiles are of one level."""
+
+
+def views_of_photo(photo_HW3: Pixels, pose: PartialPose, sides_m: Sequence[float]) -> PhotoViews:
+    """The views of a photo by which a gallery whose levels have tiles of these sides, metres,
+    rising, is searched: one where the scale is known, else one for each of SCALES."""
+    size = (photo_HW3.shape[1], photo_HW3.shape[0])
+    side_m = nearest_side(pose, size, sides_m)
     framed_HW3, how = frame_photo(photo_HW3, pose, side_m)
-    if how in ("ground", "scale"):
-        return [framed_HW3], how
-    return [_middle(framed_HW3, share) for share in SCALES], how
+    if side_m is None or how not in ("ground", "scale"):
+        return PhotoViews(images=[_middle(framed_HW3, share) for share in SCALES], framing=how)
+    level = level_range(side_m, sides_m) if len(sides_m) > 1 else None
+    return PhotoViews(images=[framed_HW3], framing=how, level=level)
+
+
+def tile_levels(sides_N: Doubles) -> list[float]:
+    """The levels of tiles by the sides of their ground, in metres, rising: the medians of runs in
+    which each is at most LEVEL_RATIO times the one before. NaN is no side."""
+    rising_N = np.sort(sides_N[~np.isnan(sides_N)])
+    begin = np.flatnonzero(rising_N[1:] > LEVEL_RATIO * rising_N[:-1]) + 1
+    return [float(np.median(run)) for run in np.split(rising_N, begin) if len(run)]
+
+
+def level_range(side_m: float, levels: Sequence[float]) -> Level:
+    """Least and greatest side, in metres, of the tiles whose nearest level, as a ratio, is that of
+    `side_m`; `levels`: rising, at least one."""
+    at = int(np.argmin(np.abs(np.log(np.asarray(levels) / side_m))))
+    edges = [0.0, *(float(np.sqrt(a * b)) for a, b in pairwise(levels)), float("inf")]
+    return edges[at], edges[at + 1]
 
 
 def nearest_side(

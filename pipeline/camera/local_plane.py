@@ -6,6 +6,7 @@ Accurate to centimetres over some kilometres (tests compare it with pyproj).
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from pipeline.core.arrays import Doubles
 
@@ -42,3 +43,14 @@ class LocalPlane:
         east_N, north_N = (metres_N2 / self.metres_per_degree[::-1]).T
         lon_N = (self.lon + east_N + 180) % 360 - 180
         return np.stack([self.lat + north_N, lon_N], axis=1)
+
+
+def tile_side_m(footprint: npt.ArrayLike) -> float:
+    """Side of the ground that a tile shows, metres: of a square of the same area. `footprint`: its
+    corners (4, 2), latitude and longitude, from the image's upper left clockwise.
+    """
+    corners_42 = np.asarray(footprint, np.float64)
+    plane = LocalPlane(lat=float(corners_42[0, 0]), lon=float(corners_42[0, 1]))
+    ground_42 = plane.to_metres(corners_42)
+    across, down = (np.linalg.norm(ground_42[at] - ground_42[0]) for at in (1, 3))
+    return float(np.sqrt(across * down))

@@ -48,15 +48,6 @@ class Tile:
     footprint: Footprint
 
 
-def tile_side_m(footprint: Footprint) -> float:
-    """Side of the ground that a tile shows, metres: of a square of the same area."""
-    corners_42 = np.asarray(footprint, np.float64)
-    plane = LocalPlane(lat=float(corners_42[0, 0]), lon=float(corners_42[0, 1]))
-    ground_42 = plane.to_metres(corners_42)
-    across, down = (np.linalg.norm(ground_42[at] - ground_42[0]) for at in (1, 3))
-    return float(np.sqrt(across * down))
-
-
 def compose_window(
     plane: LocalPlane, tiles: Iterable[Tile], half_m: float, metres_per_pixel: float
 ) -> MapWindow:

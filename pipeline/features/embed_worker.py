@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.batches.ordered import Decoded, decode_sample, stack
+from pipeline.camera.local_plane import tile_side_m
 from pipeline.core import storage
 from pipeline.core.arrays import Floats, Halves, Pixels
 from pipeline.core.errors import InputError
@@ -215,6 +216,9 @@ class ShardEmbedder:
             splits=[sample.metadata["split"] for sample in samples],
             lats=[tag.get("lat") for tag in tags],
             lons=[tag.get("lon") for tag in tags],
+            sides_m=[
+                tile_side_m(tag["footprint"]) if tag.get("footprint") else None for tag in tags
+            ],
             embeddings_BD=embeddings_ND,
         )
         footer = PartFooter(

@@ -72,6 +72,8 @@ class PartRows:
     splits: Sequence[str]
     lats: Sequence[float | None]
     lons: Sequence[float | None]
+    sides_m: Sequence[float | None] | None = None
+    "Sides of the ground shown, metres; None: no row's is known."
     embeddings_BD: Floats | Halves
 
 
@@ -99,6 +101,7 @@ def part_schema(dimension: int, dtype: str = "float32") -> pa.Schema:
             pa.field("split", names, nullable=False),
             pa.field("lat", pa.float64()),
             pa.field("lon", pa.float64()),
+            pa.field("side_m", pa.float64()),  # not in parts of before there were levels
             pa.field("embedding", pa.list_(number, dimension), nullable=False),
         ]
     )
@@ -119,6 +122,7 @@ def write_part(path: str, rows: PartRows, footer: PartFooter, dtype: str = "floa
         splits,
         pa.array(rows.lats, pa.float64()),
         pa.array(rows.lons, pa.float64()),
+        pa.array(rows.sides_m or [None] * len(rows.keys), pa.float64()),
         pa.FixedSizeListArray.from_arrays(flat, type=schema.field("embedding").type),
     ]
     table = pa.Table.from_arrays(columns, schema=schema.with_metadata(footer.metadata()))
@@ -197,10 +201,10 @@ def part_header(parquet: pq.ParquetFile, path: str) -> PartHeader:
     schema = parquet.schema_arrow
     footer = _read_footer(schema.metadata or {}, parquet.metadata.num_rows, path)
     expected = {field.name: field.type for field in part_schema(1)}
-    wrong = [name for name in expected if name not in schema.names] or [
+    wrong = [name for name in expected if name not in (*schema.names, "side_m")] or [
         name
-        for name in ("key", "location", "lat", "lon")
-        if schema.field(name).type != expected[name]
+        for name in ("key", "location", "lat", "lon", "side_m")
+        if name in schema.names and schema.field(name).type != expected[name]
     ]
     if wrong:
         raise InputError(

@@ -22,6 +22,7 @@ from pipeline.core.arrays import Doubles, Floats, Halves, Strings
 from pipeline.core.errors import InputError
 from pipeline.core.filters import Filter
 from pipeline.core.geo import Box
+from pipeline.core.parquet import select_or_null
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import Split, View
 from pipeline.features.encoding import EncodingConfig
@@ -35,6 +36,7 @@ from pipeline.features.part import (
     parse_split_and_view,
     part_header,
     part_names,
+    part_schema,
     validate_rows,
     vector_lengths,
     verify_part,
@@ -167,6 +169,7 @@ class FeatureTable:
         for part in self.parts:
             with open_part(storage.join(self.path, part)) as parquet:
                 rows = validate_rows(parquet.read(columns=wanted))
+            rows = select_or_null(rows, wanted, part_schema(1))
             rows = rows.append_column("part_row", pa.array(np.arange(len(rows), dtype=np.int32)))
             rows = self._apply_filters(rows)
             if len(rows):

@@ -18,7 +18,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.filters import Filter
 from pipeline.index.metadata import REBUILD_HINT
 
-ID_COLUMNS = ("key", "location", "view", "lat", "lon")
+ID_COLUMNS = ("key", "location", "view", "lat", "lon", "side_m")
 IDS_SCHEMA = pa.schema(
     [
         ("row", pa.int64()),
@@ -30,6 +30,7 @@ IDS_SCHEMA = pa.schema(
         # Number of the feature table's part among those that this part of the index holds.
         ("table_part", pa.int32()),
         ("part_row", pa.int32()),  # number of the row within that part
+        ("side_m", pa.float64()),  # of the ground shown; not in indexes of before there were levels
     ]
 )
 BATCH_ROWS = 65_536
@@ -81,6 +82,7 @@ class RowIds:
         try:
             with pa.memory_map(path) as source:
                 reader = pa.ipc.open_file(source)
+                self._names = reader.schema.names
                 self._batches = [reader.get_batch(i) for i in range(reader.num_record_batches)]
         except (pa.ArrowException, OSError) as error:
             raise InputError(f"{path} is damaged ({error}); {REBUILD_HINT}") from None
@@ -95,20 +97,29 @@ class RowIds:
         sorted_R = row_R[order_R]
         bounds = np.searchsorted(sorted_R, self._begin)
         names = list(columns)
+        there = [name for name in names if name in self._names]
         pieces = [
-            batch.select(names).take(pa.array(sorted_R[first:last] - begin))
+            batch.select(there).take(pa.array(sorted_R[first:last] - begin))
             for batch, begin, first, last in zip(
                 self._batches, self._begin, bounds, bounds[1:], strict=False
             )
             if last > first
         ]
-        schema = pa.schema([IDS_SCHEMA.field(name) for name in names])
+        schema = pa.schema([IDS_SCHEMA.field(name) for name in there])
         back_R = np.empty(len(row_R), np.int64)
         back_R[order_R] = np.arange(len(row_R))
-        return pa.Table.from_batches(pieces, schema).take(pa.array(back_R))
+        taken = pa.Table.from_batches(pieces, schema).take(pa.array(back_R))
+        return parquet_files.select_or_null(taken, names, IDS_SCHEMA)
+
+    def _filterable(self, batch: pa.RecordBatch) -> pa.Table:
+        """A batch with all columns by which rows are filtered."""
+        return parquet_files.select_or_null(pa.Table.from_batches([batch]), ID_COLUMNS, IDS_SCHEMA)
 
     def mask(self, where: Filter) -> Mask:
         """Which rows match the filter (N,)."""
         return np.concatenate(
-            [np.empty(0, np.bool_), *(where.mask(batch) for batch in self._batches)]
+            [
+                np.empty(0, np.bool_),
+                *(where.mask(self._filterable(batch)) for batch in self._batches),
+            ]
         )

@@ -44,6 +44,8 @@ class Hit:
     "Degrees east."
     score: float
     "Cosine similarity, -1 to 1; computed from compressed vectors where the index has only these."
+    side_m: float | None = None
+    "Side of the ground that it shows, metres; null where its corners are not known."
 
 
 class Searchable(Protocol):

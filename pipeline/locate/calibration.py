@@ -72,6 +72,8 @@ class Calibration:
     "Which photos it was fitted on, in words."
     spacing_m: float | None
     "Median distance of a gallery position to the next one; None where no two are known."
+    finest_side_m: float | None = None
+    "Side of the gallery's finest level, to which spacing and agreement radius belong."
     agreement_radius_m: float
     "How far apart agreeing candidates may lie, chosen by the photos of the calibration."
     tolerance_m: float

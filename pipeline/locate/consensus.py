@@ -38,6 +38,8 @@ class Consensus:
     lon: float | None
     spread_m: float
     "Weighted root mean square distance of the members from the group's position."
+    scale: float
+    "Of the finest member with a known position: its side over that of the gallery's finest level."
     best_other_score: float
     "The best score of a candidate outside the group; where there is none, the last score."
 
@@ -56,33 +58,44 @@ def support_weights(scores_K: Doubles) -> Doubles:
     return np.asarray(((scores_K - level) / (best - level)) ** 2)
 
 
-def agreement(locations_K: Sequence[str], positions_K2: Doubles, radius_m: float) -> Mask:
-    """Which pairs of candidates agree (K, K): those of one location, and those at most `radius_m`
-    metres apart."""
+def agreement(locations_K: Sequence[str], positions_K2: Doubles, radius_K: Doubles) -> Mask:
+    """Which pairs of candidates agree (K, K): those of one location, and those that are at most the
+    larger of their radii apart, metres."""
     names_K = np.asarray(locations_K, dtype=np.str_)
-    near_KK = haversine_m(positions_K2[:, None], positions_K2[None]) <= radius_m  # NaN gives False
+    radius_KK = np.maximum(radius_K[:, None], radius_K[None])
+    near_KK = haversine_m(positions_K2[:, None], positions_K2[None]) <= radius_KK  # NaN: False
     return np.asarray((names_K[:, None] == names_K[None]) | near_KK)
 
 
 def find_consensus(
-    scores_K: Doubles, locations_K: Sequence[str], positions_K2: Doubles, agreement_radius_m: float
+    scores_K: Doubles,
+    locations_K: Sequence[str],
+    positions_K2: Doubles,
+    agreement_radius_m: float,
+    scale_K: Doubles | None = None,
 ) -> Consensus:
     """The candidate with the highest sum of weights around it, and all that agree with it; K >= 1,
     best first.
+
+    `scale_K`: how many times the side of the gallery's finest level a candidate's ground has; by
+    default all are of one level. A coarse candidate agrees with finer ones on its ground, and its
+    own middle says less of where the photo is.
 
     The position is the group's weighted geometric median: it stays at the best candidate until the
     others together outweigh it, so that one unlike neighbour moves nothing, while a ring of
     overlapping images draws it to their middle.
     """
     weight_K = support_weights(scores_K)
-    agree_KK = agreement(locations_K, positions_K2, agreement_radius_m)
+    if scale_K is None:
+        scale_K = np.ones_like(scores_K)
+    agree_KK = agreement(locations_K, positions_K2, agreement_radius_m * scale_K)
     members_K = agree_KK[int(np.argmax(agree_KK @ weight_K))]
     others_K = scores_K[~members_K]
     known_K = members_K & ~np.isnan(positions_K2).any(axis=1)
     lat = lon = None
     spread_m = 0.0
     if known_K.any():
-        weight_N = np.maximum(weight_K[known_K], MIN_WEIGHT)
+        weight_N = np.maximum(weight_K[known_K], MIN_WEIGHT) / scale_K[known_K]
         lat, lon = geometric_median(positions_K2[known_K], weight_N)
         distance_N = haversine_m(positions_K2[known_K], np.array([lat, lon]))
         spread_m = float(np.sqrt(np.average(distance_N**2, weights=weight_N)))
@@ -92,6 +105,7 @@ def find_consensus(
         lat=lat,
         lon=lon,
         spread_m=spread_m,
+        scale=float(scale_K[known_K if known_K.any() else members_K].min()),
         best_other_score=float(others_K.max() if len(others_K) else scores_K.min()),
     )
 

@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.confidence.logistic import choice_log_probabilities
 from pipeline.locate.calibration import Calibration
 from pipeline.locate.gallery_map import GalleryMap
-from pipeline.locate.locate import Answer, Position, coordinates, relative_scores
+from pipeline.locate.locate import Answer, Position, coordinates, level_scales, relative_scores
 from pipeline.locate.track import Motion, SmoothedPhoto, TrackPhoto, TrackStart, smooth_track
 
 TRACK_THRESHOLD = 0.5
@@ -87,7 +87,8 @@ def _apply_smoothed(answer: Answer, smoothed: SmoothedPhoto, calibration: Calibr
     lat, lon = hits[chosen].lat, hits[chosen].lon
     position = None
     if lat is not None and lon is not None:
-        radius_m = (calibration.spacing_m or 0.0) / 2
+        [scale] = level_scales(hits[chosen : chosen + 1], calibration.finest_side_m).tolist()
+        radius_m = scale * (calibration.spacing_m or 0.0) / 2
         position = Position(lat=lat, lon=lon, radius_m=radius_m, how="track")
     return replace(
         answer,

@@ -7,12 +7,12 @@ Shapes: Q photos, D dimensions, K candidates.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from pipeline.camera.framing import Framing
+from pipeline.camera.framing import Framing, Level
 from pipeline.camera.uncertainty import Ellipse
 from pipeline.core.arrays import Doubles, Floats
 from pipeline.core.filters import Filter
@@ -94,6 +94,7 @@ def locate_embeddings(
     where: Filter | None = None,
     calibration: Calibration | None = None,
     spacing_m: float | None = None,
+    finest_side_m: float | None = None,
 ) -> list[Answer]:
     """One answer per embedding (Q, D), each with its `k` best candidates.
 
@@ -102,7 +103,7 @@ def locate_embeddings(
     agree where they have one location. Raises InputError where the embeddings do not fit the index.
     """
     hits = index.search(embeddings_QD, max(k, CONSENSUS_CANDIDATES), where)
-    return answers_from_hits(hits, k, calibration, spacing_m)
+    return answers_from_hits(hits, k, calibration, spacing_m, finest_side_m)
 
 
 def merge_views(hits_of_views: Sequence[Sequence[Hit]]) -> list[Hit]:
@@ -118,18 +119,29 @@ def merge_views(hits_of_views: Sequence[Sequence[Hit]]) -> list[Hit]:
 
 
 def search_views(
-    index: Searchable, views_of_photos: Sequence[Floats], k: int, where: Filter | None = None
+    index: Searchable,
+    views_of_photos: Sequence[Floats],
+    k: int,
+    where: Filter | None = None,
+    levels: Sequence[Level | None] | None = None,
 ) -> list[list[Hit]]:
-    """The `k` best candidates of each photo by its views (V, D), all in one search.
+    """The `k` best candidates of each photo by its views (V, D), in one search for each level.
 
-    Raises InputError where the embeddings do not fit the index.
+    `levels`: per photo the level that it was framed for, whose images alone are searched; None:
+    all. Raises InputError where the embeddings do not fit the index.
     """
-    if not views_of_photos:
-        return []
-    found = index.search(np.concatenate(views_of_photos), k, where)
-    ends = np.cumsum([len(views) for views in views_of_photos]).tolist()
-    starts = [0, *ends[:-1]]
-    return [merge_views(found[start:end]) for start, end in zip(starts, ends, strict=True)]
+    hits: dict[int, list[Hit]] = {}
+    of_level: dict[Level | None, list[int]] = {}
+    for at, level in enumerate(levels or [None] * len(views_of_photos)):
+        of_level.setdefault(level, []).append(at)
+    for level, group in of_level.items():
+        own = where if level is None else replace(where or Filter(), sides_m=level)
+        views = [views_of_photos[at] for at in group]
+        found = index.search(np.concatenate(views), k, own)
+        ends = np.cumsum([len(one) for one in views]).tolist()
+        for at, start, end in zip(group, [0, *ends[:-1]], ends, strict=True):
+            hits[at] = merge_views(found[start:end])
+    return [hits[at] for at in range(len(views_of_photos))]
 
 
 def answers_from_hits(
@@ -137,12 +149,20 @@ def answers_from_hits(
     k: int,
     calibration: Calibration | None = None,
     spacing_m: float | None = None,
+    finest_side_m: float | None = None,
 ) -> list[Answer]:
-    """One answer per photo from its candidates, best first; `k` of them are listed in it."""
-    spacing = (calibration.spacing_m if calibration else spacing_m) or 0.0
-    radius_m = calibration.agreement_radius_m if calibration else UNCALIBRATED_SPACINGS * spacing
+    """One answer per photo from its candidates, best first; `k` of them are listed in it.
+
+    `spacing_m`, `finest_side_m`: the gallery's, where there is no calibration.
+    """
+    radius_m = UNCALIBRATED_SPACINGS * (spacing_m or 0.0)
+    if calibration:
+        spacing_m, finest_side_m = calibration.spacing_m, calibration.finest_side_m
+        radius_m = calibration.agreement_radius_m
     return [
-        _answer(hits, consensus_of(hits, radius_m), k, calibration, spacing) if hits else NO_ANSWER
+        _answer(hits, consensus_of(hits, radius_m, finest_side_m), k, calibration, spacing_m or 0.0)
+        if hits
+        else NO_ANSWER
         for hits in hits_of_photos
     ]
 
@@ -160,7 +180,7 @@ def _answer(
         probability = calibration.probability(consensus, consensus_scores(hits))
         threshold = calibration.threshold
     if consensus.lat is not None and consensus.lon is not None:
-        radius_m = math.hypot(consensus.spread_m, spacing / 2)
+        radius_m = math.hypot(consensus.spread_m, consensus.scale * spacing / 2)
         position = Position(lat=consensus.lat, lon=consensus.lon, radius_m=radius_m)
     return Answer(
         position=position,
@@ -173,11 +193,24 @@ def _answer(
     )
 
 
-def consensus_of(hits: Sequence[Hit], agreement_radius_m: float) -> Consensus:
-    """The consensus of the best CONSENSUS_CANDIDATES hits."""
+def consensus_of(
+    hits: Sequence[Hit], agreement_radius_m: float, finest_side_m: float | None = None
+) -> Consensus:
+    """The consensus of the best CONSENSUS_CANDIDATES hits. `finest_side_m`: side of the gallery's
+    finest level, to which the radius belongs; None where its levels are not known."""
     hits = hits[:CONSENSUS_CANDIDATES]
     locations = [hit.location for hit in hits]
-    return find_consensus(consensus_scores(hits), locations, coordinates(hits), agreement_radius_m)
+    scale_K = level_scales(hits, finest_side_m)
+    scores_K = consensus_scores(hits)
+    return find_consensus(scores_K, locations, coordinates(hits), agreement_radius_m, scale_K)
+
+
+def level_scales(hits: Sequence[Hit], finest_side_m: float | None) -> Doubles:
+    """How many times the side of the finest level the ground of each hit has (K,); 1 where unknown,
+    and for the finest."""
+    sides = [(hit.side_m or finest_side_m) if finest_side_m else None for hit in hits]
+    scales = [side / finest_side_m if side and finest_side_m else 1.0 for side in sides]
+    return np.maximum(np.array(scales, np.float64), 1.0)
 
 
 def consensus_scores(hits: Sequence[Hit]) -> Doubles:

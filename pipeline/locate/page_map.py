@@ -109,7 +109,9 @@ def nearby_keys(answer: Answer, gallery: GalleryMap) -> list[str]:
         return []
     return [
         str(gallery.keys[number])
-        for number in gallery.nearest(answer.position.lat, answer.position.lon, MAX_TILES)
+        for number in gallery.nearest(
+            answer.position.lat, answer.position.lon, MAX_TILES, gallery.finest_side_m
+        )
     ]
 
 
@@ -125,7 +127,8 @@ def position_map(
     half_m = max(MAP_HALF_SPACINGS * spacing, 1.3 * position.radius_m, _reach_m(answer))
     frame = MapFrame(lat=position.lat, lon=position.lon, half_m=half_m)
     tiles = []
-    for number in gallery.nearest(position.lat, position.lon, MAX_TILES).tolist():
+    nearest = gallery.nearest(position.lat, position.lon, MAX_TILES, gallery.finest_side_m)
+    for number in nearest.tolist():
         key, (lat, lon) = str(gallery.keys[number]), gallery.positions_N2[number].tolist()
         footprint = footprints.get(key) or square_footprint(lat, lon, 0.96 * spacing)
         corners_32 = frame.pixels(np.array(footprint)[[0, 1, 3]])

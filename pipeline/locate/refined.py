@@ -79,7 +79,9 @@ def with_refinement(
         )
     if calibration is None or matching is None or not answer.candidates or of_flight:
         return answer
-    consensus = consensus_of(answer.candidates, calibration.agreement_radius_m)
+    consensus = consensus_of(
+        answer.candidates, calibration.agreement_radius_m, calibration.finest_side_m
+    )
     x_1F = confidence_features(consensus, consensus_scores(answer.candidates))[None]
     probability = float(matching.tile_model.probabilities(x_1F)[0])
     return replace(answer, probability=probability, known=probability >= matching.tile_threshold)

@@ -7,12 +7,14 @@ features. Windows lie on a grid of half their own size, so that neighbouring pho
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
-from pipeline.camera.local_plane import LocalPlane
-from pipeline.camera.map_window import MapWindow, Tile, compose_window, tile_side_m
+from pipeline.camera.framing import tile_levels
+from pipeline.camera.local_plane import LocalPlane, tile_side_m
+from pipeline.camera.map_window import MapWindow, Tile, compose_window
 from pipeline.core.arrays import Doubles, Ints, Pixels, Strings
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.thumbnails import ImageLoader
@@ -30,8 +32,12 @@ class TilePositions(Protocol):
     def positions_N2(self) -> Doubles:
         """Latitudes and longitudes (N, 2), NaN where unknown."""
 
-    def nearest(self, lat: float, lon: float, count: int) -> Ints:
-        """Numbers of the tiles nearest to a position, nearest first."""
+    @property
+    def level_sides_m(self) -> list[float]:
+        """The sides of the tiles of its levels, metres, rising; empty where they are not known."""
+
+    def nearest(self, lat: float, lon: float, count: int, side_m: float | None = None) -> Ints:
+        """Numbers of the tiles nearest to a position, nearest first; of the level of this side."""
 
 
 Footprints = Callable[[Iterable[str]], Mapping[str, list[list[float]]]]
@@ -78,22 +84,24 @@ class MapWindows:
                 yield window
 
     def tile_sides_m(self) -> list[float]:
-        """The sides of the gallery's tiles, rising; such as differ by less than a tenth are one."""
+        """The sides of the gallery's levels, metres, rising."""
+        return self._sides_m
+
+    @cached_property
+    def _sides_m(self) -> list[float]:
+        if self._gallery.level_sides_m:
+            return self._gallery.level_sides_m
         count = len(self._gallery.keys)
         numbers = np.unique(np.linspace(0, count - 1, min(count, SIDES_SAMPLE)).astype(int))
         shown = self._footprints([str(key) for key in self._gallery.keys[numbers]])
-        sides = sorted(tile_side_m(footprint) for footprint in shown.values())
-        kept: list[float] = []
-        for side in sides:
-            if not kept or side > 1.1 * kept[-1]:
-                kept.append(side)
-        return kept
+        return tile_levels(np.array([tile_side_m(footprint) for footprint in shown.values()]))
 
-    def apart_m(self) -> float:
-        """How far apart two places are at least, if no window around the one shows the ground that
-        a photo of the other does: a window's half side, its grid's step, and half a photo of some
-        tiles."""
-        return 2 * _on_the_grid(TILES_ACROSS / 2 * max(self.tile_sides_m(), default=0.0))
+    def apart_m(self, tile_m: float | None) -> float:
+        """How far apart two places are at least, if no window around a tile at the one shows the
+        ground that a photo of the other does: a window's half side, its grid's step, and half a
+        photo of some tiles. `tile_m`: the tile's side; None where it is not known."""
+        side_m = max(self.tile_sides_m(), default=0.0) if tile_m is None else tile_m
+        return 2 * _on_the_grid(TILES_ACROSS / 2 * side_m)
 
     def _half_side(self, key: str, reach_m: float) -> float | None:
         """Half the side of the window for a tile, metres, in steps of a quarter more; None where
@@ -126,16 +134,17 @@ class MapWindows:
     def _make(self, place: Place) -> MatchableWindow | None:
         half_m, row, column = place
         lat, lon = row * self._step_lat(half_m), column * self._step_lon(half_m, row)
-        window = self.compose(lat, lon, half_m, 2 * half_m / TILES_ACROSS, MOST_SIDE_PX)
+        window = self.compose(lat, lon, half_m, MOST_SIDE_PX)
         return None if window is None else prepare_window(window)
 
-    def compose(
-        self, lat: float, lon: float, half_m: float, tile_m: float, most_px: int
-    ) -> MapWindow | None:
-        """The map within `half_m` metres of a position, of tiles up to `tile_m` wide; at most
-        `most_px` pixels wide. None where no tile shows it."""
+    def compose(self, lat: float, lon: float, half_m: float, most_px: int) -> MapWindow | None:
+        """The map within `half_m` metres of a position, of the tiles of one level: the one of which
+        TILES_ACROSS come nearest to filling it; at most `most_px` pixels wide. None where no tile
+        shows it."""
         plane = LocalPlane(lat=lat, lon=lon)
-        keys = self._keys_within(plane, half_m + tile_m)
+        wanted_m = 2 * half_m / TILES_ACROSS
+        side_m = min(self._sides_m, key=lambda side: abs(math.log(side / wanted_m)), default=None)
+        keys = self._keys_within(plane, half_m, side_m)
         footprints = self._footprints(keys)
         images = self._fetch(footprints)
         decoded = {key: decode_or_none(data) for key, data in images.items()}
@@ -151,9 +160,10 @@ class MapWindows:
         resolution_m = max(_resolution_m(tiles[0]), 2 * half_m / most_px)
         return compose_window(plane, tiles, half_m, resolution_m)
 
-    def _keys_within(self, plane: LocalPlane, reach_m: float) -> list[str]:
-        """Tiles whose middle lies within a square of twice this side, nearest first."""
-        numbers = self._gallery.nearest(plane.lat, plane.lon, MOST_TILES)
+    def _keys_within(self, plane: LocalPlane, half_m: float, side_m: float | None) -> list[str]:
+        """Tiles of a level that a window may show, nearest first."""
+        reach_m = half_m + (side_m or 0.0)
+        numbers = self._gallery.nearest(plane.lat, plane.lon, MOST_TILES, side_m)
         away_N = np.abs(plane.to_metres(self._gallery.positions_N2[numbers])).max(axis=1)
         return [str(key) for key in self._gallery.keys[numbers[away_N < reach_m]]]
 

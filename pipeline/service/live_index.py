@@ -40,6 +40,8 @@ class OpenedIndex:
     "None where the index was not calibrated."
     spacing_m: float | None
     "The gallery's spacing, which sets the agreement radius without a calibration; else None."
+    finest_side_m: float | None
+    "Side of the tiles of the gallery's finest level, to which the spacing belongs."
     photo_map: PhotoMap | None
     "The gallery's pixels; None where they are not at hand."
 
@@ -57,6 +59,7 @@ def open_verified(path: str, open_map: MapOpener = no_map) -> OpenedIndex:
         index=index,
         calibration=calibration,
         spacing_m=None if calibration else gallery.spacing_m,
+        finest_side_m=gallery.finest_side_m,
         photo_map=open_map(gallery),
     )
 

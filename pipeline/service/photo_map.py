@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from PIL import Image
 
-from pipeline.camera.framing import Framing, nearest_side, views_of_photo
+from pipeline.camera.framing import PhotoViews, views_of_photo
 from pipeline.core.arrays import Pixels
 from pipeline.images.camera_tags import CameraTags
 from pipeline.images.thumbnails import ImageLoader, thumbnail_bytes, to_webp
@@ -54,9 +54,8 @@ PictureRequest = TilePicture | GroundPicture
 class FramedPhoto:
     """A photo as an index is searched by it, and as it is matched."""
 
-    views: list[Pixels]
+    views: PhotoViews
     "Each is embedded; the best candidates of all are taken."
-    framing: Framing = "none"
     matchable: MatchablePhoto | None = None
     "None where it is not to be matched."
     seconds: float = 0.0
@@ -97,18 +96,17 @@ class PhotoMap:
     def frame(self, photo_HW3: Pixels, tags: CameraTags, known: PoseSettings) -> FramedPhoto:
         """The photo as the tiles are framed, as far as its tags and `known` tell the camera."""
         if not self.matches:
-            return FramedPhoto(views=[photo_HW3])
+            return FramedPhoto(views=PhotoViews(images=[photo_HW3]))
         began = time.perf_counter()
         size = (photo_HW3.shape[1], photo_HW3.shape[0])
         try:
             pose = pose_of_photo(tags, size, known)
-            side_m = nearest_side(pose, size, self._sides_m)
-            views, framing = views_of_photo(photo_HW3, pose, side_m)
+            views = views_of_photo(photo_HW3, pose, self._sides_m)
             matchable = prepare_photo(photo_HW3, pose)
         except Exception as error:  # OpenCV and NumPy each raise their own over absurd poses
-            return FramedPhoto(views=[photo_HW3], error=_sentence(error))
+            return FramedPhoto(views=PhotoViews(images=[photo_HW3]), error=_sentence(error))
         seconds = time.perf_counter() - began
-        return FramedPhoto(views=views, framing=framing, matchable=matchable, seconds=seconds)
+        return FramedPhoto(views=views, matchable=matchable, seconds=seconds)
 
     def refine(
         self, answer: Answer, photo: FramedPhoto, calibration: Calibration | None = None
@@ -134,9 +132,7 @@ class PhotoMap:
             return thumbnail_bytes(images.get(wanted.key), TILE_PX)
         if self._windows is None:
             return None
-        window = self._windows.compose(
-            wanted.lat, wanted.lon, wanted.half_m, max(self._sides_m, default=0.0), GROUND_PX
-        )
+        window = self._windows.compose(wanted.lat, wanted.lon, wanted.half_m, GROUND_PX)
         if window is None:
             return None
         return to_webp(Image.fromarray(np.dstack([window.pixels_HW3, window.shown_HW])))

@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
+from pipeline.camera.framing import PhotoViews
 from pipeline.core.arrays import Floats, Pixels
 from pipeline.core.filters import Filter
 from pipeline.core.geo import Circle
@@ -104,17 +105,20 @@ class Predictor:
             photo_HW3 = decode(request.photo)
         except DecodeError as error:
             return Rejection(path="photo", reason=error.reason, found=error.found)
-        framed = FramedPhoto(views=[photo_HW3])
+        framed = FramedPhoto(views=PhotoViews(images=[photo_HW3]))
         if photo_map is not None:
             framed = photo_map.frame(photo_HW3, read_photo_tags(request.photo), request.pose)
-        return replace(framed, views=[self._encoder.to_input(view) for view in framed.views])
+        resized = [self._encoder.to_input(view) for view in framed.views.images]
+        return replace(framed, views=replace(framed.views, images=resized))
 
     def _answer(
         self, requests: Sequence[LocateRequest], framed: dict[int, FramedPhoto], opened: OpenedIndex
     ) -> dict[int, Answer]:
         """The answers of retrieval, by the numbers of their requests."""
-        rows_BD = self._encoder.forward([view for one in framed.values() for view in one.views])
-        ends = np.cumsum([len(one.views) for one in framed.values()])[:-1]
+        rows_BD = self._encoder.forward(
+            [view for one in framed.values() for view in one.views.images]
+        )
+        ends = np.cumsum([len(one.views.images) for one in framed.values()])[:-1]
         embeddings = dict(zip(framed, np.split(rows_BD, ends), strict=True)) if framed else {}
         searches: dict[tuple[Circle | None, int], list[int]] = {}  # photos that share one search
         for at in framed:
@@ -123,8 +127,11 @@ class Predictor:
         answers: dict[int, Answer] = {}
         for (near, k), group in searches.items():
             where = None if near is None else Filter(near=near)
-            hits = search_views(opened.index, [embeddings[at] for at in group], k, where)
-            found = answers_from_hits(hits, k, opened.calibration, opened.spacing_m)
+            levels = [framed[at].views.level for at in group]
+            hits = search_views(opened.index, [embeddings[at] for at in group], k, where, levels)
+            found = answers_from_hits(
+                hits, k, opened.calibration, opened.spacing_m, opened.finest_side_m
+            )
             answers |= dict(zip(group, found, strict=True))
         return answers
 
@@ -149,7 +156,7 @@ def _refined(
     opened: OpenedIndex, answer: Answer, photo: FramedPhoto, request: LocateRequest
 ) -> Located:
     """The answer as it is sent: matched with the map, and with the candidates asked for."""
-    located = Located(answer=replace(answer, framing=photo.framing))
+    located = Located(answer=replace(answer, framing=photo.views.framing))
     if opened.photo_map is not None:
         located = opened.photo_map.refine(located.answer, photo, opened.calibration)
     listed = located.answer.candidates[: request.top]

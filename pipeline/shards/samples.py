@@ -127,3 +127,14 @@ def _faults(key: str, stated: dict[str, Any]) -> Iterator[str]:
     valid = isinstance(tag, dict) and is_position(tag.get("lat"), tag.get("lon"))
     if tag is not None and not valid:
         yield f"the geotag {excerpt(tag)}, expected null or a latitude and a longitude in degrees"
+    corners = tag.get("footprint") if valid else None
+    if corners is not None and not _is_outline(corners):
+        yield f"the footprint {excerpt(corners)}, expected null or four positions in degrees"
+
+
+def _is_outline(corners: Any) -> bool:
+    return (
+        isinstance(corners, list)
+        and len(corners) == 4
+        and all(isinstance(one, list) and len(one) == 2 and is_position(*one) for one in corners)
+    )

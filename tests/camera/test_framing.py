@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from pipeline.camera.framing import FRAME_PX, SCALES, frame_photo, nearest_side, views_of_photo
+from pipeline.camera.framing import (
+    FRAME_PX,
+    SCALES,
+    frame_photo,
+    level_range,
+    nearest_side,
+    tile_levels,
+    views_of_photo,
+)
 from pipeline.camera.pose import PartialPose
 from pipeline.core.arrays import Pixels
 
@@ -37,10 +45,23 @@ def test_frame_by_the_heading_alone_turns() -> None:
 
 
 def test_views_of_an_unknown_camera_have_several_scales() -> None:
-    views, how = views_of_photo(quarters(), PartialPose(), 100.0)
-    assert how == "none"
-    assert [len(view) for view in views] == [round(200 * share) for share in SCALES]
-    assert len(views_of_photo(quarters(), POSE, 100.0)[0]) == 1
+    views = views_of_photo(quarters(), PartialPose(), [50.0, 100.0])
+    assert (views.framing, views.level) == ("none", None)
+    assert [len(image) for image in views.images] == [round(200 * share) for share in SCALES]
+
+
+def test_views_of_a_known_camera_are_of_the_nearest_level() -> None:
+    views = views_of_photo(quarters(), POSE, [60.0, 90.0, 240.0])
+    assert (len(views.images), views.framing) == (1, "ground")
+    assert views.level == pytest.approx((np.sqrt(60 * 90), np.sqrt(90 * 240)))
+    assert views_of_photo(quarters(), POSE, [100.0]).level is None
+
+
+def test_tile_levels_are_runs_of_like_sides() -> None:
+    sides_N = np.array([240.0, 60.0, np.nan, 61.0, 120.0, 60.5])
+    assert tile_levels(sides_N) == [60.5, 120.0, 240.0]
+    assert tile_levels(np.array([np.nan])) == []
+    assert level_range(1000.0, [60.0]) == (0.0, np.inf)
 
 
 def test_nearest_side_is_the_largest_that_fits_the_photo() -> None:

@@ -33,6 +33,7 @@ def write_table_part(
     dtype: str = "float32",
     locations: Sequence[str] | None = None,
     shard: str | None = None,
+    sides_m: Sequence[float | None] | None = None,
 ) -> None:
     """A part whose i-th row lies i thousandths of a degree north of the equator, at the part's
     number in degrees east.
@@ -42,7 +43,8 @@ def write_table_part(
         keys=[f"{split}-{number}-{n}" for n in range(count)],
         locations=locations or [f"{number}{n:04d}" for n in range(count)],
         views=[view] * count, splits=[split] * count, lats=[n / 1000 for n in range(count)],
-        lons=[float(number) if n % 5 else None for n in range(count)], embeddings_BD=vectors,
+        lons=[float(number) if n % 5 else None for n in range(count)], sides_m=sides_m,
+        embeddings_BD=vectors,
     )  # fmt: skip
     footer = PartFooter(
         fingerprint=fingerprint, shard_sha256=shard or f"shard {number}", rows=count

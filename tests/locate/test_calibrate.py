@@ -261,3 +261,19 @@ def test_examples_leave_out_images_near_the_photo() -> None:
     )
     assert "o1" in {one.location for one in example.inside}
     assert "o1" not in {one.location for one in example.outside}
+
+
+def test_examples_leave_out_coarse_images_further_away() -> None:
+    """With a spacing of 300 m images up to 600 m are the photo's own; of three times the side, up
+    to 1,800 m. Row o1 is 1,200 m off."""
+    rows = Rows(0, 60)
+    rows.hits = [replace(one, side_m=180.0 if one.location == "o1" else 60.0) for one in rows.hits]
+    photo = labelled("photo", [1, 0], 6200)
+
+    def others(finest_side_m: float | None) -> set[str]:
+        (example,) = make_examples(photo, labelled("x", [0, 1]), rows, 300.0, 25.0, finest_side_m)
+        return {one.location for one in example.outside}
+
+    assert "o1" in others(None)
+    assert "o1" not in others(60.0)
+    assert "o2" in others(60.0)

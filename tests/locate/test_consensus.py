@@ -51,6 +51,23 @@ def test_consensus_member_without_position_adds_only_support() -> None:
     assert (found.lat, found.lon) == (5, 6)
 
 
+def test_consensus_over_levels_by_hand() -> None:
+    """A coarse candidate (four times the side, so four times the radius) joins two fine ones on its
+    ground, 70 m apart, which do not agree with each other; a fine one 200 m off stays out. The
+    middle is drawn to the fine ones."""
+    d = 1 / DEGREE_M
+    positions = at((46, 8), (46 + 35 * d, 8), (46 - 35 * d, 8), (46 + 200 * d, 8), (0, 0))
+    scores, names = np.array([0.9, 0.9, 0.9, 0.85, 0.4]), list("abcde")
+    scale = np.array([4.0, 1.0, 1.0, 1.0, 1.0])
+    found = find_consensus(scores, names, positions, 30, scale)
+    assert found.members_K.tolist() == [True, True, True, False, False]
+    assert found.scale == 1
+    alone = find_consensus(scores, names, positions, 30)
+    assert alone.members_K.tolist() == [True, False, False, False, False]
+    pair = find_consensus(scores[:2], names[:2], positions[:2], 30, scale[:2])
+    assert haversine_m(at((pair.lat, pair.lon)), positions[1])[0] < 1e-3
+
+
 def test_consensus_of_one_candidate() -> None:
     found = find_consensus(np.array([0.3]), ["a"], at((1, 2)), 10)
     assert (found.leader, found.lat, found.lon, found.best_other_score) == (0, 1, 2, 0.3)

@@ -42,6 +42,28 @@ def test_gallery_map_spacing_needs_two_positions() -> None:
     assert on_a_grid(1).spacing_m is None
 
 
+def test_gallery_map_spacing_is_that_of_the_finest_level() -> None:
+    """Tiles of twice the side have the same middles, or lie a tenth of a step beside them."""
+    fine = on_a_grid(9).positions_N2
+    coarse = on_a_grid(9).positions_N2[::2] + 1e-4
+    same = on_a_grid(9).positions_N2[::3]
+    both = np.concatenate([fine, coarse, same])
+    sides_N = np.repeat([60.0, 120.0, 240.0], [len(fine), len(coarse), len(same)])
+    names = np.array([f"{number}" for number in range(len(both))])
+    gallery = GalleryMap(
+        keys=names, locations=names, positions_N2=both, sides_N=sides_N, rows=len(both)
+    )
+    assert gallery.level_sides_m == [60.0, 120.0, 240.0]
+    assert gallery.finest_side_m == 60.0
+    assert gallery.spacing_m == pytest.approx(1e-3 * DEGREE_M, rel=1e-4)
+    assert gallery.position_count == pytest.approx(81)
+    coarsest = gallery.nearest(0, 0, 3, 230.0)
+    assert gallery.sides_N is not None
+    assert gallery.sides_N[coarsest].tolist() == [240.0] * 3
+    unlevelled = GalleryMap(keys=names, locations=names, positions_N2=both, rows=len(both))
+    assert unlevelled.spacing_m != pytest.approx(1e-3 * DEGREE_M, rel=0.1)
+
+
 def test_gallery_map_nearest_across_180_degrees() -> None:
     positions = np.array([[0, 179.9], [0, -179.99], [0, 170.0], [np.nan, np.nan]])
     names = np.array(list("abcd"))

@@ -50,6 +50,7 @@ def test_geojson_known_answer_is_a_point() -> None:
             "lat": 46.0,
             "lon": 8.0,
             "score": 0.75,
+            "side_m": None,
         }
     ]
 

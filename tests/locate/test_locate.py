@@ -1,5 +1,6 @@
 """From candidates to answers: positions, radii, unknown answers, calibrations and flights."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -28,6 +29,7 @@ from pipeline.locate.locate import (
     consensus_scores,
     locate_embeddings,
     relative_scores,
+    search_views,
 )
 from pipeline.locate.track import Motion
 from tests.locate.calibrations import make_calibration
@@ -152,6 +154,38 @@ def test_calibration_of_another_encoder_is_refused(tmp_path: Any) -> None:
     write_calibration(str(tmp_path / "calibration.json"), calibration())
     with pytest.raises(InputError, match="encoder ffffffffffff and the index with 000"):
         read_calibration(str(tmp_path / "calibration.json"), "0" * 64)
+
+
+class Levels(Gallery):
+    """An index that records the levels searched."""
+
+    def search(
+        self, queries_QD: Floats, k: int = 10, where: Filter | None = None
+    ) -> list[list[Hit]]:
+        level = where.sides_m if where else None
+        return [[replace(hit(f"{level}", 0.5), score=float(row_D[0]))] for row_D in queries_QD]
+
+
+def test_search_views_asks_each_photo_of_its_level() -> None:
+    fine, coarse = (0.0, 84.0), (84.0, math.inf)
+    views = [np.full((count, 1), at, np.float32) for at, count in enumerate((1, 3, 2))]
+    found = search_views(Levels([]), views, 5, None, [coarse, None, coarse])
+    assert [[one.location for one in hits] for hits in found] == [
+        [f"{coarse}"], ["None"], [f"{coarse}"],
+    ]  # fmt: skip
+    assert [hits[0].score for hits in found] == [0, 1, 2]
+    assert search_views(Levels([]), views, 5, None, [fine] * 3)[1][0].location == f"{fine}"
+    assert search_views(Levels([]), [], 5) == []
+
+
+def test_answer_radius_grows_with_the_level() -> None:
+    coarse = [replace(one, side_m=240.0) for one in HITS]
+    (found,) = answers_from_hits([coarse], 2, spacing_m=30, finest_side_m=60)
+    (flat,) = answers_from_hits([HITS], 2, spacing_m=30)
+    assert found.position is not None
+    assert flat.position is not None
+    assert found.position.radius_m >= 4 * 15
+    assert flat.position.radius_m < found.position.radius_m
 
 
 def test_apply_track_decides_uncertain_photo_in_any_order() -> None:

@@ -108,11 +108,11 @@ def test_photo_map_refines_an_answer(made: MadeMap, known: PoseSettings) -> None
 def test_photo_map_frames_by_what_the_request_knows(made: MadeMap) -> None:
     photo_HW3 = photo_of(window_of(made_map(0)))
     photo_map = made.photo_map()
-    assert len(photo_map.frame(photo_HW3, CameraTags(), NOTHING_KNOWN).views) == 3
-    assert photo_map.frame(photo_HW3, CameraTags(), POSE_KNOWN).framing == "ground"
+    assert len(photo_map.frame(photo_HW3, CameraTags(), NOTHING_KNOWN).views.images) == 3
+    assert photo_map.frame(photo_HW3, CameraTags(), POSE_KNOWN).views.framing == "ground"
     unmatched = made.photo_map(match=False)
     framed = unmatched.frame(photo_HW3, CameraTags(), POSE_KNOWN)
-    assert (framed.framing, len(framed.views)) == ("none", 1)
+    assert (framed.views.framing, len(framed.views.images)) == ("none", 1)
     assert unmatched.refine(made.tile_answer(), framed).match_seconds is None
 
 

@@ -57,6 +57,8 @@ class CalibrationContext:
     gallery_rows: int
     spacing_m: float | None
     "Median distance of a gallery position to the next one; None where no two are known."
+    finest_side_m: float | None = None
+    "Side of the gallery's finest level; None where its levels are not known."
     photo_selection: str = ""
     "Which photos were searched, in words."
 
@@ -79,10 +81,12 @@ def fit_calibration(
             f"least {MIN_LOCATIONS} locations that the encoder was not trained on; train with "
             "--hold-out 0.1, or name another --split"
         )
-    radius_m = choose_agreement_radius(examples, criteria.tolerance, context.spacing_m)
-    inside = [consensus_of(one.inside, radius_m) for one in examples]
+    radius_m = choose_agreement_radius(
+        examples, criteria.tolerance, context.spacing_m, context.finest_side_m
+    )
+    inside = [consensus_of(one.inside, radius_m, context.finest_side_m) for one in examples]
     strangers = [one for one in examples if one.outside]
-    outside = [consensus_of(one.outside, radius_m) for one in strangers]
+    outside = [consensus_of(one.outside, radius_m, context.finest_side_m) for one in strangers]
     right_N = np.array(
         [is_correct(at, one, criteria.tolerance) for at, one in zip(inside, examples, strict=True)]
     )
@@ -112,6 +116,7 @@ def fit_calibration(
         gallery_rows=context.gallery_rows,
         photo_selection=context.photo_selection,
         spacing_m=context.spacing_m,
+        finest_side_m=context.finest_side_m,
         agreement_radius_m=radius_m,
         tolerance_m=criteria.tolerance,
         outside=criteria.outside,
@@ -146,7 +151,10 @@ def is_correct(consensus: Consensus, example: CalibrationExample, tolerance_m: f
 
 
 def choose_agreement_radius(
-    examples: Sequence[CalibrationExample], tolerance_m: float, spacing_m: float | None
+    examples: Sequence[CalibrationExample],
+    tolerance_m: float,
+    spacing_m: float | None,
+    finest_side_m: float | None = None,
 ) -> float:
     """The agreement radius in metres: the smallest of AGREEMENT_FACTORS, unless a larger one
     locates significantly more photos within the tolerance.
@@ -158,7 +166,10 @@ def choose_agreement_radius(
         return 0.0
     _, location_N = np.unique([one.location for one in examples], return_inverse=True)
     errors = [
-        [position_error_m(consensus_of(one.inside, factor * spacing_m), one) for one in examples]
+        [
+            position_error_m(consensus_of(one.inside, factor * spacing_m, finest_side_m), one)
+            for one in examples
+        ]
         for factor in AGREEMENT_FACTORS
     ]
     within = [[error is not None and error <= tolerance_m for error in row] for row in errors]

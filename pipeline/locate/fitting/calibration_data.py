@@ -12,16 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
+from pipeline.camera.framing import Level
+from pipeline.camera.local_plane import tile_side_m
+from pipeline.core.arrays import Doubles, Floats
 from pipeline.core.geo import haversine_m
 from pipeline.core.records import View
 from pipeline.index.searcher import Hit, Searchable
 from pipeline.locate.fitting.calibrate import CalibrationExample
-from pipeline.locate.locate import coordinates, search_views
+from pipeline.locate.locate import coordinates, level_scales, search_views
 from pipeline.locate.track import TRACK_CANDIDATES
 
 OWN_LOCATION_SPACINGS = 2.0
-"""Spacings of the gallery within which an image counts as one of a photo's own location: an
+"""Spacings of an image's level within which it counts as one of a photo's own location: an
 overlapping neighbour shows it too."""
 
 
@@ -45,16 +47,18 @@ def make_examples(
     index: Searchable,
     spacing_m: float | None,
     tolerance_m: float,
+    finest_side_m: float | None = None,
 ) -> list[CalibrationExample]:
-    """One example per photo, in order."""
+    """One example per photo, in order. `spacing_m`, `finest_side_m`: the gallery's."""
     own_rows: dict[str, list[int]] = {}
     for row, record in enumerate(overhead.records):
         own_rows.setdefault(record["location"], []).append(row)
-    radius_m = max(tolerance_m, OWN_LOCATION_SPACINGS * (spacing_m or 0.0))
+    own_m = OWN_LOCATION_SPACINGS * (spacing_m or 0.0)
 
     def others(number: int, hits: Sequence[Hit]) -> list[Hit]:
         location = photos.records[number]["location"]
-        away = hits_outside_radius(hits, *photos.position(number), radius_m)
+        radius_K = np.maximum(tolerance_m, own_m * level_scales(hits, finest_side_m))
+        away = hits_outside_radius(hits, *photos.position(number), radius_K)
         return [hit for hit in away if hit.location != location]
 
     views = list(photos.embeddings_QD[:, None])
@@ -81,9 +85,10 @@ def search_near_and_away(
     index: Searchable,
     views_of_photos: Sequence[Floats],
     others: Callable[[int, Sequence[Hit]], list[Hit]],
+    levels: Sequence[Level | None] | None = None,
 ) -> list[tuple[list[Hit], list[Hit]]]:
-    """For each photo by its views (V, D): its candidates, and those of them that `others` takes for
-    such of elsewhere, by the photo's number.
+    """For each photo by its views (V, D), of the level that it was framed for: its candidates, and
+    those of them that `others` takes for such of elsewhere, by the photo's number.
 
     Searches with a growing number of candidates until there are TRACK_CANDIDATES of these, or no
     more rows.
@@ -91,7 +96,9 @@ def search_near_and_away(
     found: dict[int, tuple[list[Hit], list[Hit]]] = {}
     pending, k = list(range(len(views_of_photos))), 2 * TRACK_CANDIDATES
     while pending:
-        hits_of = search_views(index, [views_of_photos[number] for number in pending], k)
+        views = [views_of_photos[number] for number in pending]
+        own = None if levels is None else [levels[number] for number in pending]
+        hits_of = search_views(index, views, k, None, own)
         for number, hits in zip(pending, hits_of, strict=True):
             away = others(number, hits)
             if len(away) >= TRACK_CANDIDATES or k >= len(index):
@@ -101,12 +108,12 @@ def search_near_and_away(
 
 
 def hits_outside_radius(
-    hits: Sequence[Hit], lat: float | None, lon: float | None, radius_m: float
+    hits: Sequence[Hit], lat: float | None, lon: float | None, radius_K: Doubles
 ) -> list[Hit]:
-    """The hits that are not known to lie within `radius_m` of a position."""
+    """The hits that are not known to lie within their radius of a position, metres."""
     if lat is None or lon is None or not hits:
         return list(hits)
-    near_K = haversine_m(coordinates(hits), np.array([lat, lon])) <= radius_m  # NaN gives False
+    near_K = haversine_m(coordinates(hits), np.array([lat, lon])) <= radius_K  # NaN gives False
     return [hit for hit, near in zip(hits, near_K, strict=True) if not near]
 
 
@@ -118,6 +125,7 @@ def _own_hits(embedding_D: Floats, images: LabelledImages, rows: Sequence[int]) 
 
 def _hit(images: LabelledImages, row: int, score: float) -> Hit:
     record, (lat, lon) = images.records[row], images.position(row)
+    corners = (record["geotag"] or {}).get("footprint")
     return Hit(
         key=record["key"],
         location=record["location"],
@@ -125,4 +133,5 @@ def _hit(images: LabelledImages, row: int, score: float) -> Hit:
         lat=lat,
         lon=lon,
         score=score,
+        side_m=tile_side_m(corners) if corners else None,
     )

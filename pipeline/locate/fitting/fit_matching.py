@@ -100,12 +100,14 @@ def _error(example: MatchedExample, inside: bool) -> tuple[float, float]:
 
 def _tile_features(example: MatchedExample, inside: bool, calibration: Calibration) -> Doubles:
     hits = example.searched.inside if inside else example.searched.outside
-    consensus = consensus_of(hits, calibration.agreement_radius_m)
+    consensus = consensus_of(hits, calibration.agreement_radius_m, calibration.finest_side_m)
     return confidence_features(consensus, consensus_scores(hits))
 
 
 def _tile_is_right(example: MatchedExample, inside: bool, calibration: Calibration) -> bool:
     if not inside:
         return False
-    consensus = consensus_of(example.searched.inside, calibration.agreement_radius_m)
+    consensus = consensus_of(
+        example.searched.inside, calibration.agreement_radius_m, calibration.finest_side_m
+    )
     return is_correct(consensus, example.searched, calibration.tolerance_m)
