@@ -7,6 +7,7 @@ middle.
 import cv2
 import numpy as np
 
+from pipeline.camera.ground import corners
 from pipeline.core.arrays import Doubles, Pixels
 
 FROM_MIDDLE_33 = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
@@ -32,16 +33,28 @@ def shrink_first(image_HW3: Pixels, shrink: float) -> tuple[Pixels, Doubles]:
     return smaller_HW3, np.diag([width / size[0], height / size[1], 1.0])
 
 
+def lay_on(image_HW3: Pixels, target_42: Doubles, size: tuple[int, int]) -> Pixels:
+    """A picture (H, W, 4) of `size` (width, height) with an image whose corners, from the upper
+    left clockwise, lie at `target_42`; transparent beyond it."""
+    sides_4 = np.linalg.norm(np.roll(target_42, -1, axis=0) - target_42, axis=1)
+    image_HW3, _ = shrink_first(image_HW3, float(sides_4.max()) / max(image_HW3.shape[:2]))
+    height, width = image_HW3.shape[:2]
+    source_42 = corners((width, height)).astype(np.float32)
+    homography_33 = cv2.getPerspectiveTransform(source_42, target_42.astype(np.float32))
+    opaque_HW4 = np.dstack([image_HW3, np.full((height, width), 255, np.uint8)])
+    return warp(opaque_HW4, np.asarray(homography_33, np.float64), size, (0.0, 0.0, 0.0, 0.0))
+
+
 def warp(
-    image_HW3: Pixels,
+    image_HWC: Pixels,
     homography_33: Doubles,
     size: tuple[int, int],
     beyond: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> Pixels:
     """The picture of `size` (width, height) that a homography makes of an image; beyond the image
     this colour."""
-    warped_HW3 = cv2.warpPerspective(
-        image_HW3, np.linalg.inv(FROM_MIDDLE_33) @ homography_33 @ FROM_MIDDLE_33, size,
+    warped_HWC = cv2.warpPerspective(
+        image_HWC, np.linalg.inv(FROM_MIDDLE_33) @ homography_33 @ FROM_MIDDLE_33, size,
         flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=beyond,
     )  # fmt: skip
-    return np.asarray(warped_HW3, np.uint8)
+    return np.asarray(warped_HWC, np.uint8)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 from PIL import Image
 
+from pipeline.core.arrays import Pixels
 from pipeline.images.decode import DecodeError, decode
 
 QUERY_PX = 360
@@ -57,14 +58,14 @@ def thumbnail_bytes(data: bytes | None, pixels: int) -> bytes | None:
     if data is None:
         return None
     try:
-        image = Image.fromarray(decode(data))
+        return shrink_to_webp(decode(data), pixels)
     except DecodeError:
         return None
+
+
+def shrink_to_webp(pixels_HWC: Pixels, pixels: int) -> bytes:
+    """A WebP of an image, RGB or RGBA, made smaller where a side exceeds `pixels`."""
+    image, stream = Image.fromarray(pixels_HWC), io.BytesIO()
     image.thumbnail((pixels, pixels), Image.Resampling.LANCZOS)
-    return to_webp(image)
-
-
-def to_webp(image: Image.Image) -> bytes:
-    stream = io.BytesIO()
     image.save(stream, "WEBP", quality=WEBP_QUALITY, method=WEBP_EFFORT)
     return stream.getvalue()

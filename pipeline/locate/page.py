@@ -12,9 +12,19 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.camera.warp import lay_on
+from pipeline.core.arrays import Pixels
 from pipeline.core.geo import haversine_m
 from pipeline.core.templates import template_environment
-from pipeline.images.thumbnails import ANSWER_PX, QUERY_PX, ImageLoader, thumbnail
+from pipeline.images.decode import DecodeError, decode
+from pipeline.images.thumbnails import (
+    ANSWER_PX,
+    QUERY_PX,
+    ImageLoader,
+    as_data_uri,
+    shrink_to_webp,
+    thumbnail,
+)
 from pipeline.index.searcher import Hit
 from pipeline.locate.calibration import Calibration
 from pipeline.locate.gallery_map import GalleryMap
@@ -24,13 +34,21 @@ from pipeline.locate.page_map import (
     MAP_SIDE_PX,
     Footprint,
     MapView,
+    match_paths,
     nearby_keys,
     overview_map,
+    photo_box,
     position_map,
 )
 
 MAX_SHOWN = 60
-"Answers on the page at most, evenly spaced: about 100 kB each."
+"Answers on the page at most, evenly spaced: 100 to 150 kB each."
+
+LAID_PX = 400
+"Longest side of a photo laid over the map: some 30 kB."
+
+PAIR_GAP_PX = 16
+"Between a photo and its map, where lines join them."
 
 TILE_PX = 96
 LatLon = tuple[float, float]
@@ -71,7 +89,6 @@ def render_page(
     on_maps = {tile.key for view in maps if view for tile in view.tiles}
     candidates = {hit.key for answer in answers for hit in answer.candidates}
     tiles = load_tiles(sorted(on_maps | candidates))
-    photos = load_photos([one.photos[0] for one in shown])
     named = [(one.name, one.answer) for one in located if one.answer]
     environment = template_environment(Path(__file__).parent / "templates")
     return environment.get_template("answers.html").render(
@@ -85,9 +102,11 @@ def render_page(
         overview=overview_map(named, context.gallery, context.track),
         tiles={key: thumbnail(tiles[key], TILE_PX) for key in sorted(on_maps & tiles.keys())},
         panels=[
-            _panel(one, view, tiles, photos, context) for one, view in zip(shown, maps, strict=True)
+            _panel(one, view, tiles, load_photos, context)
+            for one, view in zip(shown, maps, strict=True)
         ],
         side=MAP_SIDE_PX,
+        gap=PAIR_GAP_PX,
     )
 
 
@@ -95,10 +114,11 @@ def _panel(
     one: LocatedPhoto,
     view: MapView | None,
     tiles: Mapping[str, bytes],
-    photos: Mapping[str, bytes],
+    load_photos: ImageLoader,
     context: PageContext,
 ) -> dict[str, Any]:
     """One answer as the template shows it."""
+    photo_HW3 = _decoded(load_photos([one.photos[0]]).get(one.photos[0]))
     answer, truth = one.answer, context.true_positions.get(one.name)
     point = view.frame.pixels(np.array([truth]))[0].tolist() if view and truth else None
     on_map = point is not None and all(0 <= at <= MAP_SIDE_PX for at in point)
@@ -108,13 +128,48 @@ def _panel(
         "path": one.name,
         "count": len(one.photos),
         "taken_at": one.taken_at,
-        "picture": thumbnail(photos.get(one.photos[0]), QUERY_PX),
+        "picture": None if photo_HW3 is None else _webp_uri(photo_HW3, QUERY_PX),
         "map": view,
+        "laid": _laid(answer, photo_HW3, view),
         "answer": answer,
         "rejected": one.rejected,
         "truth": point if on_map else None,
         "error": format_distance(distance_to_m(answer, truth)) if answer and truth else "",
         "candidates": [_candidate(rank, hit, answer, tiles) for rank, hit in candidates if answer],
+    }
+
+
+def _decoded(data: bytes | None) -> Pixels | None:
+    try:
+        return None if data is None else decode(data)
+    except DecodeError:
+        return None
+
+
+def _webp_uri(pixels_HWC: Pixels, pixels: int) -> str:
+    return as_data_uri(shrink_to_webp(pixels_HWC, pixels))
+
+
+def _laid(
+    answer: Answer | None, photo_HW3: Pixels | None, view: MapView | None
+) -> dict[str, Any] | None:
+    """A matched photo as it lies on the map, and the pairs that carry it, drawn from the photo to
+    the map: side by side, and for narrow screens the map below it."""
+    if answer is None or answer.refinement is None or photo_HW3 is None or view is None:
+        return None
+    corners_42 = view.frame.pixels(np.array(answer.refinement.footprint))
+    least_2, extent_2 = corners_42.min(axis=0), np.maximum(np.ptp(corners_42, axis=0), 1e-6)
+    scale = LAID_PX / float(extent_2.max())
+    width, height = (max(1, round(side * scale)) for side in extent_2.tolist())
+    laid_HW4 = lay_on(photo_HW3, (corners_42 - least_2) * scale, (width, height))
+    size = (photo_HW3.shape[1], photo_HW3.shape[0])
+    box, beyond = photo_box(size, 0, 0), float(MAP_SIDE_PX + PAIR_GAP_PX)
+    return {
+        "source": _webp_uri(laid_HW4, LAID_PX),
+        "box": [*least_2.tolist(), *extent_2.tolist()],
+        "photo": box,
+        "wide": match_paths(answer.refinement, view.frame, box, (beyond, 0.0)),
+        "tall": match_paths(answer.refinement, view.frame, box, (0.0, beyond)),
     }
 
 

@@ -12,10 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.camera.uncertainty import Ellipse
 from pipeline.core.arrays import Doubles
 from pipeline.core.geo import EARTH_RADIUS_M
 from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.locate import Answer
+from pipeline.matching.refine import Refinement
 
 MAP_SIDE_PX = 320
 "Pixels of a map's side, before it is scaled to the page."
@@ -96,7 +98,9 @@ class MapView:
     dots: tuple[tuple[float, float], ...] = ()
     marks: tuple[MapMark, ...] = ()
     circle: tuple[float, float, float] | None = None
-    "x, y and radius of the circle of uncertainty."
+    "x, y and radius of the circle of uncertainty, where there is no ellipse."
+    ellipse: tuple[float, float, float, float, float] | None = None
+    "x, y, half the longer and the shorter axis, and the longer one's turn from the x axis."
     line: str = ""
     "Points of the flight's polyline."
     outline: str = ""
@@ -126,24 +130,67 @@ def position_map(
     spacing = gallery.spacing_m or position.radius_m or 1.0
     half_m = max(MAP_HALF_SPACINGS * spacing, 1.3 * position.radius_m, _reach_m(answer))
     frame = MapFrame(lat=position.lat, lon=position.lon, half_m=half_m)
-    tiles = []
+    tiles: list[tuple[float, MapTile]] = []
     nearest = gallery.nearest(position.lat, position.lon, MAX_TILES, gallery.finest_side_m)
     for number in nearest.tolist():
         key, (lat, lon) = str(gallery.keys[number]), gallery.positions_N2[number].tolist()
         footprint = footprints.get(key) or square_footprint(lat, lon, 0.96 * spacing)
         corners_32 = frame.pixels(np.array(footprint)[[0, 1, 3]])
         if (corners_32.max(axis=0) > 0).all() and (corners_32.min(axis=0) < MAP_SIDE_PX).all():
-            tiles.append(MapTile(key=key, matrix=svg_matrix(corners_32)))
+            side = float(np.linalg.norm(corners_32[1] - corners_32[0]))
+            tiles.append((side, MapTile(key=key, matrix=svg_matrix(corners_32))))
+    # The near ones over the far, and of several levels the fine ones over the coarse.
+    tiles.reverse()
+    tiles.sort(key=lambda tile: -round(tile[0]))
     (x, y), *_ = frame.pixels(np.array([[position.lat, position.lon]])).tolist()
     return MapView(
         frame=frame,
-        tiles=tuple(reversed(tiles)),
+        tiles=tuple(tile for _, tile in tiles),
         marks=tuple(candidate_marks(answer, frame)),
-        circle=(x, y, max(frame.length(position.radius_m), SMALLEST_CIRCLE_PX)),
+        circle=None
+        if position.ellipse
+        else (x, y, max(frame.length(position.radius_m), SMALLEST_CIRCLE_PX)),
+        ellipse=_ellipse(x, y, position.ellipse, frame) if position.ellipse else None,
         outline=_outline(answer, frame),
         summary=f"Map of {2 * half_m:.0f} m around latitude {position.lat:.5f}, longitude "
         f"{position.lon:.5f}",
     )
+
+
+def _ellipse(
+    x: float, y: float, ellipse: Ellipse, frame: MapFrame
+) -> tuple[float, float, float, float, float]:
+    longer, shorter = (
+        max(frame.length(half_m), SMALLEST_CIRCLE_PX)
+        for half_m in (ellipse.major_m, ellipse.minor_m)
+    )
+    return x, y, longer, shorter, ellipse.direction_deg - 90
+
+
+def photo_box(size: tuple[int, int], left: float, top: float) -> tuple[float, float, float, float]:
+    """x, y, width and height of a photo of `size` (width, height) in the middle of a square of
+    MAP_SIDE_PX."""
+    scale = MAP_SIDE_PX / max(size)
+    width, height = size[0] * scale, size[1] * scale
+    return left + (MAP_SIDE_PX - width) / 2, top + (MAP_SIDE_PX - height) / 2, width, height
+
+
+def match_paths(
+    refinement: Refinement,
+    frame: MapFrame,
+    box: tuple[float, float, float, float],
+    map_at: tuple[float, float],
+) -> tuple[str, str]:
+    """SVG paths of a refinement's pairs: lines from a photo drawn in `box` (x, y, width, height) to
+    a map whose upper left corner is drawn at `map_at`; and their ends."""
+    x, y, width, height = box
+    shares_M2 = np.array([(point.x, point.y) for point in refinement.points]).reshape(-1, 2)
+    ground_M2 = np.array([(point.lat, point.lon) for point in refinement.points]).reshape(-1, 2)
+    photo_M2 = shares_M2 * (width, height) + (x, y)
+    map_M2 = frame.pixels(ground_M2) + map_at
+    ends = [[f"{u:.1f} {v:.1f}" for u, v in side.tolist()] for side in (photo_M2, map_M2)]
+    lines = "".join(f"M{one}L{other}" for one, other in zip(*ends, strict=True))
+    return lines, "".join(f"M{end}h0" for side in ends for end in side)
 
 
 def _reach_m(answer: Answer) -> float:

@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from PIL import Image
 
 from pipeline.camera.framing import PhotoViews, views_of_photo
 from pipeline.core.arrays import Pixels
 from pipeline.images.camera_tags import CameraTags
-from pipeline.images.thumbnails import ImageLoader, thumbnail_bytes, to_webp
+from pipeline.images.thumbnails import ImageLoader, shrink_to_webp, thumbnail_bytes
 from pipeline.locate.calibration import Calibration
 from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.locate import Answer
@@ -135,7 +134,7 @@ class PhotoMap:
         window = self._windows.compose(wanted.lat, wanted.lon, wanted.half_m, GROUND_PX)
         if window is None:
             return None
-        return to_webp(Image.fromarray(np.dstack([window.pixels_HW3, window.shown_HW])))
+        return shrink_to_webp(np.dstack([window.pixels_HW3, window.shown_HW]), GROUND_PX)
 
 
 MapOpener = Callable[[GalleryMap], PhotoMap | None]
