@@ -59,5 +59,12 @@ def field_of_view(
     return None
 
 
+def focal_length_35mm(fov_deg: float, size: tuple[int, int]) -> float:
+    """The 35 mm equivalent, millimetres, of a field of view across the width of a photo of `size`
+    (width, height)."""
+    share = size[0] / math.hypot(*size)
+    return DIAGONAL_35MM * share / 2 / math.tan(math.radians(fov_deg) / 2)
+
+
 def _across(width_per_focal_length: float) -> float:
     return math.degrees(2 * math.atan(width_per_focal_length / 2))

@@ -2,8 +2,9 @@
 
 import hashlib
 import re
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import StrEnum
+from typing import Any
 
 
 class Split(StrEnum):
@@ -42,6 +43,16 @@ class GeoTag:
     footprint: tuple[tuple[float, float], ...] | None = None
     """Corners (lat, lon) of the ground shown, from the image's upper left clockwise, where they are
     known."""
+    roll_deg: float | None = None
+    "Of the camera about its optical axis; above 0 the image's right side is the lower one."
+    focal_35mm: float | None = None
+    "Focal length of the same field of view on 35 mm film, millimetres."
+
+    def as_json(self) -> dict[str, Any]:
+        """All fields; roll and focal length only where they are known, so that tags without them
+        are written as they were before there were these."""
+        later = ("roll_deg", "focal_35mm")
+        return {k: v for k, v in asdict(self).items() if v is not None or k not in later}
 
 
 @dataclass(frozen=True, kw_only=True)

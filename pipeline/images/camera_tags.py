@@ -25,6 +25,7 @@ from pipeline.images.xmp import read_xmp
 ALTITUDE_REF, ALTITUDE, DIRECTION_REF, DIRECTION = 5, 6, 16, 17
 TAKEN, TAKEN_OFFSET, TAKEN_FRACTION = 0x9003, 0x9011, 0x9291
 MODEL, FOCAL, FOCAL_35MM = 0x0110, 0x920A, 0xA405
+WIDTH, HEIGHT = 0xA002, 0xA003
 XMP_HEIGHT = ("AboveGroundAltitude", "RelativeAltitude")
 XMP_HEADING = ("GimbalYawDegree", "CameraYawDegree", "CameraOrientationNED.Yaw")
 XMP_BODY_HEADING = ("FlightYawDegree", "DroneYawDegree")
@@ -63,6 +64,8 @@ class CameraTags:
     "Focal length, millimetres."
     model: str = ""
     "Of the camera."
+    taken_size: tuple[int, int] | None = None
+    "Width and height of the photo as it was taken, pixels, before it was turned upright."
     taken_at: str | None = None
     "ISO 8601; without an offset the camera's own clock."
     ignored: tuple[str, ...] = ()
@@ -96,7 +99,10 @@ def read_tags(blocks: MetadataBlocks) -> CameraTags:
         sea_level = _first_number(xmp, ("AbsoluteAltitude",), ignored)
     heading, taken_at = _heading(exif.gps, xmp, pitch, ignored), _taken_at(exif.photo, ignored)
     roll = _first_number(xmp, XMP_ROLL, ignored)
-    focal_35mm = exif.photo[FOCAL_35MM].integer() if FOCAL_35MM in exif.photo else None
+    focal_35mm, width, height_px = (
+        exif.photo[tag].integer() if tag in exif.photo else None
+        for tag in (FOCAL_35MM, WIDTH, HEIGHT)
+    )
     return CameraTags(
         position=position,
         height_m=height,
@@ -108,6 +114,7 @@ def read_tags(blocks: MetadataBlocks) -> CameraTags:
         focal_35mm=_above_zero(focal_35mm),
         focal_mm=_above_zero(_first_rational(exif.photo, FOCAL)),
         model=exif.main[MODEL].text() if MODEL in exif.main else "",
+        taken_size=(width, height_px) if width and height_px else None,
         taken_at=taken_at,
         ignored=tuple(dict.fromkeys(ignored)),
     )

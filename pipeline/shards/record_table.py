@@ -28,7 +28,7 @@ SCHEMA = pa.schema(
     + [("footprint", pa.list_(pa.list_(pa.float64(), 2))), ("taken_at", pa.string())]
     + [pa.field(name, pa.string(), nullable=False) for name in ("source", "path", "part", "sha256")]
     + [pa.field(name, pa.int64(), nullable=False) for name in ("bytes", "width", "height")]
-    + [("level", pa.string())]
+    + [("level", pa.string()), ("roll_deg", pa.float64()), ("focal_35mm", pa.float64())]
 )
 "A column that may be null is null where an older part lacks it."
 FOOTER = b"pvda.packed"

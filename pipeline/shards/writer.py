@@ -107,7 +107,7 @@ def read_member(record: ImageRecord, source: Source, check: Check) -> Member:
         "view": record.view,
         "split": record.split,
         "variant": record.variant,
-        "geotag": None if record.geotag is None else asdict(record.geotag),
+        "geotag": None if record.geotag is None else record.geotag.as_json(),
         "taken_at": record.taken_at,
         "source": name_of(source),
         "sha256": sha256_of(data),

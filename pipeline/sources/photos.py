@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
+from pipeline.camera.lens import field_of_view, focal_length_35mm
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch_map
@@ -159,7 +160,30 @@ def geotag_of_photo(tags: CameraTags, project: bool) -> GeoTag | None:
         and pitch <= MAX_PITCH_DEG
     ):
         lat, lon = aim_point(lat, lon, height, heading, pitch)
-    return GeoTag(lat=lat, lon=lon, altitude_m=height, heading_deg=heading, pitch_deg=pitch)
+    return GeoTag(
+        lat=lat,
+        lon=lon,
+        altitude_m=height,
+        heading_deg=heading,
+        pitch_deg=pitch,
+        roll_deg=tags.roll_deg,
+        focal_35mm=equivalent_focal_length(tags),
+    )
+
+
+def equivalent_focal_length(tags: CameraTags) -> float | None:
+    """The focal length on 35 mm film, by whatever the tags say of the lens; None where that is not
+    enough."""
+    if tags.taken_size is None:
+        return tags.focal_35mm
+    fov = field_of_view(
+        tags.taken_size,
+        focal_px=tags.focal_px,
+        focal_35mm=tags.focal_35mm,
+        focal_mm=tags.focal_mm,
+        model=tags.model,
+    )
+    return None if fov is None else round(focal_length_35mm(fov, tags.taken_size), 3)
 
 
 def aim_point(

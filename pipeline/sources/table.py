@@ -113,11 +113,14 @@ def geotag_of_row(row: Row) -> GeoTag | None:
     and `lon` that contradict it are refused. Raises BadRow.
     """
     shape: Shape | None = row.get(SHAPE_COLUMN)
-    altitude, heading, pitch = (
-        _cell_number(row, name) for name in ("altitude_m", "heading_deg", "pitch_deg")
+    altitude, heading, pitch, roll, focal = (
+        _cell_number(row, name)
+        for name in ("altitude_m", "heading_deg", "pitch_deg", "roll_deg", "focal_35mm")
     )
     if pitch is not None and abs(pitch) > 90:
         raise BadRow("unreadable tag", f"pitch_deg {pitch}, not from -90 to 90")
+    if focal is not None and focal <= 0:
+        raise BadRow("unreadable tag", f"focal_35mm {focal}, not above 0")
     position = _position(row, "position") if shape is None else _middle(shape)
     if position is None:
         return None
@@ -129,6 +132,8 @@ def geotag_of_row(row: Row) -> GeoTag | None:
         altitude_m=altitude,
         heading_deg=None if heading is None else heading % 360,
         pitch_deg=pitch,
+        roll_deg=roll,
+        focal_35mm=focal,
         footprint=order_footprint(shape.corners, heading or 0.0)
         if shape is not None and shape.corners
         else None,

@@ -29,10 +29,14 @@ COLUMNS = (
     "altitude_m",
     "heading_deg",
     "pitch_deg",
+    "roll_deg",
+    "focal_35mm",
     "taken_at",
 )
 ALIASES = {"latitude": "lat", "longitude": "lon", "lng": "lon"}
-NUMBER_COLUMNS = ("lat", "lon", "altitude_m", "heading_deg", "pitch_deg")
+NUMBER_COLUMNS = (
+    "lat", "lon", "altitude_m", "heading_deg", "pitch_deg", "roll_deg", "focal_35mm",
+)  # fmt: skip
 SHAPE_COLUMN = "shape"
 "Under this name a GeoJSON row holds its geometry, a Shape."
 BROKEN_COLUMN = "broken"

@@ -9,6 +9,7 @@ writes `locations.csv` and `poses.csv` at the root, which are read without a fla
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+from pipeline.camera.lens import focal_length_35mm
 from pipeline.core import storage
 from pipeline.core.records import GeoTag, Rejection, Scanned, View
 from pipeline.sources.base import Source
@@ -18,6 +19,7 @@ from pipeline.sources.text_tables import (
     TagTable,
     Unreadable,
     parse_number,
+    parse_optional_number,
     parse_position,
     read_rows,
     unreadable_tag_row,
@@ -81,6 +83,11 @@ def read_pose_tables(root: str, tags: TagTable) -> list[Rejection]:
                 tag = tags.find(row["location"])
                 if tag is not None:
                     tag = replace(tag, altitude_m=altitude, heading_deg=heading, pitch_deg=pitch)
+                    fov = parse_optional_number(row.get("fov_deg", ""))
+                    if fov is not None and not 0 < fov < 180:
+                        raise Unreadable(f"fov_deg {fov:g} is not between 0 and 180")
+                    if fov is not None:  # its images are squares
+                        tag = replace(tag, focal_35mm=round(focal_length_35mm(fov, (1, 1)), 3))
                     tags.add(row["path"], tag)
             except Unreadable as error:
                 rejected.append(unreadable_tag_row(path, line, ",".join(row.values()), error))

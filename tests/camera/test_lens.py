@@ -5,7 +5,7 @@ import pytest
 from pyproj import Geod
 
 from pipeline.camera.ground import looked_at
-from pipeline.camera.lens import field_of_view
+from pipeline.camera.lens import field_of_view, focal_length_35mm
 from pipeline.camera.local_plane import LocalPlane
 from pipeline.camera.pose import PartialPose, Pose
 from pipeline.camera.uncertainty import PoseErrors, ellipse_of, looked_at_covariance
@@ -70,3 +70,9 @@ def test_partial_pose_says_what_it_lacks() -> None:
     assert not known.complete
     with pytest.raises(ValueError, match="field of view"):
         known.over()
+
+
+def test_35mm_equivalent_is_the_inverse_of_the_field_of_view() -> None:
+    fov = field_of_view((4000, 3000), focal_35mm=24)
+    assert fov is not None
+    assert focal_length_35mm(fov, (4000, 3000)) == pytest.approx(24)

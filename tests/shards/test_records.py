@@ -79,7 +79,7 @@ def test_records_of_before_levels_are_read(tmp_path: Path) -> None:
     [shard, *_] = pack(SOURCE, packing(imagery(tmp_path / "root"), out)).shards
     part = str(out / f"records/{shard.name}.parquet")
     rows = read_part(str(out), shard.name)
-    parquet.write_table(part, parquet.read_table(part).drop_columns(["level"]))
+    parquet.write_table(part, parquet.read_table(part).drop_columns(["level", "roll_deg"]))
     assert read_part(str(out), shard.name) == rows
     assert read_part(str(out), shard.name, ["level", "key"]).to_pylist()[0]["level"] is None
     assert open_shards(str(out)).export(str(tmp_path / "all.parquet")) == (15, 0)
@@ -110,7 +110,8 @@ DEGREES = st.floats(-90, 90)
 def tags(draw: st.DrawFn) -> GeoTag | None:
     if draw(st.booleans()):
         return None
-    known = {name: draw(st.none() | DEGREES) for name in ("altitude_m", "heading_deg", "pitch_deg")}
+    names = ("altitude_m", "heading_deg", "pitch_deg", "roll_deg", "focal_35mm")
+    known = {name: draw(st.none() | DEGREES) for name in names}
     corners = draw(st.none() | st.tuples(*[st.tuples(DEGREES, DEGREES)] * 4))
     return GeoTag(lat=draw(DEGREES), lon=draw(DEGREES), footprint=corners, **known)
 
@@ -129,6 +130,7 @@ def recorded(facts: dict[str, Any], row: dict[str, Any]) -> ImageRecord:
         "level": facts.get("level", ""),
     }
     assert facts.get("level") == row["level"]
+    assert row["focal_35mm"] == (None if tag is None else tag.focal_35mm)
     return ImageRecord(path=row["path"], geotag=tag, bytes=row["bytes"], **kind)
 
 

@@ -19,11 +19,16 @@ FLOWN = (
 )
 
 
-def photo(path: Path, gps: dict[int, Any] | None = None, **options: Any) -> None:
+def photo(
+    path: Path,
+    gps: dict[int, Any] | None = None,
+    lens: dict[int, Any] | None = None,
+    **options: Any,
+) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     exif = Image.Exif()
     exif.get_ifd(0x8825).update(gps or {})
-    exif.get_ifd(0x8769).update({0x9003: "2024:05:01 12:34:56"})
+    exif.get_ifd(0x8769).update({0x9003: "2024:05:01 12:34:56"} | (lens or {}))
     kind = {".png": "PNG", ".webp": "WEBP", ".tif": "TIFF"}.get(path.suffix.lower(), "JPEG")
     Image.new("RGB", (16, 12), "green").save(path, kind, exif=exif, **options)
 

@@ -119,6 +119,22 @@ def test_pose_tables_give_positions_and_poses(tmp_path: Path) -> None:
     assert records["train-satellite-0839-0839"].geotag == GeoTag(lat=53.75, lon=-1.25)
 
 
+def test_pose_tables_tell_the_lens(tmp_path: Path) -> None:
+    """90 degrees across a square: half its width of focal length, so 43.27 / (2 sqrt(2)) mm."""
+    root = miniature(tmp_path)
+    (root / "locations.csv").write_text("location,lat,lon\n0839,53.75,-1.25\n")
+    (root / "poses.csv").write_text(
+        "path,location,altitude_m,heading_deg,pitch_deg,fov_deg\n"
+        "train/drone/0839/image-01.jpeg,0839,120.5,90,-45,90\n"
+        "train/drone/0839/image-02.jpeg,0839,120.5,90,-45,180\n"
+    )
+    records, refused = scanned(root)
+    tag = records["train-drone-0839-image-01"].geotag
+    assert tag is not None
+    assert tag.focal_35mm == pytest.approx(15.297, abs=0.001)
+    assert [one.found for one in refused if "fov_deg 180" in one.found]
+
+
 def test_pose_tables_damaged_line_costs_only_its_tag(tmp_path: Path) -> None:
     root = miniature(tmp_path)
     (root / "locations.csv").write_text("location,lat,lon\n0839,north,-1.25\n0840,1,2\n0841\n")
