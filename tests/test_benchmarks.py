@@ -68,6 +68,10 @@ CASES: dict[str, tuple[str, str]] = {
         "--imagery {images} --out {out} --tiles 3 --photos 2 --height 12 16",
         r"built-in, matched, pose: [\d.]+% within 1 m, .* of 2 photos, [\d.]+ x ImageNet's tiles",
     ),
+    "region": (
+        "--out {out} --side 400 --resolution 0.5 --minutes 0 --photos 4 --checks 20 --height 60 80",
+        r"\| after, without \| [\d.]+% \|.* [\d.]+ x \|",
+    ),
     "serve": (
         "--checkpoint {trained}/run/last.pt --index {trained}/index "
         "--photos {trained}/flights/test/query_drone --clients 2 --seconds 0.2 --rounds 1",

@@ -36,6 +36,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "matching": BELOW_ALL | {"confidence"},
     "locate": BELOW_ALL | {"index", "matching", "confidence"},
     "service": BELOW_ALL | {"locate", "index", "matching"},
+    "region": BELOW_ALL | {"locate", "index", "matching"},
     "retrieval": BELOW_ALL | {"features"},
     "report": BELOW_ALL | {"retrieval"},
     "evaluation": BELOW_ALL | {"report", "retrieval", "features", "shards"},

@@ -187,5 +187,5 @@ def matching_summary(calibration: Calibration) -> str:
         f"{matching.known_right:.1%} rightly (a tile's answer within {calibration.tolerance_m:g} "
         f"m); expected calibration error {matching.calibration_error:.3f}; unknown for "
         f"{matching.outside_unknown:.1%} of the photos without their place in the gallery; "
-        f"ellipses grow {matching.gate.ellipse_scale:.1f} times to hold 95 % of the places"
+        f"beside the matches' own error, 95 % lie within {matching.gate.floor_m:.2f} m"
     )

@@ -19,7 +19,7 @@ from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.progress import progress
-from pipeline.core.records import GeoTag, ImageRecord, Rejection
+from pipeline.core.records import GeoTag, ImageRecord, Rejection, View
 from pipeline.index.searcher import Hit, Index
 from pipeline.locate.calibration import Calibration
 from pipeline.locate.fitting.calibrate import CalibrationExample
@@ -63,7 +63,7 @@ def flight_of(table: str, most: int) -> list[FlightPhoto]:
     found = [
         FlightPhoto(path=row.path, truth=row.geotag)
         for row in rows
-        if isinstance(row, ImageRecord) and row.geotag is not None
+        if isinstance(row, ImageRecord) and row.geotag is not None and row.view == View.DRONE
     ]
     if not found:
         raise InputError(

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from jobs.encoding.encoder import read_checkpoint_bytes
+from jobs.encoding.localizer import with_localizer
 from jobs.encoding.photo_encoder import PhotoEncoder
 from jobs.encoding.queries import Query, encode_photos, merge_by_folder, one_view
 from jobs.stages.matching import open_map, refine_answers, view_maker
@@ -50,6 +51,7 @@ def locate_photos(
     `true_positions`: where photos were taken, by name, for the page. Raises InputError and
     CheckpointError on unusable input.
     """
+    settings = with_localizer(settings)
     photos = find_photos(settings.photos)
     checkpoint = read_checkpoint_bytes(settings.checkpoint)
     index = Index(settings.index, verify=settings.verify or None)

@@ -16,6 +16,7 @@ from jobs.encoding.encoder import (
     read_checkpoint_bytes,
     require_checkpoint,
 )
+from jobs.encoding.localizer import with_localizer
 from jobs.encoding.photo_encoder import PhotoEncoder
 from jobs.stages.matching import open_photo_map
 from jobs.stages.settings import ServeSettings
@@ -55,6 +56,7 @@ def load_predictor(
 
 def serve(settings: ServeSettings) -> None:
     """Answer over HTTP where photos were taken, until Ctrl-C or SIGTERM."""
+    settings = with_localizer(settings)
     require_checkpoint(settings.checkpoint)
     path = storage.join(settings.index, METADATA_FILE)
     if not storage.is_file(path):

@@ -41,19 +41,23 @@ class Ellipse:
     direction_deg: float
     "Of the longer axis, degrees clockwise from north, 0 to 180."
 
-    def scaled(self, factor: float) -> "Ellipse":
-        """The ellipse with axes longer by `factor`."""
-        return replace(self, major_m=self.major_m * factor, minor_m=self.minor_m * factor)
+    def widened(self, radius_m: float) -> "Ellipse":
+        """The ellipse with an independent error of 95 % within `radius_m`, in any direction,
+        added."""
+        return replace(
+            self,
+            major_m=math.hypot(self.major_m, radius_m),
+            minor_m=math.hypot(self.minor_m, radius_m),
+        )
 
-    def scale_to_hold(self, east_m: float, north_m: float) -> float:
-        """The factor by which it must grow to hold a point so far from its middle; infinite where
-        it has no extent."""
-        direction = np.radians(self.direction_deg)
-        along = east_m * np.sin(direction) + north_m * np.cos(direction)
-        across = east_m * np.cos(direction) - north_m * np.sin(direction)
+    def holds(self, east_m: float, north_m: float) -> bool:
+        """Whether a point so far from its middle lies within it."""
+        direction = math.radians(self.direction_deg)
+        along = east_m * math.sin(direction) + north_m * math.cos(direction)
+        across = east_m * math.cos(direction) - north_m * math.sin(direction)
         if not self.minor_m or not self.major_m:
-            return math.inf
-        return math.hypot(along / self.major_m, across / self.minor_m)
+            return False
+        return math.hypot(along / self.major_m, across / self.minor_m) <= 1
 
 
 def looked_at_covariance(pose: Pose, errors: PoseErrors) -> Doubles:

@@ -150,7 +150,8 @@ def _check_model(calibration: Calibration) -> None:
     models: list[tuple[LogisticModel, tuple[str, ...]]] = [(calibration.model, FEATURE_NAMES)]
     if calibration.matching:
         models.append((calibration.matching.tile_model, FEATURE_NAMES))
-        models.append((calibration.matching.gate.model, GATE_FEATURES))
+        gate = calibration.matching.gate
+        models += [(gate.model, GATE_FEATURES), (gate.place_model, GATE_FEATURES)]
     for model, names in models:
         vectors = (model.mean_F, model.scale_F, model.coefficient_F)
         if any(len(vector_F) != len(names) for vector_F in vectors):

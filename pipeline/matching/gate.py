@@ -15,21 +15,28 @@ from pipeline.core.arrays import Doubles
 from pipeline.matching.refine import Refinement
 
 LEAST_INLIERS, MOST_ELLIPSE_M = 20, 5.0
-"""Without a model: a refinement of fewer inliers, or of a wider ellipse, is not used. By chance a
-window gives up to a dozen."""
-GATE_FEATURES = ("log inliers", "inlier share", "log ellipse", "log residual", "promised")
+"Without a model: a refinement of fewer inliers, or of a wider ellipse, is not used."
+CHANCE_INLIERS = 12
+"By chance a window gives up to a dozen: they are never enough, whatever a model says."
+GATE_FEATURES = ("log inliers", "inlier share", "log ellipse", "log residual", "tilt", "promised")
 SMALLEST_M = 0.01
 "Ellipses and residuals below a centimetre are taken for one."
 
 
 def gate_features(refinement: Refinement) -> Doubles:
-    """The features (F,) of GATE_FEATURES that separate right refinements from wrong ones."""
+    """The features (F,) of GATE_FEATURES that separate right refinements from wrong ones. Tilt is
+    the logarithm of the footprint's longest side over its shortest: relief moves what an oblique
+    photo shows."""
+    corners_42 = np.array(refinement.footprint)
+    corners_42[:, 1] *= math.cos(math.radians(refinement.lat))
+    side_4 = np.linalg.norm(np.roll(corners_42, -1, axis=0) - corners_42, axis=1)
     return np.array(
         [
             math.log(refinement.inliers),
             refinement.inliers / refinement.matches,
             math.log(min(max(refinement.ellipse.major_m, SMALLEST_M), 1e6)),
             math.log(max(refinement.residual_m, SMALLEST_M)),
+            math.log(side_4.max() / max(side_4.min(), 1e-12)),
             float(refinement.promised),
         ]
     )
@@ -37,28 +44,36 @@ def gate_features(refinement: Refinement) -> Doubles:
 
 @dataclass(frozen=True, kw_only=True)
 class Gate:
-    """Which refinements of one map hold, and how probably."""
+    """Which refinements of one map hold, and how probably they are near the truth."""
 
-    within_m: float
-    "A refinement is right if the ground that it names is so near to the true one."
-    model: LogisticModel
-    "Of the probability that a refinement is right, by GATE_FEATURES."
+    place_model: LogisticModel
+    "Of the probability that a refinement shows the right place, by GATE_FEATURES."
     threshold: float
-    "Refinements of a lower probability are not used."
-    ellipse_scale: float
-    "The factor by which the ellipses had to grow to hold 95 % of the right refinements' places."
+    "Refinements of a lower probability of the right place are not used."
+    within_m: float
+    "A position counts as right if it is so near to the true one."
+    model: LogisticModel
+    "Of the probability that a used refinement's position is right, by GATE_FEATURES."
+    floor_m: float
+    """The error that matches do not tell, relief above all: with it the ellipses held 95 % of the
+    true places."""
+
+    def admits(self, refinement: Refinement) -> bool:
+        """Whether a refinement is used."""
+        [place] = self.place_model.probabilities(gate_features(refinement)[None])
+        return bool(refinement.inliers > CHANCE_INLIERS and place >= self.threshold)
 
     def probability(self, refinement: Refinement) -> float:
-        """Probability that the refinement is right."""
+        """Probability that the position of a refinement that is used is right."""
         return float(self.model.probabilities(gate_features(refinement)[None])[0])
 
     def ellipse(self, refinement: Refinement) -> Ellipse:
         """The refinement's ellipse, as wide as the errors on this map are."""
-        return refinement.ellipse.scaled(self.ellipse_scale)
+        return refinement.ellipse.widened(self.floor_m)
 
 
 def holds(refinement: Refinement, gate: Gate | None = None) -> bool:
-    """Whether a refinement is used."""
+    """Whether a refinement is used: by its gate, else by the rule."""
     if gate is not None:
-        return gate.probability(refinement) >= gate.threshold
+        return gate.admits(refinement)
     return refinement.inliers >= LEAST_INLIERS and refinement.ellipse.major_m <= MOST_ELLIPSE_M

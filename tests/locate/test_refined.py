@@ -43,7 +43,8 @@ def matched(count: int = LOCATIONS) -> list[MatchedExample]:
             inside=hits(True, rng), outside=hits(False, rng),
         )  # fmt: skip
         inside = make_refinement(inliers=int(rng.integers(30, 90))) if n % 3 else None
-        outside = make_refinement(inliers=int(rng.integers(8, 14))) if n % 2 else None
+        chance = make_refinement(inliers=int(rng.integers(8, 14)), lat=46.01)
+        outside = chance if n % 2 else None
         examples.append(MatchedExample(searched=searched, inside=inside, outside=outside))
     return examples
 
@@ -73,7 +74,7 @@ def test_refined_answer_has_the_gate_s_probability(calibration: Calibration) -> 
     assert refined.probability == gate.probability(refinement)
     assert (refined.within_m, refined.known) == (5.0, True)
     assert refined.position is not None
-    assert refined.position.radius_m == pytest.approx(gate.ellipse_scale)
+    assert refined.position.radius_m == pytest.approx(np.hypot(1.0, gate.floor_m))
 
 
 def test_tile_of_a_photo_that_no_match_holds_for(calibration: Calibration) -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.camera.uncertainty import Ellipse
 from pipeline.matching.fit_gate import LEAST_RIGHT, GateExamples, error_of, fit_gate
-from pipeline.matching.gate import holds
+from pipeline.matching.gate import CHANCE_INLIERS, holds
 from tests.matching.refinements import METRE_LAT, make_refinement
 
 
@@ -24,35 +24,63 @@ def examples(count: int = 200) -> GateExamples:
 
 
 def test_gate_separates_by_inliers() -> None:
-    fitted = fit_gate(examples(), within_m=5.0)
+    fitted = fit_gate(examples(), within_m=5.0, place_m=25.0)
     assert fitted is not None
-    gate, p_N = fitted
-    assert p_N[::2].mean() > 0.95
-    assert p_N[1::2].mean() < 0.05
+    assert fitted.admitted_N[::2].mean() > 0.95
+    assert fitted.admitted_N[1::2].mean() < 0.05
+    assert fitted.p_N[fitted.admitted_N].mean() > 0.95
+    gate = fitted.gate
     assert gate.probability(make_refinement(inliers=100)) > 0.95
     assert holds(make_refinement(inliers=100), gate)
     assert not holds(make_refinement(inliers=10), gate)
 
 
-def test_gate_ellipse_grows_to_hold_the_errors() -> None:
-    """Errors of 1 m to the east and ellipses of half a metre there: twice as wide."""
-    fitted = fit_gate(examples(), within_m=5.0)
+def test_gate_keeps_right_places_that_are_not_near_enough() -> None:
+    """Nine in ten of the right places are within a metre and the others 8 m off, which nothing
+    tells beforehand: all are used, at nine in ten."""
+    given = examples()
+    given.errors_N2[::20] = [8.0, 0.0]
+    fitted = fit_gate(given, within_m=5.0, place_m=25.0)
     assert fitted is not None
-    assert fitted[0].ellipse_scale == pytest.approx(2.0)
-    assert fitted[0].ellipse(make_refinement(inliers=50)).minor_m == pytest.approx(1.0)
+    assert fitted.admitted_N[::2].mean() > 0.95
+    assert fitted.p_N[fitted.admitted_N].mean() == pytest.approx(0.9, abs=0.03)
+
+
+def test_gate_of_right_examples_only_still_asks_for_inliers() -> None:
+    given = examples()
+    right = GateExamples(
+        refinements=given.refinements[::2],
+        errors_N2=given.errors_N2[::2],
+        weight_N=given.weight_N[::2],
+        locations_N=given.locations_N[::2],
+    )
+    fitted = fit_gate(right, within_m=5.0, place_m=25.0)
+    assert fitted is not None
+    assert fitted.admitted_N.all()
+    assert not holds(make_refinement(inliers=CHANCE_INLIERS), fitted.gate)
+
+
+def test_gate_ellipse_holds_the_errors() -> None:
+    """Errors of 1 m to the east and ellipses of half a metre there."""
+    fitted = fit_gate(examples(), within_m=5.0, place_m=25.0)
+    assert fitted is not None
+    assert fitted.gate.floor_m == pytest.approx(0.75**0.5)
+    assert fitted.gate.ellipse(make_refinement(inliers=50)).minor_m == pytest.approx(1.0)
 
 
 def test_gate_needs_right_refinements() -> None:
     few = examples(2 * LEAST_RIGHT - 2)
-    assert fit_gate(few, within_m=5.0) is None
-    assert fit_gate(few, within_m=0.5) is None
+    assert fit_gate(few, within_m=5.0, place_m=25.0) is None
+    assert fit_gate(few, within_m=0.5, place_m=25.0) is None
 
 
-def test_ellipse_scale_to_hold_by_hand() -> None:
+def test_ellipse_holds_by_hand() -> None:
     ellipse = Ellipse(major_m=3.0, minor_m=1.0, direction_deg=90.0)
-    assert ellipse.scale_to_hold(6.0, 0.0) == pytest.approx(2.0)
-    assert ellipse.scale_to_hold(0.0, 2.0) == pytest.approx(2.0)
-    assert Ellipse(major_m=0.0, minor_m=0.0, direction_deg=0.0).scale_to_hold(1, 1) == np.inf
+    assert ellipse.holds(2.9, 0.0)
+    assert not ellipse.holds(3.1, 0.0)
+    assert not ellipse.holds(0.0, 1.1)
+    assert ellipse.widened(4.0).holds(4.9, 0.0)
+    assert not Ellipse(major_m=0.0, minor_m=0.0, direction_deg=0.0).holds(1, 1)
 
 
 def test_error_of_refinement_in_metres() -> None:

@@ -6,14 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from PIL import Image
 from rasterio.transform import Affine
 
 from pipeline.core.errors import InputError
+from pipeline.core.records import Split, View
 from pipeline.images.camera_tags import read_tags
 from pipeline.images.image_blocks import find_metadata
+from pipeline.shards.pack import pack
+from pipeline.shards.settings import PackingSettings
+from pipeline.shards.shard_set import open_shards
 from pipeline.simulation.over_map.fly import fly
-from pipeline.simulation.over_map.photo import photo_over_map
+from pipeline.simulation.over_map.photo import BLOCK_M, is_in_part, photos_over_map
 from pipeline.simulation.over_map.settings import MapFlightSettings
+from pipeline.sources.table import Table
 
 SIDE = 700
 GROUND = Affine(0.3, 0, 500_000, 0, -0.3, 5_200_000)
@@ -68,10 +74,53 @@ def test_photo_over_a_surface_model_has_relief(tmp_path: Path) -> None:
         dtype="float32", crs="EPSG:32632", transform=GROUND,
     ) as opened:  # fmt: skip
         opened.write(steps, 1)
-    flat = photo_over_map(settings(tmp_path), 0)
-    raised = photo_over_map(settings(tmp_path, surface=str(tmp_path / "surface.tif")), 0)
-    assert (flat.lat, flat.lon, flat.pose) == (raised.lat, raised.lon, raised.pose)
-    assert flat.jpeg != raised.jpeg
+    flat = photos_over_map(settings(tmp_path), 0, 1)
+    raised = photos_over_map(settings(tmp_path, surface=str(tmp_path / "surface.tif")), 0, 1)
+    assert (flat.lat, flat.lon, flat.photos[0].pose) == (
+        raised.lat, raised.lon, raised.photos[0].pose,
+    )  # fmt: skip
+    assert flat.photos[0].jpeg != raised.photos[0].jpeg
+
+
+def test_fly_pairs_can_be_packed_and_trained_on(tmp_path: Path) -> None:
+    """Two places of the blocks to learn from: two photos each, less the last one, and their pieces
+    of the map."""
+    write_map(tmp_path / "map.tif")
+    out = fly(settings(tmp_path, photos=3, views=2, overhead_m=40.0, part="learn"))
+    packed = str(tmp_path / "shards")
+    pack(Table(), PackingSettings(root=str(out / "photos.csv"), out=packed, workers=0))
+    counts = {
+        (shard.split, shard.view): shard.samples for shard in open_shards(packed).manifest.shards
+    }
+    assert counts == {(Split.TRAIN, View.DRONE): 3, (Split.TRAIN, View.SATELLITE): 2}
+    with (out / "photos.csv").open() as table:
+        rows = list(csv.DictReader(table))
+    at = {(row["location"], row["lat"], row["lon"]) for row in rows}
+    assert len(at) == 2
+    assert len({row["heading_deg"] for row in rows if row["view"] == "drone"}) == 3
+    piece = np.asarray(Image.open(out / "overhead" / "00000.jpg"))
+    assert piece.shape[0] == pytest.approx(40 / 0.3, abs=1)
+
+
+def test_parts_of_a_map_do_not_touch() -> None:
+    """One block in five is held out, and its places keep a fifth of its side from its border."""
+    axis = np.arange(2, 5 * BLOCK_M, 16.0)
+    points = [(x, y) for x in axis for y in axis]
+    learn = np.array([one for one in points if is_in_part("learn", *one)])
+    held = np.array([one for one in points if is_in_part("held-out", *one)])
+    assert len(learn) / len(points) == pytest.approx(0.8, abs=0.01)
+    assert len(held) / len(points) == pytest.approx(0.2 * 0.6**2, rel=0.1)
+    apart_2 = np.abs(learn[:, None] - held[None]).max(axis=2).min(axis=0)
+    assert apart_2.min() >= 0.2 * BLOCK_M
+
+
+def test_fly_held_out_pairs_are_a_test_set(tmp_path: Path) -> None:
+    write_map(tmp_path / "map.tif")
+    out = fly(settings(tmp_path, photos=1, overhead_m=40.0, part="held-out"))
+    with (out / "photos.csv").open() as table:
+        assert [(row["view"], row["split"]) for row in csv.DictReader(table)] == [
+            ("drone", "query"), ("satellite", "gallery"),
+        ]  # fmt: skip
 
 
 def test_fly_over_an_unusable_map_is_refused(tmp_path: Path) -> None:
@@ -79,5 +128,5 @@ def test_fly_over_an_unusable_map_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be flown over"):
         fly(settings(tmp_path))
     write_map(tmp_path / "map.tif")
-    with pytest.raises(InputError, match="shows no place for photo 0"):
-        photo_over_map(settings(tmp_path, height=(900.0, 900.0)), 0)
+    with pytest.raises(InputError, match="shows no ground for place 0"):
+        photos_over_map(settings(tmp_path, height=(900.0, 900.0)), 0, 1)

@@ -31,7 +31,8 @@ class MatchedExample:
     inside: Refinement | None
     "By windows around the candidates of the gallery that contains its place."
     outside: Refinement | None
-    "By windows around candidates from elsewhere, which do not show its place."
+    """By windows around candidates from elsewhere. Right where such a window shows its place after
+    all: an oblique photo shows ground far ahead."""
 
 
 def fit_matching(
@@ -53,19 +54,19 @@ def fit_matching(
         weight_N=weight_N[refined],
         locations_N=locations_N[refined],
     )
-    fitted = fit_gate(gate_examples, within_m)
+    fitted = fit_gate(gate_examples, within_m, calibration.tolerance_m)
     if fitted is None:
         raise InputError(
             f"fewer than {LEAST_RIGHT} of {len(examples)} photos are matched within {within_m:g} m "
             "of their true place, expected more to fit a gate on; calibrate on more photos, check "
             "their positions, or give a larger --within"
         )
-    gate, gate_p = fitted
-    p_N, right_N, held_N = (np.zeros(len(both)) for _ in range(3))
-    p_N[refined] = gate_p
+    gate = fitted.gate
+    p_N, right_N = np.zeros(len(both)), np.zeros(len(both))
+    p_N[refined] = fitted.p_N
     right_N[refined] = np.linalg.norm(gate_examples.errors_N2, axis=1) <= within_m
-    held_N[refined] = gate_p >= gate.threshold
-    tiles_N = held_N == 0
+    tiles_N = np.ones(len(both), np.bool_)
+    tiles_N[refined] = ~fitted.admitted_N
     x_NF = np.array([_tile_features(*one, calibration) for one in both])
     right_N[tiles_N] = np.array([_tile_is_right(*one, calibration) for one in both])[tiles_N]
     tile_model, tile_threshold = calibration.model, calibration.threshold
@@ -75,25 +76,25 @@ def fit_matching(
         tile_model = fit_logistic(*rest)
         tile_threshold = youden_threshold(p_N[tiles_N], *rest[1:])
     bins = reliability_bins(p_N, right_N, weight_N)
-    known_N: Mask = p_N >= np.where(tiles_N, tile_threshold, gate.threshold)
+    known_N: Mask = ~tiles_N | (p_N >= tile_threshold)
     inside_N = np.array([inside for _, inside in both])
     return MatchingCalibration(
         gate=gate,
         tile_model=tile_model,
         tile_threshold=tile_threshold,
         photos=len(examples),
-        refined=float((held_N * right_N)[inside_N].mean()),
+        refined=float((~tiles_N & (right_N > 0))[inside_N].mean()),
         known=float(known_N[inside_N].mean()),
         known_right=float(right_N[inside_N & known_N].mean()),
-        outside_unknown=float((~known_N[~inside_N]).mean()),
+        outside_unknown=float((~known_N[~inside_N & (right_N == 0)]).mean()),
         calibration_error=expected_calibration_error(bins),
         bins=tuple(bins),
     )
 
 
 def _error(example: MatchedExample, inside: bool) -> tuple[float, float]:
-    place, refinement = example.searched, example.inside
-    if not inside or refinement is None or place.lat is None or place.lon is None:
+    place, refinement = example.searched, example.inside if inside else example.outside
+    if refinement is None or place.lat is None or place.lon is None:
         return np.nan, np.nan
     return error_of(refinement, place.lat, place.lon)
 

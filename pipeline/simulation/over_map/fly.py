@@ -1,11 +1,12 @@
 """The stage of a simulated flight over a map: settings come in, photos and their table go out.
 
     photos/<number>.jpg    JPEGs with heading, pitch, height and lens in their tags, as sensors err
+    overhead/<place>.jpg   with --overhead-m: each place's piece of the map
     photos.csv             path, location, lat, lon, altitude_m, heading_deg, pitch_deg: the truth,
-                           as `make_shards --source table` reads it
+                           as `make_shards --source table` reads it; with --overhead-m view, split
     flight.json            the settings; written last
 
-Each photo is one task, and a rerun resumes with the missing ones.
+Each place is one task, and a rerun resumes with the missing ones.
 """
 
 from collections.abc import Iterator
@@ -15,12 +16,14 @@ from pathlib import Path
 
 import ray
 
+from pipeline.camera.pose import Pose
 from pipeline.core import cluster, json_files, storage
 from pipeline.core.errors import InputError
 from pipeline.core.lock import locks_output
 from pipeline.core.progress import console, progress
+from pipeline.core.records import Split, View
 from pipeline.simulation.layout import write_table
-from pipeline.simulation.over_map.photo import photo_over_map
+from pipeline.simulation.over_map.photo import MapPlace, photos_over_map
 from pipeline.simulation.over_map.settings import MapFlightSettings
 from pipeline.simulation.resume import begin, is_complete
 
@@ -45,48 +48,66 @@ def fly(settings: MapFlightSettings) -> Path:
         console.print(f"{root} is complete already; nothing to do")
         return root
     begin(root, about)
-    numbers = range(settings.photos)
-    missing = [number for number in numbers if not _part(root, number).exists()]
-    with progress(len(missing), "fly", "photos") as meter:
-        for _ in _take_photos(settings, root, missing):
+    places = range(-(-settings.photos // settings.views))
+    missing = [place for place in places if not _part(root, place).exists()]
+    with progress(len(missing), "fly", "places") as meter:
+        for _ in _visit_places(settings, root, missing):
             meter.advance()
-    rows = [json_files.read_checksummed(str(_part(root, number)))["row"] for number in numbers]
-    write_table(root / TABLE, rows)
+    parts = [json_files.read_checksummed(str(_part(root, place))) for place in places]
+    write_table(root / TABLE, [row for part in parts for row in part["rows"]])
     json_files.write_checksummed(str(root / COMPLETE), about)
     storage.remove_folder(str(root / ".parts"))
     console.print(f"{root}: {settings.photos} photos over {settings.mosaic}", markup=False)
     return root
 
 
-def _take_photos(settings: MapFlightSettings, root: Path, numbers: list[int]) -> Iterator[None]:
+def _visit_places(settings: MapFlightSettings, root: Path, places: list[int]) -> Iterator[None]:
     if settings.workers == 0:
-        for number in numbers:
-            write_photo(settings, str(root), number)
+        for place in places:
+            write_place(settings, str(root), place)
             yield
         return
     cluster.connect()
-    task, window = ray.remote(num_cpus=1)(write_photo), settings.workers or 2 * cluster.cpus()
+    task, window = ray.remote(num_cpus=1)(write_place), settings.workers or 2 * cluster.cpus()
     submit = partial(task.remote, settings, str(root))
-    for _ in cluster.bounded_map(submit, numbers, window):
+    for _ in cluster.bounded_map(submit, places, window):
         yield None
 
 
-def write_photo(settings: MapFlightSettings, root: str, number: int) -> None:
-    """Take one photo and write it, then the part with its row."""
-    taken = photo_over_map(settings, number)
-    name = f"photos/{number:05d}.jpg"
-    storage.write_bytes(str(Path(root) / name), taken.jpeg)
+def write_place(settings: MapFlightSettings, root: str, place: int) -> None:
+    """Take a place's photos and write them, then the part with their rows."""
+    first = place * settings.views
+    count = min(settings.views, settings.photos - first)
+    found = photos_over_map(settings, place, count)
+    rows = []
+    for number, photo in enumerate(found.photos, first):
+        rows.append(_row(settings, found, f"photos/{number:05d}.jpg", place, photo.pose))
+        storage.write_bytes(str(Path(root) / rows[-1]["path"]), photo.jpeg)
+    if found.overhead is not None:
+        rows.append(_row(settings, found, f"overhead/{place:05d}.jpg", place, None))
+        storage.write_bytes(str(Path(root) / rows[-1]["path"]), found.overhead)
+    json_files.write_checksummed(str(_part(Path(root), place)), {"rows": rows})
+
+
+def _row(
+    settings: MapFlightSettings, found: MapPlace, path: str, place: int, pose: Pose | None
+) -> dict[str, str]:
+    """The table's row of a photo, or, without a pose, of a piece of the map."""
     row = {
-        "path": name,
-        "location": f"{number:05d}",
-        "lat": f"{taken.lat:.8f}",
-        "lon": f"{taken.lon:.8f}",
-        "altitude_m": f"{taken.pose.altitude_m:.2f}",
-        "heading_deg": f"{taken.pose.heading_deg:.2f}",
-        "pitch_deg": f"{taken.pose.pitch_deg:.2f}",
+        "path": path,
+        "location": f"{place:05d}",
+        "lat": f"{found.lat:.8f}",
+        "lon": f"{found.lon:.8f}",
+        "altitude_m": f"{pose.altitude_m:.2f}" if pose else "",
+        "heading_deg": f"{pose.heading_deg:.2f}" if pose else "",
+        "pitch_deg": f"{pose.pitch_deg:.2f}" if pose else "",
     }
-    json_files.write_checksummed(str(_part(Path(root), number)), {"row": row})
+    if settings.overhead_m is None:
+        return row
+    test = Split.QUERY if pose else Split.GALLERY
+    split = test if settings.part == "held-out" else Split.TRAIN
+    return row | {"view": View.DRONE if pose else View.SATELLITE, "split": split}
 
 
-def _part(root: Path, number: int) -> Path:
-    return root / ".parts" / f"{number:05d}.json"
+def _part(root: Path, place: int) -> Path:
+    return root / ".parts" / f"{place:05d}.json"

@@ -1,5 +1,5 @@
-"""One simulated UAV photo over a map: a GeoTIFF, a seed and a number come in, JPEG bytes with the
-camera's tags and the true position go out.
+"""Simulated UAV photos of one place of a map: a GeoTIFF, a seed and a number come in, JPEG bytes
+with the cameras' tags and the true position go out.
 
 A pure function of its spec and the map. The ground is the map's own pixels, on another day's
 season, haze and sensor; with a surface model it has relief and parallax, without one it is flat.
@@ -24,7 +24,7 @@ from pipeline.core.errors import InputError
 from pipeline.simulation.appearance import sample_day
 from pipeline.simulation.flight import LOWEST_RAY_DEG
 from pipeline.simulation.over_map.photo_tags import with_camera_tags
-from pipeline.simulation.over_map.settings import MapFlightSettings
+from pipeline.simulation.over_map.settings import MapFlightSettings, Part
 from pipeline.simulation.render import render_perspective
 from pipeline.simulation.scene import REACH_IN_RADII, prepare_scene
 from pipeline.simulation.texture import photographed_world
@@ -38,6 +38,14 @@ MOST_TRIES = 60
 "Places that are drawn for a photo until one shows enough of the map."
 LEAST_SHOWN = 0.98
 "Of the ground around a photo: its share that the map has."
+MOST_DRAWS = 10_000
+"Pixels that are drawn until one lies in the flight's part of the map."
+BLOCK_M, HELD_OUT_BLOCKS, MARGIN_SHARE = 160.0, 5, 0.2
+"""Side of a block; one block in so many is held out; and the share of its side by which a held-out
+place keeps away from its border."""
+OVERHEAD_QUALITY = 92
+MOST_WITHOUT_HEIGHT = 0.1
+"Likewise, the share that a surface model may lack, at the map's edge and in its gaps."
 MARGIN_M = 12.0
 "Ground beyond the photo's corners."
 BLUR_PX = (0.4, 1.1)
@@ -49,19 +57,28 @@ class MapPhoto:
     """A photo and its truth."""
 
     jpeg: bytes
-    lat: float
-    "Of the ground in the photo's middle, WGS84."
-    lon: float
     pose: Pose
-    "The true one; x and y from that ground."
+    "The true one; x and y from the ground in the photo's middle."
 
 
-def photo_over_map(settings: MapFlightSettings, number: int) -> MapPhoto:
-    """Photo `number` of a flight.
+@dataclass(frozen=True, kw_only=True)
+class MapPlace:
+    """A place of a map with its photos."""
 
-    Raises InputError where the map has no place for it, or cannot be used.
+    lat: float
+    "Of the ground in the photos' middle, WGS84."
+    lon: float
+    photos: list[MapPhoto]
+    overhead: bytes | None
+    "Its piece of the map as JPEG, where it is asked for."
+
+
+def photos_over_map(settings: MapFlightSettings, place: int, count: int) -> MapPlace:
+    """`count` photos of place number `place` of a flight.
+
+    Raises InputError where the map has no place for them, or cannot be used.
     """
-    rng = np.random.default_rng([settings.seed, number])
+    rng = np.random.default_rng([settings.seed, place])
     try:
         placement = place_mosaic(settings.mosaic, None, False)
     except MosaicRejected as rejected:
@@ -70,16 +87,37 @@ def photo_over_map(settings: MapFlightSettings, number: int) -> MapPhoto:
             "expected a georeferenced GeoTIFF"
         ) from None
     for _ in range(MOST_TRIES):
-        pose = draw_pose(settings, rng)
-        window = _draw_window(settings.mosaic, placement, _reach_m(pose), rng)
-        if window.shown_HW.mean() >= LEAST_SHOWN * 255:
+        poses = [draw_pose(settings, rng) for _ in range(count)]
+        middle = _draw_point(settings, placement, rng)
+        reaches_m = [_reach_m(pose) for pose in poses]
+        widest = _window_around(settings.mosaic, placement, middle, max(reaches_m))
+        if widest.shown_HW.mean() >= LEAST_SHOWN * 255:
             break
     else:
         raise InputError(
-            f"{settings.mosaic} shows no place for photo {number} in {MOST_TRIES} tries: found "
-            f"{window.shown_HW.mean() / 255:.0%} of the ground around the last one, expected "
+            f"{settings.mosaic} shows no ground for place {place} in {MOST_TRIES} tries: found "
+            f"{widest.shown_HW.mean() / 255:.0%} of the ground around the last one, expected "
             f"{LEAST_SHOWN:.0%}; fly lower or steeper, or give a larger map"
         )
+    photos = []
+    for pose, reach_m in zip(poses, reaches_m, strict=True):
+        window = widest
+        if reach_m < max(reaches_m):
+            window = _window_around(settings.mosaic, placement, middle, reach_m)
+        photos.append(_take(settings, window, pose, rng))
+    overhead = None
+    if settings.overhead_m is not None:
+        piece = _window_around(settings.mosaic, placement, middle, settings.overhead_m / 2)
+        overhead = simplejpeg.encode_jpeg(
+            piece.pixels_HW3, quality=OVERHEAD_QUALITY, colorspace="RGB"
+        )
+    return MapPlace(lat=widest.plane.lat, lon=widest.plane.lon, photos=photos, overhead=overhead)
+
+
+def _take(
+    settings: MapFlightSettings, window: MapWindow, pose: Pose, rng: np.random.Generator
+) -> MapPhoto:
+    """One photo of a window's middle, on a day of its own."""
     heights_HW = _heights(settings.surface, window) if settings.surface else None
     world = _world(window, heights_HW)
     middle = len(world.height_HW) // 2
@@ -91,12 +129,7 @@ def photo_over_map(settings: MapFlightSettings, number: int) -> MapPhoto:
     frame_SS3 = np.asarray(cv2.GaussianBlur(frame_SS3, (0, 0), rng.uniform(*BLUR_PX)), np.uint8)
     jpeg: bytes = simplejpeg.encode_jpeg(frame_SS3, quality=JPEG_QUALITY, colorspace="RGB")
     told = _told(pose, settings, rng)
-    return MapPhoto(
-        jpeg=with_camera_tags(jpeg, told, settings.size),
-        lat=window.plane.lat,
-        lon=window.plane.lon,
-        pose=pose,
-    )
+    return MapPhoto(jpeg=with_camera_tags(jpeg, told, settings.size), pose=pose)
 
 
 def draw_pose(settings: MapFlightSettings, rng: np.random.Generator) -> Pose:
@@ -119,12 +152,42 @@ def _reach_m(pose: Pose) -> float:
     return float(np.abs(shown_42).max()) + MARGIN_M
 
 
-def _draw_window(
-    path: str, placement: Placement, half_m: float, rng: np.random.Generator
+def _draw_point(
+    settings: MapFlightSettings, placement: Placement, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Column and row of a random pixel of the flight's part of the map.
+
+    Raises InputError where the map has hardly any such.
+    """
+    dataset = open_mosaic(settings.mosaic)
+    across_m, down_m = placement.pixel_m
+    for _ in range(MOST_DRAWS):
+        x, y = rng.uniform(0, dataset.width), rng.uniform(0, dataset.height)
+        if is_in_part(settings.part, x * across_m, y * down_m):
+            return float(x), float(y)
+    raise InputError(
+        f"{settings.mosaic} has no ground in blocks that are {settings.part}, expected a map of "
+        f"several blocks of {BLOCK_M:g} m; give a larger map, or --part all"
+    )
+
+
+def is_in_part(part: Part, x_m: float, y_m: float) -> bool:
+    """Whether a point, metres from the map's corner, belongs to a part of the map."""
+    if part == "all":
+        return True
+    (column, right), (row, down) = divmod(x_m / BLOCK_M, 1), divmod(y_m / BLOCK_M, 1)
+    held_out = (column + 2 * row) % HELD_OUT_BLOCKS == 0
+    if part == "learn":
+        return not held_out
+    return held_out and max(abs(right - 0.5), abs(down - 0.5)) < 0.5 - MARGIN_SHARE
+
+
+def _window_around(
+    path: str, placement: Placement, middle: tuple[float, float], half_m: float
 ) -> MapWindow:
-    """The map around a random one of its pixels, north up, at its own resolution."""
+    """The map around one of its pixels (column, row), north up, at its own resolution."""
     dataset = open_mosaic(path)
-    x, y = rng.uniform(0, dataset.width), rng.uniform(0, dataset.height)
+    x, y = middle
     [[lat, lon]] = placement.georeference.degrees(np.array([[x, y]])).tolist()
     plane = LocalPlane(lat=lat, lon=lon)
     # The diagonal: the map may be turned against north.
@@ -156,7 +219,7 @@ def _heights(path: str, window: MapWindow) -> FloatMap:
         dst_transform=Affine(scale, 0, -side / 2 * scale, 0, -scale, side / 2 * scale),
         dst_nodata=np.nan, resampling=Resampling.bilinear,
     )  # fmt: skip
-    if np.isnan(heights_HW).mean() > 1 - LEAST_SHOWN:
+    if np.isnan(heights_HW).mean() > MOST_WITHOUT_HEIGHT:
         raise InputError(
             f"{path} has no heights around latitude {plane.lat:.5f}, longitude {plane.lon:.5f}; "
             "expected a surface model of the same ground as the map; give one, or none"

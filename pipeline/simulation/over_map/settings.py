@@ -4,8 +4,15 @@ Imports nothing heavy, so that the command line is parsed at once.
 """
 
 from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import tyro
 
 from pipeline.core.errors import require
+
+SURFACE_FLAG = tyro.conf.arg(aliases=["--dsm"])
+Part = Literal["all", "learn", "held-out"]
+"The places of a map that are flown over: all, those to learn from, or those kept to check with."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,8 +24,17 @@ class MapFlightSettings:
     out: str
     "Folder of the photos and their table; a local or mounted path."
     photos: int = 200
-    "Number of photos, each at a random place of the map."
-    surface: str | None = None
+    "Number of photos, at random places of the map."
+    views: int = 1
+    "Photos of each place, each with a pose and a day of its own."
+    overhead_m: float | None = None
+    """Write each place's piece of the map too, of so many metres a side: pairs to train and to
+    evaluate on. The table then names views and splits: train, or those of the test for --part
+    held-out."""
+    part: Part = "all"
+    """The map is a chessboard of blocks of 160 m, of which one in five is held out; with `held-out`
+    the middle of each photo lies well within such a block, with `learn` in no such block."""
+    surface: Annotated[str | None, SURFACE_FLAG] = None
     "A surface model (GeoTIFF, metres): relief and parallax. None: the ground is flat."
     height: tuple[float, float] = (60.0, 120.0)
     "Range of the camera's height above the ground, metres."
@@ -42,6 +58,9 @@ class MapFlightSettings:
 
     def __post_init__(self) -> None:
         require(self.photos >= 1, "photos", self.photos, "1 or more")
+        require(self.views >= 1, "views", self.views, "1 or more")
+        side = self.overhead_m
+        require(side is None or side > 0, "overhead_m", side, "metres above 0")
         require(64 <= self.size <= 2048, "size", self.size, "64 to 2048 pixels")
         low, high = self.pitch
         steep = "two angles from -90 to -35, the steeper first"

@@ -1,0 +1,183 @@
+"""From a map to a localizer: `adapt` on a map that nobody trained on, and what became of its word.
+
+    python benchmarks/region.py --out DIR --imagery DIR [--tiles 16] [--minutes 20] [--photos 200]
+    python benchmarks/region.py --out DIR [--side 1000] ...      a procedural town, another day
+
+The map is a mosaic of overhead images, or a town with its surface model. Photos of another seed
+(over the town: of another day's sun, season and haze, with relief) are then located with the
+camera's tags (heading wrong by 3 degrees, pitch by 1, height by 3 %) and without: before (the
+built-in encoder, tiles alone, then matched, without any fitting) and after `adapt`. Beside it: what
+`adapt` promised, photos of another map, and how often matching makes a right tile's answer worse.
+"""
+
+import argparse
+import csv
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from own_map import make_index, make_map, write_map
+
+from jobs.region.adapt import adapt
+from jobs.region.expect import outcome_of
+from jobs.region.settings import AdaptSettings
+from jobs.stages.locate import locate_photos
+from jobs.stages.settings import LocateSettings
+from model.weights.builtin import BUILTIN
+from pipeline.core import cluster
+from pipeline.region.expectation import Expectation, Outcome, expect
+from pipeline.simulation.over_map.fly import fly
+from pipeline.simulation.over_map.settings import MapFlightSettings, TownMapSettings
+from pipeline.simulation.over_map.town_map import ANOTHER_DAY, MAP, SURFACE, make_town_map
+
+Truth = dict[str, tuple[float, float, float, float]]
+"Latitude, longitude, height and pitch by the photo's path."
+
+
+def make_maps(options: argparse.Namespace, out: Path, seed: int) -> tuple[str, str, str | None]:
+    """A map, what photos are taken over (the same ground), and its surface model."""
+    if options.imagery is None:
+        town = make_town_map(
+            TownMapSettings(
+                out=str(out), side=options.side, resolution=options.resolution, seed=seed
+            )
+        )
+        return str(town / MAP), str(town / ANOTHER_DAY), str(town / SURFACE)
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / "map.tif"
+    if not path.exists():
+        write_map(make_map(options.imagery, options.tiles, seed), path)
+    return str(path), str(path), None
+
+
+def take_photos(
+    options: argparse.Namespace, over: str, surface: str | None, out: Path, count: int
+) -> Truth:
+    """Photos that `adapt` has not seen, with the truth."""
+    flight = fly(
+        MapFlightSettings(
+            mosaic=over, surface=surface, out=str(out), photos=count, seed=1000 + options.seed,
+            height=tuple(options.height),
+        )
+    )  # fmt: skip
+    with (flight / "photos.csv").open() as table:
+        return {
+            str(flight / row["path"]): (
+                float(row["lat"]), float(row["lon"]), float(row["altitude_m"]),
+                float(row["pitch_deg"]),
+            )
+            for row in csv.DictReader(table)
+        }  # fmt: skip
+
+
+def locate_all(settings: LocateSettings, truth: Truth) -> tuple[list[Outcome], float]:
+    """The photos' outcomes in their order, and the seconds a photo."""
+    begin = time.perf_counter()
+    located = {one.name: one for one in locate_photos(settings)}
+    seconds = (time.perf_counter() - begin) / len(truth)
+    outcomes = [
+        outcome_of(located[path], (lat, lon), settings.pose, height_m, pitch_deg)
+        for path, (lat, lon, height_m, pitch_deg) in truth.items()
+    ]
+    return outcomes, seconds
+
+
+def print_row(name: str, outcomes: Sequence[Outcome], seconds: float, baseline: float) -> float:
+    """A row of the table; the share within 25 m."""
+    found = expect(name, outcomes)
+    within = [f"{one.value:.1%} [{one.low:.1%}, {one.high:.1%}]" for one in found.within]
+    gap = "" if np.isnan(found.calibration_gap) else f"{100 * found.calibration_gap:+.1f} points"
+    share = found.within[-1].value
+    ratio = share / max(baseline or share, 1 / len(outcomes))
+    print(
+        f"| {name} | {found.answered.value:.1%} | {' | '.join(within)} | {found.wrong.value:.1%} "
+        f"| {found.median_m:.2f} m | {gap} | {seconds:.2f} s | {ratio:.2f} x |",
+        flush=True,
+    )
+    return share
+
+
+def print_promises(promised: Sequence[Expectation], seen: dict[bool, list[Outcome]]) -> None:
+    """How near `what to expect` came to what was seen."""
+    for way, posed in zip(promised[:2], (True, False), strict=True):
+        found = expect("", seen[posed])
+        for at, metres in ((1, 5), (2, 25)):
+            told, kept = way.within[at].value, found.within[at].value
+            print(f"{way.title}, within {metres} m: promised {told:.1%}, seen {kept:.1%}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--imagery", type=Path, help="overhead images; without them, a town")
+    parser.add_argument("--tiles", type=int, default=16, help="images along a side of the mosaic")
+    parser.add_argument("--side", type=float, default=1000.0, help="of the town, metres")
+    parser.add_argument("--resolution", type=float, default=0.3, help="of the town, m a pixel")
+    parser.add_argument("--minutes", type=float, default=20.0)
+    parser.add_argument("--photos", type=int, default=200)
+    parser.add_argument("--checks", type=int, default=80)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--height", type=float, nargs=2, default=(60.0, 120.0), help="metres")
+    options = parser.parse_args()
+    out: Path = options.out
+    cluster.connect()
+    mosaic, over, surface = make_maps(options, out / "map", options.seed)
+    truth = take_photos(options, over, surface, out / "photos", options.photos)
+    _, far, far_surface = make_maps(options, out / "elsewhere-map", options.seed + 100)
+    strangers = take_photos(
+        options, far, far_surface, out / "elsewhere", max(1, options.photos // 4)
+    )
+    region = out / "region"
+    begin = time.perf_counter()
+    promised = adapt(
+        AdaptSettings(
+            mosaic=mosaic, surface=surface, out=str(region), minutes=options.minutes,
+            checks=options.checks, seed=options.seed, height=tuple(options.height),
+        )
+    )  # fmt: skip
+    print(f"adapt: {(time.perf_counter() - begin) / 60:.1f} minutes")
+    tiles = str(region / "tiles")
+    before = LocateSettings(
+        photos=tuple(truth), checkpoint=BUILTIN, index=make_index(out / "before", tiles, BUILTIN),
+        shards=tiles, out=str(out / "where.geojson"), match=False,
+    )  # fmt: skip
+    after = replace(before, index=str(region / "index"))
+    print(
+        "| photos | answered | within 1 m | within 5 m | within 25 m | wrong answers | median "
+        "| promised too much | a photo | within 25 m, x the first row |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    baseline, seen, by_tiles = 0.0, {}, {}
+    for posed, way in ((True, "with tags"), (False, "without")):
+        for name, settings in (
+            ("before, tiles", before),
+            ("before, matched by rule", replace(before, match=True)),
+            ("after, tiles", replace(after, match=False)),
+            ("after", replace(after, match=True)),
+        ):
+            found, seconds = locate_all(replace(settings, pose=posed), truth)
+            share = print_row(f"{name}, {way}", found, seconds, baseline)
+            baseline = baseline or share
+            if name == "after":
+                seen[posed] = found
+            elif name == "after, tiles":
+                by_tiles[posed] = found
+    print_promises(promised, seen)
+    pairs = [
+        pair for posed in seen for pair in zip(by_tiles[posed], seen[posed], strict=True)
+        if pair[0].error_m <= 25
+    ]  # fmt: skip
+    worse = sum(refined.error_m > max(tile.error_m, 5) for tile, refined in pairs)
+    print(f"right tiles made worse by matching (and more than 5 m off): {worse} of {len(pairs)}")
+    for posed, way in ((True, "with tags"), (False, "without")):
+        settings = replace(after, photos=tuple(strangers), match=True, pose=posed)
+        given = sum(one.known for one in locate_all(settings, strangers)[0])
+        print(f"photos of another map, {way}: {given} of {len(strangers)} answered")
+    print(json.dumps({"minutes": options.minutes, "seed": options.seed, "photos": len(truth)}))
+
+
+if __name__ == "__main__":
+    main()

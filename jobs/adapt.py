@@ -1,0 +1,23 @@
+"""From a map to a localizer: `adapt.py --mosaic map.tif [--surface dsm.tif] [--photos DIR] --out
+REGION [--minutes 20]`
+
+Makes tiles, flies simulated UAVs over the map, fine-tunes the built-in encoder, builds the index,
+fits its confidence, and writes REGION/what_to_expect.html. Then: `locate.py --index REGION/index
+--shards REGION/tiles --checkpoint REGION/encoder.safetensors --out where.geojson PHOTO...`
+"""
+
+from jobs.command_line.cli import run
+from jobs.region.settings import AdaptSettings
+
+
+def main(settings: AdaptSettings) -> None:
+    """Make a localizer of a map: tiles, an encoder that has learned the map, an index with a fitted
+    confidence, and a page that says what to expect.
+    """
+    from jobs.region.adapt import adapt
+
+    adapt(settings)
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,109 @@
+"""Photos of known places, located by a region: what can be expected of it."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from jobs.region.folder import Region
+from jobs.stages.calibrate_flight import flight_of
+from jobs.stages.locate import locate_photos
+from jobs.stages.settings import LocateSettings
+from pipeline.core.records import ImageRecord, View
+from pipeline.features.table import open_table
+from pipeline.index.searcher import Index
+from pipeline.locate.geojson import LocatedPhoto
+from pipeline.locate.page import distance_to_m
+from pipeline.region.expectation import Expectation, Outcome, expect
+from pipeline.region.lookalikes import Lookalike, find_lookalikes
+from pipeline.sources.photos import Photos
+
+LOOKALIKES, LOOKALIKE_ROWS, APART_TILES = 6, 1000, 3
+"""Pairs on the page, gallery images that are searched for them, and sides of a tile that a pair is
+at least apart."""
+
+
+def located_outcomes(region: Region, table: str, most: int) -> list[Outcome]:
+    """The photos of a table located with and without their tags, against the truth."""
+    photos = {photo.path: photo.truth for photo in flight_of(table, most)}
+    outcomes = []
+    for posed in (True, False):
+        settings = locate_settings(region, tuple(photos), posed)
+        for one in locate_photos(settings, {path: (t.lat, t.lon) for path, t in photos.items()}):
+            truth = photos[one.name]
+            outcomes.append(
+                outcome_of(one, (truth.lat, truth.lon), posed, truth.altitude_m, truth.pitch_deg)
+            )
+    return outcomes
+
+
+def locate_settings(region: Region, photos: tuple[str, ...], posed: bool) -> LocateSettings:
+    """Photos located by the region; its answers and page lie in its folder."""
+    way = "with-tags" if posed else "without-tags"
+    return LocateSettings(
+        photos=photos, checkpoint=region.encoder, index=region.index, shards=region.tiles,
+        pose=posed, out=region.path("expect", f"{way}.geojson"),
+        page=region.path("expect", f"{way}.html"),
+    )  # fmt: skip
+
+
+def outcome_of(
+    one: LocatedPhoto,
+    truth: tuple[float, float],
+    posed: bool,
+    height_m: float | None,
+    pitch_deg: float | None,
+) -> Outcome:
+    """An answer against the truth."""
+    answer = one.answer
+    error_m = distance_to_m(answer, truth) if answer else None
+    return Outcome(
+        name=one.name,
+        error_m=math.inf if error_m is None else error_m,
+        known=answer is not None and answer.known,
+        probability=answer.probability if answer else None,
+        within_m=answer.within_m if answer else None,
+        refined=answer is not None and answer.refinement is not None,
+        posed=posed,
+        height_m=math.nan if height_m is None else height_m,
+        pitch_deg=math.nan if pitch_deg is None else pitch_deg,
+    )
+
+
+def real_photos(region: Region, folder: str | None) -> Expectation | None:
+    """The UAV's own photos, located and compared with their GPS; None where they have none."""
+    if not folder:
+        return None
+    source = Photos(location="file", project=True)
+    truths = {
+        record.path: record.geotag
+        for record in source.scan(folder)
+        if isinstance(record, ImageRecord) and record.geotag is not None
+    }
+    if not truths:
+        return None
+    given = locate_settings(region, tuple(truths), posed=True)
+    given = replace(
+        given,
+        out=region.path("expect", "photos.geojson"),
+        page=region.path("expect", "photos.html"),
+    )
+    located = locate_photos(given, {path: (tag.lat, tag.lon) for path, tag in truths.items()})
+    outcomes = [
+        outcome_of(one, (truths[one.name].lat, truths[one.name].lon), True,
+                   truths[one.name].altitude_m, truths[one.name].pitch_deg)
+        for one in located
+    ]  # fmt: skip
+    return expect("your photos, against their GPS", outcomes)
+
+
+def lookalikes(region: Region, tile_m: float) -> list[Lookalike]:
+    index = Index(region.index)
+    table = open_table(region.path("table")).select(None, View.SATELLITE)
+    labels = table.labels()
+    rows = np.unique(np.linspace(0, table.rows - 1, min(table.rows, LOOKALIKE_ROWS)).astype(int))
+    positions_N2 = np.stack([labels.lats, labels.lons], axis=1)[rows]
+    return find_lookalikes(
+        index, [str(key) for key in labels.keys[rows]], positions_N2, table.embeddings()[rows],
+        apart_m=APART_TILES * tile_m, count=LOOKALIKES,
+    )  # fmt: skip

@@ -1,0 +1,62 @@
+"""The simulated flights of a region: to learn from, to check with, and to expect by."""
+
+from dataclasses import asdict, replace
+
+from jobs.region.folder import Region, print_command
+from jobs.region.settings import AdaptSettings
+from pipeline.core import storage
+from pipeline.region.camera_ranges import CameraRanges
+from pipeline.shards.pack import pack
+from pipeline.shards.settings import PackingSettings
+from pipeline.simulation.over_map.fly import TABLE, fly
+from pipeline.simulation.over_map.settings import MapFlightSettings
+from pipeline.sources.table import Table
+
+VIEWS = 4
+"Photos of each place to learn from."
+PLACES_PER_MINUTE, LEAST_PLACES, MOST_PLACES = 20, 48, 400
+"To learn from: training sees each of them some twenty times."
+LEARN_PX = 256
+"Side of a photo to learn from: the encoder sees 128."
+TESTED_PLACES = 60
+"Held-out places that choose between the encoder before and after training."
+
+
+def plan_flights(
+    region: Region, settings: AdaptSettings, cameras: CameraRanges
+) -> list[MapFlightSettings]:
+    """The flights: pairs to learn from, pairs that choose the encoder, photos that confidence is
+    fitted on, and photos that tell what to expect. Each has days of its own."""
+    base = MapFlightSettings(
+        mosaic=settings.mosaic, surface=settings.surface, out="", part="held-out",
+        photos=settings.checks, height=cameras.height_m, pitch=cameras.pitch_deg,
+        fov=cameras.fov_deg,
+    )  # fmt: skip
+    pairs = replace(base, overhead_m=settings.tile_m, size=LEARN_PX)
+    places = min(MOST_PLACES, max(LEAST_PLACES, round(settings.minutes * PLACES_PER_MINUTE)))
+    flights = {
+        "learn": replace(pairs, part="learn", photos=places * VIEWS, views=VIEWS),
+        "choose": replace(pairs, photos=2 * TESTED_PLACES, views=2),
+        "check": base,
+        "expect": base,
+    }
+    return [
+        replace(flight, out=region.path("flights", name), seed=10 * settings.seed + number)
+        for number, (name, flight) in enumerate(flights.items())
+    ]
+
+
+def take_flight(flight: MapFlightSettings) -> str:
+    told = {name: value for name, value in asdict(flight).items() if value is not None}
+    default = asdict(MapFlightSettings(mosaic="", out=""))
+    print_command("fly", **{name: told[name] for name in told if told[name] != default[name]})
+    return str(fly(flight))
+
+
+def pack_pairs(flight: str) -> str:
+    """A flight's pairs as shards."""
+    out = f"{flight}-shards"
+    root = storage.join(flight, TABLE)
+    print_command("make_shards", source="table", root=root, out=out)
+    pack(Table(), PackingSettings(root=root, out=out))
+    return out

@@ -1,0 +1,70 @@
+"""The folder of a region: what lies where, and the command that makes each part alone."""
+
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+
+from jobs.region.settings import AdaptSettings
+from pipeline.core import json_files, storage
+from pipeline.core.errors import InputError
+from pipeline.core.progress import console
+
+
+@dataclass(frozen=True, kw_only=True)
+class Region:
+    """The folder of a region and what lies in it."""
+
+    out: str
+
+    def path(self, *names: str) -> str:
+        return storage.join(self.out, *names)
+
+    @cached_property
+    def tiles(self) -> str:
+        return self.path("tiles")
+
+    @cached_property
+    def index(self) -> str:
+        return self.path("index")
+
+    @cached_property
+    def encoder(self) -> str:
+        return self.path("encoder.safetensors")
+
+
+def claim(region: Region, settings: AdaptSettings) -> None:
+    """Note the region's settings in its folder.
+
+    Raises InputError where it is of others, or has no map.
+    """
+    if not storage.exists(settings.mosaic):
+        raise InputError(f"no map at {settings.mosaic}, expected a GeoTIFF; check --mosaic")
+    about = {name: value for name, value in asdict(settings).items() if name != "out"}
+    about |= {name: list(value) for name, value in about.items() if isinstance(value, tuple)}
+    path = region.path("region.json")
+    if not storage.exists(path):
+        Path(region.out).mkdir(parents=True, exist_ok=True)
+        json_files.write_checksummed(path, about)
+        return
+    try:
+        found = json_files.read_checksummed(path)
+    except ValueError as error:
+        raise InputError(
+            f"{path} is damaged ({error}), expected the settings of a region; remove the folder "
+            "and adapt again"
+        ) from None
+    differing = sorted(name for name in {*found, *about} if found.get(name) != about.get(name))
+    if differing:
+        raise InputError(
+            f"{region.out} was adapted with another {', '.join(differing)}, expected the same "
+            "settings to resume; choose another --out or remove the folder"
+        )
+
+
+def print_command(name: str, **flags: object) -> None:
+    """Print the command that runs a stage alone."""
+    words = []
+    for flag, value in flags.items():
+        values = value if isinstance(value, (list, tuple)) else [value]
+        words += [f"--{flag.replace('_', '-')}", *map(str, values)]
+    console.print(f"pvda {name} {' '.join(words)}", style="dim", markup=False, soft_wrap=True)

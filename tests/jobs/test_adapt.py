@@ -1,0 +1,82 @@
+"""From a map to a localizer: every stage once on a small map, a rerun that makes nothing anew, and
+what is refused."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jobs.encoding.localizer import with_localizer
+from jobs.region import flights
+from jobs.region.adapt import PAGE, adapt
+from jobs.region.settings import AdaptSettings
+from jobs.stages.settings import LocateSettings
+from model.weights.builtin import BUILTIN
+from pipeline.core.errors import InputError
+from pipeline.simulation.over_map.settings import TownMapSettings
+from pipeline.simulation.over_map.town_map import MAP, SURFACE, make_town_map
+
+
+@pytest.fixture(scope="module")
+def small() -> Iterator[None]:
+    """Fewer places than anybody would learn from."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(flights, "LEAST_PLACES", 24)
+        patch.setattr(flights, "TESTED_PLACES", 4)
+        patch.setattr(flights, "VIEWS", 1)
+        yield
+
+
+@pytest.fixture(scope="module")
+def settings(
+    tmp_path_factory: pytest.TempPathFactory, ray_cluster: None, small: None
+) -> AdaptSettings:
+    """A region of a town of 400 m, with a moment of training."""
+    root = tmp_path_factory.mktemp("adapt")
+    town = make_town_map(TownMapSettings(out=str(root / "town"), side=400.0, resolution=0.5))
+    given = AdaptSettings(
+        mosaic=str(town / MAP), surface=str(town / SURFACE), out=str(root / "region"),
+        minutes=0.01, checks=20, height=(60.0, 80.0), pitch=(-90.0, -75.0),
+    )  # fmt: skip
+    adapt(given)
+    return given
+
+
+def test_adapt_makes_a_localizer_and_says_what_to_expect(settings: AdaptSettings) -> None:
+    out = Path(settings.out)
+    assert "What to expect of map.tif" in (out / PAGE).read_text()
+    figures = json.loads((out / "expect" / "figures.json").read_text())
+    assert [one["photos"] for one in figures["expectations"][:2]] == [20, 20]
+    errors = np.array([one["error_m"] for one in figures["outcomes"] if one["known"]])
+    assert np.median(errors) < 25
+    assert (out / "index" / "calibration.json").exists()
+    located = with_localizer(
+        LocateSettings(photos=("a.jpg",), index=str(out / "index"), out="where.geojson")
+    )
+    assert Path(located.checkpoint).resolve() == (out / "encoder.safetensors").resolve()
+    assert Path(located.shards or "").resolve() == (out / "tiles").resolve()
+    named = with_localizer(replace(located, checkpoint="mine.pt", shards="tiles"))
+    assert (named.checkpoint, named.shards) == ("mine.pt", "tiles")
+    (out / "index" / "localizer.json").rename(out / "elsewhere.json")
+    alone = LocateSettings(photos=("a.jpg",), index=str(out / "index"), out="where.geojson")
+    assert with_localizer(alone).checkpoint == BUILTIN
+    (out / "elsewhere.json").rename(out / "index" / "localizer.json")
+
+
+def test_adapt_again_makes_nothing_anew(settings: AdaptSettings) -> None:
+    made = [path for path in Path(settings.out).rglob("*") if path.is_file()]
+    kept = {path: path.stat().st_mtime_ns for path in made}
+    adapt(settings)
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    with pytest.raises(InputError, match="adapted with another seed"):
+        adapt(replace(settings, seed=1))
+
+
+def test_adapt_without_a_map_is_refused(tmp_path: Path) -> None:
+    given = AdaptSettings(mosaic=str(tmp_path / "none.tif"), out=str(tmp_path / "region"))
+    with pytest.raises(InputError, match="no map at"):
+        adapt(given)
+    assert not (tmp_path / "region" / "region.json").exists()
