@@ -76,30 +76,29 @@ def print_published(tasks: list[str]) -> None:
 
 def print_positions(rows: list[dict[str, Any]]) -> None:
     """Distance errors of the best answers, if positions are known."""
-    known = [row for row in rows if row.get("geo_queries")]
+    known = [row for row in rows if row.get("distance_p90_m") is not None]
     if not known:
         return
     table = _table("distance of the best answer")
     for heading in (
         "task",
         "median",
-        "≤ 25 m",
-        "50 m",
-        "100 m",
+        "90 %",
+        "≤ 1 m",
+        "5 m",
+        "25 m",
         "SDM@1",
-        "SDM@3",
         "SDM@5",
         "queries",
     ):
         table.add_column(heading, justify="left" if heading == "task" else "right", no_wrap=True)
     for row in known:
-        shares = (f"{100 * row[f'within_{metres}m']:.2f}" for metres in (25, 50, 100))
-        marks = (
-            "-" if row[f"sdm{k}"] is None else f"{100 * row[f'sdm{k}']:.2f}" for k in (1, 3, 5)
-        )
+        shares = (f"{100 * row[f'within_{metres}m']:.2f}" for metres in (1, 5, 25))
+        marks = ("-" if row[f"sdm{k}"] is None else f"{100 * row[f'sdm{k}']:.2f}" for k in (1, 5))
         table.add_row(
             row["task"],
             f"{row['distance_median_m']:.1f} m",
+            f"{row['distance_p90_m']:.1f} m",
             *shares,
             *marks,
             f"{row['geo_queries']:,}",

@@ -45,6 +45,7 @@ from pipeline.retrieval.results import (
 from pipeline.retrieval.subsets import vectors_by_key
 from pipeline.retrieval.tasks import METRICS_SCHEMA, Task, possible_tasks, retrieve
 from pipeline.shards.shard_set import ShardSet, open_shards
+from pipeline.shards.tile_reader import TileReader
 from pipeline.shards.verify import require_intact
 
 OUTPUT_SETTINGS = (
@@ -272,7 +273,7 @@ def _write_report(evaluation: _Evaluation, results: EvaluationResults) -> None:
             by_key |= vectors_by_key(embedding_set_from_table(table), wanted)
         return by_key
 
-    images = no_images if shards is None else shards.fetch
+    images = no_images if shards is None else TileReader(shards).fetch
     page = render_report(results, evaluation.context, images, vectors, settings.panels)
     storage.write_bytes(storage.join(settings.out, "report.html"), page.encode())
     if settings.figures:

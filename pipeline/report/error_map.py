@@ -11,7 +11,9 @@ import numpy as np
 from pipeline.report.charts import Axis, Chart, Row, Series, Tick, share_axis
 from pipeline.report.map_sheet import MapSheet, format_metres
 
-MAX_LINES = 300
+MAX_ARROWS = 300
+SHORTEST_ARROW_PX = 2.0
+"Shorter ones are hidden by the dots of their places."
 MAX_WORST = 5
 
 
@@ -27,13 +29,25 @@ class MapLocation:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ErrorArrow:
+    """From where queries were taken to the position of their first answer."""
+
+    x1: float
+    y1: float
+    x2: float
+    y2: float
+    right: bool
+    "The answer is of the queries' own place."
+    text: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class ErrorMap:
     title: str
     note: str
     summary: str
     places: tuple[MapLocation, ...]
-    lines: tuple[tuple[float, float, float, float, str], ...]
-    "From a place to the position of a wrong first answer: x, y, x, y and the text."
+    arrows: tuple[ErrorArrow, ...]
     bar: tuple[float, str]
     "Length of the scale bar and its label."
     meridians: tuple[Tick, ...]
@@ -43,8 +57,8 @@ class ErrorMap:
 
     @property
     def opacity(self) -> float:
-        """Opacity of the lines: the more there are, the fainter."""
-        return min(0.65, 4 / math.sqrt(max(len(self.lines), 1)))
+        """Opacity of the arrows: the more there are, the fainter."""
+        return min(0.8, 6 / math.sqrt(max(len(self.arrows), 1)))
 
 
 def with_positions(rows: Sequence[Row]) -> list[Row]:
@@ -61,26 +75,25 @@ def error_map(title: str, rows: Sequence[Row]) -> ErrorMap | None:
     for row in known:
         by_place.setdefault(row["location"], []).append(row)
     asked_L2 = np.array([(each[0]["lat"], each[0]["lon"]) for each in by_place.values()])
-    wrong = Counter(
-        (row["location"], row["top_locations"][0], row["answer_lat"], row["answer_lon"])
-        for row in known if row["first_match_rank"] != 1
-    )  # fmt: skip
-    far: dict[tuple[str, str], float] = {}
-    for row in known:
-        pair = row["location"], row["top_locations"][0]
-        far[pair] = max(far.get(pair, 0.0), row["distance_m"])
-    drawn = sorted(wrong, key=lambda line: (-far[line[:2]], line))[:MAX_LINES]
-    answers_N2 = np.array([line[2:] for line in drawn]).reshape(-1, 2)
-    sheet = MapSheet.around(np.concatenate([asked_L2, answers_N2]))
+    off = [row for row in known if row["distance_m"] > 0]
+    errors = Counter(_ends(row) for row in off)
+    rows_of = {_ends(row): row for row in off}
+    drawn = sorted(errors, key=lambda ends: (-rows_of[ends]["distance_m"], ends))[:MAX_ARROWS]
+    ends_A4 = np.array([ends[2:] for ends in drawn]).reshape(-1, 4)
+    sheet = MapSheet.around(np.concatenate([asked_L2, ends_A4[:, :2], ends_A4[:, 2:]]))
     at = dict(zip(by_place, sheet.xy(asked_L2), strict=True))
-    lines = []
-    for line, end in zip(drawn, sheet.xy(answers_N2), strict=True):
-        place, answer = line[:2]
-        text = (
-            f"{place} taken for {answer}, {format_metres(far[place, answer])} off, "
-            f"{wrong[line]} of {len(by_place[place])}"
-        )
-        lines.append((*at[place], *end, text))
+    arrows = []
+    for ends, (x1, y1), (x2, y2) in zip(
+        drawn, sheet.xy(ends_A4[:, :2]), sheet.xy(ends_A4[:, 2:]), strict=True
+    ):
+        row, (place, answer) = rows_of[ends], ends[:2]
+        right = row["first_match_rank"] == 1
+        if right and math.hypot(x2 - x1, y2 - y1) < SHORTEST_ARROW_PX:
+            continue
+        taken = "answered by an image of its own place" if right else f"taken for {answer}"
+        count = f"{errors[ends]} of {len(by_place[place])}"
+        text = f"{place} {taken}, {format_metres(row['distance_m'])} off, {count}"
+        arrows.append(ErrorArrow(x1=x1, y1=y1, x2=x2, y2=y2, right=right, text=text))
     places = []
     for name, each in by_place.items():
         hits = sum(row["first_match_rank"] == 1 for row in each)
@@ -88,16 +101,18 @@ def error_map(title: str, rows: Sequence[Row]) -> ErrorMap | None:
         places.append(
             MapLocation(x=at[name][0], y=at[name][1], found=2 * hits >= len(each), text=text)
         )
-    misses = sum(wrong.values())
-    cut = f"; of {len(wrong):,} lines the {MAX_LINES} longest" if len(wrong) > MAX_LINES else ""
+    misses = sum(row["first_match_rank"] != 1 for row in known)
+    cut = (
+        f"; of {len(errors):,} arrows the {MAX_ARROWS} longest" if len(errors) > MAX_ARROWS else ""
+    )
     return ErrorMap(
         title=title,
-        note=f"{len(places):,} places; "
-        f"a line leads from a place to where a wrong first answer lies{cut}",
+        note=f"{len(places):,} places; an arrow leads from where a query was taken to where its "
+        f"first answer lies{cut}",
         summary=f"Map of {len(places):,} places: "
         f"{misses:,} of {len(known):,} first answers are wrong",
         places=tuple(places),
-        lines=tuple(lines),
+        arrows=tuple(arrows),
         bar=sheet.bar(),
         meridians=sheet.meridians(),
         parallels=sheet.parallels(),
@@ -128,6 +143,14 @@ def distance_chart(title: str, rows: Sequence[Row]) -> Chart | None:
         x=Axis(label="distance (m)", low=1, high=10.0**top, ticks=ticks, log=True),
         y=share_axis("queries"),
     )
+
+
+def _ends(row: Row) -> tuple[str, str, float, float, float, float]:
+    """Place and answer of a query, and where both lie: queries that share them share an arrow."""
+    return (
+        row["location"], row["top_locations"][0],
+        row["lat"], row["lon"], row["answer_lat"], row["answer_lon"],
+    )  # fmt: skip
 
 
 def _worst(known: Sequence[Row]) -> list[Row]:

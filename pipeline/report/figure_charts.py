@@ -89,9 +89,21 @@ def scatter_figure(scatter: Scatter) -> Figure:
 def map_figure(drawn: ErrorMap) -> Figure:
     """The page's map of errors."""
     figure, [axes] = _figure(1, COLUMN * map_sheet.MAP_HEIGHT / map_sheet.MAP_WIDTH)
-    for x1, y1, x2, y2, _ in drawn.lines:
-        axes.plot([x1, x2], [y1, y2], color=RED, linewidth=0.4, alpha=drawn.opacity, zorder=1)
-        axes.plot(x2, y2, "o", color=RED, markersize=1.2, zorder=1)
+    for arrow in drawn.arrows:
+        axes.annotate(
+            "",
+            xy=(arrow.x2, arrow.y2),
+            xytext=(arrow.x1, arrow.y1),
+            arrowprops={
+                "arrowstyle": "-|>,head_length=.12,head_width=.06",
+                "color": BLUE if arrow.right else RED,
+                "linewidth": 0.4,
+                "alpha": drawn.opacity,
+                "shrinkA": 0,
+                "shrinkB": 0,
+            },
+            zorder=1,
+        )
     for found, name, look in (
         (True, "found first by half or more", {"color": GREEN}),
         (

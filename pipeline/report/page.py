@@ -19,7 +19,13 @@ from pipeline.report.inputs import EvaluationResults, ReportContext, VectorLoade
 from pipeline.report.options import DEFAULT_PANELS
 from pipeline.report.panels import make_panel
 from pipeline.report.tables import group_tables, part_tables
-from pipeline.report.tasks import METRIC_LABELS, PanelChoice, choose_panels, task_views
+from pipeline.report.tasks import (
+    METRE_LABELS,
+    METRIC_LABELS,
+    PanelChoice,
+    choose_panels,
+    task_views,
+)
 from pipeline.report.training_charts import training_charts
 from pipeline.retrieval.subsets import evenly_spaced
 
@@ -76,6 +82,7 @@ def render_report(
         groups=group_tables(results.groups, names, r1),
         parts=part_tables(results.parts, names, r1),
         gaps=[svg.layout_scatter(scatter(gap, context.beside)) for gap in results.gaps],
+        metres=METRE_LABELS if any(task.geo for task in tasks) else {},
         maps=[task.errors for task in single if task.errors],
         training=training_charts(context.training),
         sections=[

@@ -25,6 +25,13 @@ from pipeline.report.panels import (
 from pipeline.retrieval import metrics
 from pipeline.retrieval.subsets import evenly_spaced
 
+METRE_LABELS = {
+    "within_1m": "≤ 1 m",
+    "within_5m": "≤ 5 m",
+    "within_25m": "≤ 25 m",
+    "distance_median_m": "median",
+    "distance_p90_m": "90 % within",
+}
 METRIC_LABELS = {"r1": "R@1", "r5": "R@5", "r10": "R@10", "r1p": "R@1%", "ap": "AP"}
 
 
@@ -103,7 +110,7 @@ def _task_view(
             for measure, (low, high) in bounds.items()
             if low is not None and high is not None
         },
-        geo=row if row.get("geo_queries") else None,
+        geo=row if row.get("geo_queries") and "distance_p90_m" in row else None,
         recall=recall_chart(
             name,
             f"{row['queries']:,} queries, {row['gallery']:,} in the gallery",

@@ -6,6 +6,7 @@ bootstrap: Davison and Hinkley, Bootstrap Methods and their Application, 1997, s
 only, seeded, no I/O. Shapes: Q queries, L locations, M measures, S samples.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,14 +50,40 @@ def resampled_means(
     total_LM = np.stack(
         [np.bincount(location_Q, weights=column_Q) for column_Q in values_QM.T], axis=1
     )
-    rng = np.random.default_rng(seed)
-    means, step = [], max(1, WEIGHTS_PER_BLOCK // len(names))
+    return np.concatenate(
+        [
+            (weight_SL @ total_LM) / (weight_SL @ count_L)[:, None]
+            for weight_SL in _draws(len(names), len(names), samples, seed)
+        ]
+    )
+
+
+def _draws(locations: int, width: int, samples: int, seed: int) -> Iterator[Ints]:
+    """How often each location is drawn (S, L), in blocks that `width` columns of them fit."""
+    rng, step = np.random.default_rng(seed), max(1, WEIGHTS_PER_BLOCK // width)
     for first in range(0, samples, step):
-        weight_SL = rng.multinomial(
-            len(names), np.full(len(names), 1 / len(names)), min(step, samples - first)
-        )
-        means.append((weight_SL @ total_LM) / (weight_SL @ count_L)[:, None])
-    return np.concatenate(means)
+        share_L = np.full(locations, 1 / locations)
+        yield rng.multinomial(locations, share_L, min(step, samples - first))
+
+
+def quantile_intervals(
+    values_Q: Doubles,
+    locations_Q: Strings,
+    shares: Sequence[float],
+    samples: int = BOOTSTRAP_SAMPLES,
+    seed: int = BOOTSTRAP_SEED,
+) -> Doubles:
+    """The 95 % percentile interval of each quantile of the values, (2, M): low, high; locations are
+    drawn as for means. Q >= 1."""
+    names, location_Q = np.unique(locations_Q, return_inverse=True)
+    order_Q = np.argsort(values_Q, kind="stable")
+    sorted_Q, found = values_Q[order_Q], []
+    for weight_SL in _draws(len(names), len(values_Q), samples, seed):
+        reached_SQ = np.cumsum(weight_SL[:, location_Q[order_Q]], axis=1)
+        at_SM = [(reached_SQ < share * reached_SQ[:, -1:]).sum(axis=1) for share in shares]
+        found.append(sorted_Q[np.stack(at_SM, axis=1)])
+    tails = [(1 - CONFIDENCE_LEVEL) / 2, (1 + CONFIDENCE_LEVEL) / 2]
+    return np.asarray(np.quantile(np.concatenate(found), tails, axis=0))
 
 
 def confidence_intervals(

@@ -48,8 +48,13 @@ METRICS_SCHEMA = pa.schema(
         *((f"{name}_{end}", pa.float64()) for name in METRIC_NAMES for end in ("low", "high")),
         # queries with a position; 0 if distances are unknown, and then they are null
         ("geo_queries", pa.int64()),
-        ("distance_median_m", pa.float64()),
+        *((name, pa.float64()) for name in geo_metrics.QUANTILES),
         *((f"within_{metres}m", pa.float64()) for metres in geo_metrics.WITHIN_M),
+        *(
+            (f"{name}_{end}", pa.float64())
+            for name in geo_metrics.WITH_INTERVALS
+            for end in ("low", "high")
+        ),
         *((f"sdm{k}", pa.float64()) for k in geo_metrics.SDM_K),
     ]
 )
@@ -188,7 +193,9 @@ def _metric_row(
     # With positions for a part of the gallery only, no distance is measured at all.
     unknown = bool(np.isnan(answers_N2).any())
     queries_Q2 = np.full((len(queries.keys), 2), np.nan) if unknown else _positions(queries)
-    return row | geo_metrics.distance_metrics(queries_Q2, answers_N2[ranking.top_rows_QK])
+    return row | geo_metrics.distance_metrics(
+        queries_Q2, answers_N2[ranking.top_rows_QK], queries.locations
+    )
 
 
 def _positions(embeddings: EmbeddingSet) -> Doubles:

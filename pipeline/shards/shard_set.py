@@ -16,7 +16,6 @@ from pipeline.shards import record_table
 from pipeline.shards.external import ARCHIVE, EXTERNAL, TAR_ENDINGS, scan_tars
 from pipeline.shards.manifest import MANIFEST, Manifest, Shard, read_manifest, repair_hint
 from pipeline.shards.samples import Sample, read_locations, read_samples
-from pipeline.shards.tar_reader import IMAGE_SUFFIXES, read_tar
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,15 +60,6 @@ class ShardSet:
     def locations(self, shard: Shard) -> Iterator[str]:
         """The locations of one shard's samples, without reading its images."""
         return read_locations(self.tar(shard))
-
-    def fetch(self, keys: Iterable[str]) -> dict[str, bytes]:
-        """The encoded images of some keys; unknown keys are absent."""
-        wanted = set(keys)
-        found: dict[str, bytes] = {}
-        for shard in self._holding(wanted):
-            members = read_tar(self.tar(shard), IMAGE_SUFFIXES)
-            found |= {key: next(iter(images.values())) for key, images in members if key in wanted}
-        return found
 
     def records(self, shard: Shard, columns: list[str] | None = None) -> pa.Table:
         """The record table's rows of one shard.
@@ -123,13 +113,6 @@ class ShardSet:
     def _file(self, shard: Shard) -> str:
         files: dict[str, str] = self.manifest.packing.get("files", {}) if self.external else {}
         return files.get(shard.name, f"{shard.name}.tar")
-
-    def _holding(self, keys: Collection[str]) -> Iterator[Shard]:
-        """The shards that may hold some keys, by the split and view that begin a key."""
-        for shard in self.manifest.shards:
-            prefix = f"{shard.split}-{shard.view}-"
-            if any(key.startswith(prefix) for key in keys):
-                yield shard
 
 
 def open_shards(path: str) -> ShardSet:

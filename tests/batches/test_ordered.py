@@ -11,7 +11,6 @@ import webdataset
 from pipeline.batches.ordered import decode_samples
 from pipeline.images.decode import DecodeError
 from pipeline.shards.samples import read_samples
-from pipeline.shards.shard_set import open_shards
 
 # Reading for embedding and for pictures.
 
@@ -33,21 +32,6 @@ def test_decode_samples_keeps_order_and_returns_errors(shards: str, tmp_path: Pa
     kinds = [type(image) for _, image in found]
     assert kinds == [np.ndarray, DecodeError, *[np.ndarray] * 8]
     assert all(image.shape == (8, 8, 3) for _, image in found if not isinstance(image, DecodeError))
-
-
-def test_fetch_returns_bytes_of_known_keys(
-    shards: str,
-) -> None:
-    wanted = [
-        "train-satellite-0003-satellite-004",
-        "train-drone-0839-drone-038",
-        "train-drone-0839-no",
-        "query-x",
-    ]
-    found = open_shards(shards).fetch(wanted)
-    assert set(found) == set(wanted[:2])
-    assert found[wanted[1]] == (Path(shards).parent / "drone-038.png").read_bytes()
-    assert open_shards(shards).fetch([]) == {}
 
 
 def test_tarfile_finds_two_members_a_sample(shards: str) -> None:

@@ -152,6 +152,8 @@ def test_evaluate_measures_distances_from_positions(
     [row, merged] = storage.read_json(str(tmp_path / "o" / "metrics.json"))
     assert (row["geo_queries"], row["within_25m"], row["within_100m"]) == (2, 0.0, 1.0)
     assert row["distance_median_m"] == pytest.approx(55.6, abs=0.05)
+    assert row["distance_p90_m_low"] == pytest.approx(55.6, abs=0.05)
+    assert (row["within_25m_low"], row["within_25m_high"]) == (0, 0)
     assert row["sdm1"] == pytest.approx(np.exp(-2.5))
     assert row["sdm3"] is None
     assert merged["geo_queries"] == 0
@@ -166,7 +168,9 @@ def test_evaluate_measures_distances_from_positions(
     ]
     assert asked[2]["distance_m"] is None
     assert (tmp_path / "o" / "figures" / "map-drone-satellite.pdf").exists()
-    assert 'id="map"' in (tmp_path / "o" / "report.html").read_text()
+    report = (tmp_path / "o" / "report.html").read_text()
+    assert 'id="map"' in report
+    assert 'id="metres"' in report
     output = capsys.readouterr().out
     assert "55.6 m" in output
     assert "published" in output

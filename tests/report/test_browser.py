@@ -13,6 +13,7 @@ from PIL import Image
 
 from pipeline.report import page as report
 from pipeline.report.inputs import EvaluationResults, ReportContext
+from pipeline.retrieval.geo_metrics import WITH_INTERVALS
 from pipeline.retrieval.tasks import RESULTS_SCHEMA
 from tests.report.test_sections import GAP, GROUPS, PARTS
 
@@ -84,6 +85,10 @@ def evaluation(rows: list[dict[str, Any]], name: str) -> EvaluationResults:
     metrics |= {
         "geo_queries": 5,
         "distance_median_m": 1234.5,
+        "distance_p90_m": 40.0,
+        "within_1m": 0.0,
+        "within_5m": 0.25,
+        **{f"{name}_{end}": 0.125 for name in WITH_INTERVALS for end in ("low", "high")},
         "within_25m": 0.5,
         "within_50m": 0.5,
         "within_100m": 1.0,

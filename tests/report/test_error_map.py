@@ -43,13 +43,25 @@ def test_error_map_joins_a_place_with_its_wrong_answer() -> None:
     ]
     drawn = error_map("t", rows)
     assert drawn
-    [line] = drawn.lines
+    [arrow] = drawn.arrows
     at = {place.text.split(":")[0]: (place.x, place.y) for place in drawn.places}
-    assert (line[:2], line[2:4]) == (at["a"], at["b"])
-    assert line[4] == "a taken for b, 963 m off, 1 of 2"
+    assert ((arrow.x1, arrow.y1), (arrow.x2, arrow.y2)) == (at["a"], at["b"])
+    assert (arrow.text, arrow.right) == ("a taken for b, 963 m off, 1 of 2", False)
     assert [place.found for place in drawn.places] == [True, True, True]  # a: half of its queries
     assert at["a"][0] == at["c"][0] < at["b"][0]  # east is right
     assert at["c"][1] < at["a"][1] == at["b"][1]  # north is up
+
+
+def test_error_map_shows_how_far_off_right_answers_are() -> None:
+    """Two photos of one place, 481 m east and a metre north of its gallery image."""
+    off, near = (30.0, 120.005), (30.00001, 120.0)
+    drawn = error_map("t", [query("a", off, "a", A, 1), query("a", near, "a", A, 2)])
+    assert drawn
+    [arrow] = drawn.arrows  # the metre is below what the map can show
+    assert arrow.right
+    assert arrow.x1 > arrow.x2
+    assert arrow.text == "a answered by an image of its own place, 481 m off, 1 of 2"
+    assert "0 of 2 first answers are wrong" in drawn.summary
 
 
 def test_map_sheet_bar_is_a_round_distance_to_scale() -> None:

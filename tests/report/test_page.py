@@ -21,6 +21,7 @@ from pipeline.report.panels import (
     panel_keys,
     spread_over_locations,
 )
+from pipeline.retrieval.geo_metrics import WITH_INTERVALS
 from pipeline.retrieval.tasks import RESULTS_SCHEMA
 
 
@@ -228,6 +229,10 @@ def test_page_shows_intervals_distances_and_views() -> None:
     geo = {
         "geo_queries": 4,
         "distance_median_m": 12.4,
+        "distance_p90_m": 40.0,
+        "within_1m": 0.0,
+        "within_5m": 0.25,
+        **{f"{name}_{end}": 0.125 for name in WITH_INTERVALS for end in ("low", "high")},
         "within_25m": 0.5,
         "within_50m": 0.75,
         "within_100m": 1.0,
@@ -238,7 +243,10 @@ def test_page_shows_intervals_distances_and_views() -> None:
     )
     text = report.render_report(full, ReportContext(title="Town"), lambda keys: {})
     assert "40.0 to 60.0" in text
-    assert "best answer off by 12 m (median); within 25, 50, 100 m: 50.00, 75.00, 100.00" in text
+    assert "best answer off by 12 m (median); within 1, 5, 25 m: 0.00, 25.00, 50.00" in text
+    assert "Errors in metres" in text
+    assert "12.5 to 12.5" in text
+    assert "≤ 5 m" in text
     assert "R@1 by views a query: 1 views: 1.85 %, 6 views: 11.11 %, 54 views: 100.00 %" in text
     assert "median score" in text
     before = report.render_report(plain, ReportContext(title="Town"), lambda keys: {})

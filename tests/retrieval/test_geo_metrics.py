@@ -35,15 +35,23 @@ def test_distance_metrics_use_queries_of_known_position() -> None:
     queries = np.array([[0.0, 0], [0.0, 0], [0.0, 0], [np.nan, np.nan]])
     metres = np.array([0, 30, 200, 0]) / DEGREE_M
     answers = np.stack([np.stack([metres, np.zeros(4)], axis=1)] * 3, axis=1)
-    found = distance_metrics(queries, answers)
+    found = distance_metrics(queries, answers, np.array(["a", "b", "c", "d"]))
     assert found["geo_queries"] == 3
     assert found["distance_median_m"] == pytest.approx(30)
-    assert [found[f"within_{m}m"] for m in (25, 50, 100)] == pytest.approx([1 / 3, 2 / 3, 2 / 3])
+    assert found["distance_p90_m"] == pytest.approx(30 + 0.8 * 170)
+    within = [found[f"within_{metres}m"] for metres in (1, 5, 25, 50, 100)]
+    assert within == pytest.approx([1 / 3, 1 / 3, 1 / 3, 2 / 3, 2 / 3])
+    # Three places: a share of a third is within none to all, and so is every quantile.
+    assert (found["within_5m_low"], found["within_5m_high"]) == (0, 1)
+    assert found["distance_median_m_low"] == pytest.approx(0)
+    assert found["distance_median_m_high"] == pytest.approx(200)
     assert found["sdm3"] == pytest.approx(np.mean(np.exp(-5e3 * metres[:3])))
     assert found["sdm5"] is None
 
 
 def test_distance_metrics_of_a_partly_tagged_gallery_are_none() -> None:
-    found = distance_metrics(np.zeros((2, 2)), np.array([[[0.0, 0]], [[np.nan, np.nan]]]))
+    found = distance_metrics(
+        np.zeros((2, 2)), np.array([[[0.0, 0]], [[np.nan, np.nan]]]), np.array(["a", "b"])
+    )
     assert found["geo_queries"] == 0
     assert {value for name, value in found.items() if name != "geo_queries"} == {None}

@@ -14,9 +14,11 @@ from pipeline.shards.tile_reader import TileReader
 def test_tile_reader_reads_what_a_pass_reads(tiny_shards: str) -> None:
     opened = open_shards(tiny_shards)
     [shard, *_] = opened.manifest.of(Split.GALLERY, View.SATELLITE)
-    keys = [sample.key for sample in opened.samples(shard)]
+    images = {sample.key: sample.data for sample in opened.samples(shard)}
+    keys = list(images)
     reader = TileReader(opened)
-    assert reader.fetch([*keys, "unknown"]) == opened.fetch(keys)
+    assert reader.fetch([*keys, "unknown"]) == images
+    assert reader.fetch([]) == {}
     assert reader.footprints(keys) == {}
     assert TileReader(opened, View.DRONE).fetch(keys) == {}
 
