@@ -6,7 +6,10 @@ Puts overhead images together into a GeoTIFF, flies over it (any heading, 45 to 
 horizon, 60 to 120 m high, another day), and walks the road of the README: tiles, embeddings, index,
 locate. Prints how far the answers are from the photos' places: with the camera's pose in the tags
 (heading wrong by 3 degrees, pitch by 1, height by 3 %), without it, by tiles alone; and as control
-by tiles with ImageNet's weights (and a random refinement).
+by tiles with ImageNet's weights (and a random refinement). Then, for photos from --higher times
+these heights, a gallery of one tile size beside one of several levels (--levels): how many answers
+are near, and how often the first candidate shows the photo's place. `--only-levels` leaves out the
+first part.
 """
 
 import argparse
@@ -31,10 +34,12 @@ from model.weights.builtin import BUILTIN
 from model.weights.start import load_start
 from pipeline.core import cluster
 from pipeline.core.arrays import Pixels
+from pipeline.core.geo import haversine_m
 from pipeline.features.embed import embed_gallery
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.index.build import build_index
 from pipeline.index.settings import IndexSettings
+from pipeline.locate.geojson import LocatedPhoto
 from pipeline.locate.page import LatLon, distance_to_m
 from pipeline.shards.pack import pack
 from pipeline.shards.settings import PackingSettings
@@ -97,6 +102,78 @@ def make_index(out: Path, tiles: str, checkpoint: str) -> str:
     return index
 
 
+def fly_over(
+    mosaic: Path, out: Path, photos: int, height: tuple[float, float], seed: int
+) -> tuple[str, dict[str, LatLon]]:
+    """The photos' folder of a flight, and their places by name."""
+    flight = fly(
+        MapFlightSettings(mosaic=str(mosaic), out=str(out), photos=photos, height=height, seed=seed)
+    )
+    with (flight / "photos.csv").open() as table:
+        truth = {
+            Path(row["path"]).name: (float(row["lat"]), float(row["lon"]))
+            for row in csv.DictReader(table)
+        }
+    return str(flight / "photos"), truth
+
+
+def print_levels(options: argparse.Namespace, mosaic: Path, tiles: str) -> None:
+    """One tile size beside several levels, for photos from several heights. `tiles`: of one size.
+
+    Prints a row of a table for each, and the ratio of the answers within 5 m.
+    """
+    out: Path = options.out
+    shards = {"one level": tiles, "levels": str(out / "levels")}
+    pack_tiles(mosaic, shards["levels"], tuple(options.levels))
+    indexes = {
+        "one level": make_index(out / "built-in", tiles, BUILTIN),
+        "levels": make_index(out / "built-in-levels", shards["levels"], BUILTIN),
+    }
+    names = ("metres up", "pose", "gallery", "first shows it", "within 5 m", "25 m", "s a photo")
+    print(f"| {' | '.join(names)} |\n|{'---|' * len(names)}")
+    for times in options.higher:
+        low, high = (times * metres for metres in options.height)
+        photos, truth = fly_over(
+            mosaic, out / f"flight-{times:g}", options.photos, (low, high), options.seed + 1
+        )
+        for pose in (True, False):
+            within: dict[str, float] = {}
+            for name, index in indexes.items():
+                settings = LocateSettings(
+                    photos=(photos,), index=index, shards=shards[name], pose=pose,
+                    out=str(out / "where.geojson"),
+                )  # fmt: skip
+                begin = time.perf_counter()
+                located = locate_photos(settings)
+                seconds = (time.perf_counter() - begin) / len(located)
+                error_P, shown_P = zip(*(judge(one, truth) for one in located), strict=True)
+                within[name] = float((np.array(error_P) <= 5).mean())
+                print(
+                    f"| {low:g} to {high:g} | {'yes' if pose else 'no'} | {name} | "
+                    f"{np.mean(shown_P):.1%} | {within[name]:.1%} | "
+                    f"{(np.array(error_P) <= 25).mean():.1%} | {seconds:.2f} |",
+                    flush=True,
+                )
+            ratio = within["levels"] / max(within["one level"], 1 / len(truth))
+            print(f"levels, {low:g} to {high:g} m: {ratio:.2f} x one level's photos within 5 m")
+
+
+def judge(one: LocatedPhoto, truth: dict[str, LatLon]) -> tuple[float, bool]:
+    """Metres from the answer to the photo's place, and whether the first candidate shows it."""
+    place = truth[Path(one.name).name]
+    error_m = distance_to_m(one.answer, place) if one.answer else None
+    if one.answer is None or error_m is None:
+        return np.inf, False
+    first = one.answer.candidates[0]
+    away_m = float(haversine_m(np.array([first.lat, first.lon]), np.array(place)))
+    return error_m, away_m <= (first.side_m or 0.0) / np.sqrt(2)
+
+
+def pack_tiles(mosaic: Path, out: str, sides_m: float | tuple[float, ...]) -> None:
+    """Tiles that overlap by half."""
+    pack(GeoTiff(tile_m=sides_m, overlap=0.5), PackingSettings(root=str(mosaic.parent), out=out))
+
+
 def print_errors(
     name: str, settings: LocateSettings, truth: dict[str, LatLon], baseline: float
 ) -> float:
@@ -104,12 +181,7 @@ def print_errors(
     begin = time.perf_counter()
     located = locate_photos(settings)
     seconds = time.perf_counter() - begin
-    error_P = np.array(
-        [
-            np.inf if one.answer is None else distance_to_m(one.answer, truth[Path(one.name).name])
-            for one in located
-        ]
-    )
+    error_P = np.array([judge(one, truth)[0] for one in located])
     share = float((error_P <= 25).mean())
     within = ", ".join(
         f"{(error_P <= metres).mean():.1%} within {metres} m" for metres in (1, 5, 25)
@@ -135,6 +207,9 @@ def main() -> None:
     parser.add_argument("--photos", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--height", type=float, nargs=2, default=(60.0, 120.0), help="metres")
+    parser.add_argument("--levels", type=float, nargs="+", default=(TILE_M, 2 * TILE_M, 4 * TILE_M))
+    parser.add_argument("--higher", type=float, nargs="+", default=(1.0, 2.0))
+    parser.add_argument("--only-levels", action="store_true")
     options = parser.parse_args()
     out = options.out
     (out / "map").mkdir(parents=True, exist_ok=True)
@@ -142,22 +217,22 @@ def main() -> None:
     mosaic_HW3 = make_map(options.imagery, options.tiles, options.seed)
     mosaic = out / "map" / "map.tif"
     write_map(mosaic_HW3, mosaic)
-    flight = fly(
-        MapFlightSettings(
-            mosaic=str(mosaic), out=str(out / "flight"), photos=options.photos,
-            height=tuple(options.height), seed=options.seed,
-        )
-    )  # fmt: skip
-    with (flight / "photos.csv").open() as table:
-        truth = {
-            Path(row["path"]).name: (float(row["lat"]), float(row["lon"]))
-            for row in csv.DictReader(table)
-        }
     tiles = str(out / "tiles")
-    pack(GeoTiff(tile_m=TILE_M, overlap=0.5), PackingSettings(root=str(out / "map"), out=tiles))
+    pack_tiles(mosaic, tiles, TILE_M)
+    print(f"map of {mosaic_HW3.shape[1] * METRES_PER_PIXEL / 1000:.2f} km a side")
+    if not options.only_levels:
+        print_ways(options, mosaic, tiles)
+    print_levels(options, mosaic, tiles)
+
+
+def print_ways(options: argparse.Namespace, mosaic: Path, tiles: str) -> None:
+    """Tiles and matching, with the camera's pose and without, and ImageNet's weights as control."""
+    out: Path = options.out
+    photos, truth = fly_over(
+        mosaic, out / "flight", options.photos, tuple(options.height), options.seed
+    )
     start = out / "imagenet.pt"
     start.write_bytes(imagenet_checkpoint())
-    print(f"map of {mosaic_HW3.shape[1] * METRES_PER_PIXEL / 1000:.2f} km a side")
     baseline = 0.0
     for name, checkpoint, match, pose in (
         ("ImageNet's weights, tiles", str(start), False, True),
@@ -167,7 +242,7 @@ def main() -> None:
     ):
         index = make_index(out / name.partition(",")[0].replace(" ", "-"), tiles, checkpoint)
         settings = LocateSettings(
-            photos=(str(flight / "photos"),), checkpoint=checkpoint, index=index, shards=tiles,
+            photos=(photos,), checkpoint=checkpoint, index=index, shards=tiles,
             out=str(out / "where.geojson"), page=str(out / "where.html"), match=match, pose=pose,
         )  # fmt: skip
         share = print_errors(name, settings, truth, baseline)

@@ -65,8 +65,9 @@ CASES: dict[str, tuple[str, str]] = {
         r"without_turns \| [\d.]+% \[.*\] \| [+-][\d.]+% \[",
     ),
     "own_map": (
-        "--imagery {images} --out {out} --tiles 3 --photos 2 --height 12 16",
-        r"built-in, matched, pose: [\d.]+% within 1 m, .* of 2 photos, [\d.]+ x ImageNet's tiles",
+        "--imagery {images} --out {out} --tiles 3 --photos 2 --height 12 16 --higher 1.5",
+        r"built-in, matched, pose: [\d.]+% within 1 m, .* of 2 photos, [\d.]+ x ImageNet's tiles"
+        r"(.|\n)*\| 18 to 24 \| no \| levels \|(.|\n)*levels, .* [\d.]+ x one level's photos",
     ),
     "region": (
         "--out {out} --side 400 --resolution 0.5 --minutes 0 --photos 4 --checks 20 --height 60 80",

@@ -30,24 +30,16 @@ class Filter:
     locations: frozenset[str] | None = None
     box: Box | None = None
     near: Circle | None = None
-    sides_m: tuple[float, float] | None = None
-    """Least and greatest side of the ground shown, metres: the images of one level, and those whose
-    ground is not known."""
 
     @property
     def columns(self) -> set[str]:
         """Names of the columns that `mask` reads."""
-        named = {
-            "split": self.split,
-            "view": self.view,
-            "location": self.locations,
-            "side_m": self.sides_m,
-        }
+        named = {"split": self.split, "view": self.view, "location": self.locations}
         positions = {"lat", "lon"} if self.box or self.near else set()
         return {name for name, value in named.items() if value is not None} | positions
 
     def mask(self, rows: pa.Table | pa.RecordBatch) -> Mask:
-        """Which rows meet the conditions (N,). A null value meets none but `sides_m`."""
+        """Which rows meet the conditions (N,). A null value meets none."""
         mask_N = np.ones(len(rows), np.bool_)
         for name, value in (("split", self.split), ("view", self.view)):
             if value is not None:
@@ -55,9 +47,6 @@ class Filter:
         if self.locations is not None:
             wanted = pa.array(sorted(self.locations), pa.string())
             mask_N &= _to_mask(pc.is_in(rows["location"], wanted))
-        if self.sides_m is not None:
-            side_N = rows["side_m"].to_numpy(zero_copy_only=False)
-            mask_N &= (self.sides_m[0] <= side_N) & (side_N <= self.sides_m[1]) | np.isnan(side_N)
         if self.box or self.near:
             # A null becomes NaN, which every comparison refuses.
             lat_N, lon_N = (rows[name].to_numpy(zero_copy_only=False) for name in ("lat", "lon"))

@@ -111,15 +111,8 @@ class RowIds:
         taken = pa.Table.from_batches(pieces, schema).take(pa.array(back_R))
         return parquet_files.select_or_null(taken, names, IDS_SCHEMA)
 
-    def _filterable(self, batch: pa.RecordBatch) -> pa.Table:
-        """A batch with all columns by which rows are filtered."""
-        return parquet_files.select_or_null(pa.Table.from_batches([batch]), ID_COLUMNS, IDS_SCHEMA)
-
     def mask(self, where: Filter) -> Mask:
         """Which rows match the filter (N,)."""
         return np.concatenate(
-            [
-                np.empty(0, np.bool_),
-                *(where.mask(self._filterable(batch)) for batch in self._batches),
-            ]
+            [np.empty(0, np.bool_), *(where.mask(batch) for batch in self._batches)]
         )

@@ -7,7 +7,6 @@ import pyarrow as pa
 import pytest
 
 from pipeline.core import parquet
-from pipeline.core.filters import Filter
 from pipeline.index.ids import RowIds
 from pipeline.index.searcher import Index
 from tests.index.index_tables import build, clustered, write_table_part
@@ -21,19 +20,14 @@ def table(tmp_path: Path) -> Path:
     return tmp_path / "table"
 
 
-def sides(index: Index, where: Filter | None = None) -> dict[str, float | None]:
-    [hits] = index.search(clustered(1, 8, 1), 10, where)
+def sides(index: Index) -> dict[str, float | None]:
+    [hits] = index.search(clustered(1, 8, 1), 10)
     return {hit.key: hit.side_m for hit in hits}
 
 
 def test_hits_know_the_side_of_their_ground(table: Path, tmp_path: Path) -> None:
     found = sides(build(str(table), tmp_path / "index"))
     assert found == {f"gallery-0-{n}": side for n, side in enumerate(SIDES)}
-
-
-def test_filter_of_a_level_keeps_images_of_unknown_ground(table: Path, tmp_path: Path) -> None:
-    found = sides(build(str(table), tmp_path / "index"), Filter(sides_m=(0.0, 84.0)))
-    assert sorted(found) == ["gallery-0-0", "gallery-0-2", "gallery-0-3"]
 
 
 def test_table_and_index_of_before_levels_are_read(table: Path, tmp_path: Path) -> None:
@@ -51,4 +45,3 @@ def test_table_and_index_of_before_levels_are_read(table: Path, tmp_path: Path) 
         "key": "gallery-0-3", "location": "00003", "view": "satellite", "lat": 0, "lon": 0.0,
         "side_m": None,
     }  # fmt: skip
-    assert found.mask(Filter(sides_m=(0.0, 84.0))).all()

@@ -156,26 +156,18 @@ def test_calibration_of_another_encoder_is_refused(tmp_path: Any) -> None:
         read_calibration(str(tmp_path / "calibration.json"), "0" * 64)
 
 
-class Levels(Gallery):
-    """An index that records the levels searched."""
-
-    def search(
-        self, queries_QD: Floats, k: int = 10, where: Filter | None = None
-    ) -> list[list[Hit]]:
-        level = where.sides_m if where else None
-        return [[replace(hit(f"{level}", 0.5), score=float(row_D[0]))] for row_D in queries_QD]
-
-
-def test_search_views_asks_each_photo_of_its_level() -> None:
-    fine, coarse = (0.0, 84.0), (84.0, math.inf)
-    views = [np.full((count, 1), at, np.float32) for at, count in enumerate((1, 3, 2))]
-    found = search_views(Levels([]), views, 5, None, [coarse, None, coarse])
+def test_search_views_prefers_the_level_of_each_photo() -> None:
+    fine = replace(hit("fine", 0.60), side_m=60.0)
+    coarse = replace(hit("coarse", 0.61), side_m=240.0)
+    unknown = hit("unknown", 0.605)
+    views = [np.ones((count, 4), np.float32) for count in (1, 3, 2)]
+    gallery = Gallery([coarse, unknown, fine])
+    found = search_views(gallery, views, 5, None, [(0.0, 120.0), None, (120.0, math.inf)])
     assert [[one.location for one in hits] for hits in found] == [
-        [f"{coarse}"], ["None"], [f"{coarse}"],
+        ["fine", "coarse", "unknown"], ["coarse", "unknown", "fine"], ["coarse", "unknown", "fine"],
     ]  # fmt: skip
-    assert [hits[0].score for hits in found] == [0, 1, 2]
-    assert search_views(Levels([]), views, 5, None, [fine] * 3)[1][0].location == f"{fine}"
-    assert search_views(Levels([]), [], 5) == []
+    assert [hits[0].score for hits in found] == pytest.approx([0.62, 0.61, 0.63])
+    assert search_views(gallery, [], 5) == []
 
 
 def test_answer_radius_grows_with_the_level() -> None:
