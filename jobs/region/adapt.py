@@ -16,7 +16,7 @@ from jobs.encoding.encoder import make_encoder_spec, read_checkpoint_bytes
 from jobs.encoding.localizer import write_localizer
 from jobs.region.expect import located_outcomes, lookalikes, real_photos
 from jobs.region.flights import plan_flights, take_flight
-from jobs.region.folder import Region, claim, print_command
+from jobs.region.folder import Region, claim, print_command, with_absolute_paths
 from jobs.region.settings import AdaptSettings
 from jobs.region.tuning import choose_encoder
 from jobs.stages.calibrate import calibrate_index
@@ -57,7 +57,8 @@ def adapt(settings: AdaptSettings) -> list[Expectation]:
 
     Raises InputError for a map that cannot be used, or a folder of another region.
     """
-    region = Region(out=storage.absolute(settings.out))
+    settings = with_absolute_paths(settings)
+    region = Region(out=settings.out)
     if not storage.is_local(region.out):
         raise InputError(
             f"--out is {settings.out}, expected a local or mounted folder; make it there and copy"

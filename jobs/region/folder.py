@@ -1,6 +1,6 @@
 """The folder of a region: what lies where, and the command that makes each part alone."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -32,17 +32,35 @@ class Region:
         return self.path("encoder.safetensors")
 
 
+def with_absolute_paths(settings: AdaptSettings) -> AdaptSettings:
+    """The settings for processes in other folders, and for a rerun from another one."""
+    surface, photos = settings.surface, settings.photos
+    return replace(
+        settings,
+        mosaic=storage.absolute(settings.mosaic),
+        out=storage.absolute(settings.out),
+        surface=surface and storage.absolute(surface),
+        photos=photos and storage.absolute(photos),
+    )
+
+
 def claim(region: Region, settings: AdaptSettings) -> None:
     """Note the region's settings in its folder.
 
-    Raises InputError where it is of others, or has no map.
+    Raises InputError where it is of other settings or another map, or where there is no map.
     """
-    if not storage.exists(settings.mosaic):
+    if not storage.is_file(settings.mosaic):
         raise InputError(f"no map at {settings.mosaic}, expected a GeoTIFF; check --mosaic")
     about = {name: value for name, value in asdict(settings).items() if name != "out"}
     about |= {name: list(value) for name, value in about.items() if isinstance(value, tuple)}
+    about["mosaic_bytes"] = storage.size(settings.mosaic)
     path = region.path("region.json")
     if not storage.exists(path):
+        if storage.is_folder(region.out) and storage.walk(region.out):
+            raise InputError(
+                f"{region.out} holds files of something else, expected a new or empty folder; "
+                "choose another --out"
+            )
         Path(region.out).mkdir(parents=True, exist_ok=True)
         json_files.write_checksummed(path, about)
         return

@@ -79,4 +79,9 @@ def test_adapt_without_a_map_is_refused(tmp_path: Path) -> None:
     given = AdaptSettings(mosaic=str(tmp_path / "none.tif"), out=str(tmp_path / "region"))
     with pytest.raises(InputError, match="no map at"):
         adapt(given)
+    (tmp_path / "none.tif").write_bytes(b"no map")
+    (tmp_path / "region").mkdir()
+    (tmp_path / "region" / "mine.txt").write_text("not a region's")
+    with pytest.raises(InputError, match="holds files of something else"):
+        adapt(given)
     assert not (tmp_path / "region" / "region.json").exists()

@@ -128,5 +128,5 @@ def test_fly_over_an_unusable_map_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be flown over"):
         fly(settings(tmp_path))
     write_map(tmp_path / "map.tif")
-    with pytest.raises(InputError, match="shows no ground for place 0"):
+    with pytest.raises(InputError, match="is too small: no place"):
         photos_over_map(settings(tmp_path, height=(900.0, 900.0)), 0, 1)

@@ -35,11 +35,11 @@ from pipeline.sources.maps.tiles import Window
 
 JPEG_QUALITY = 88
 MOST_TRIES = 60
-"Places that are drawn for a photo until one shows enough of the map."
+"Windows that are read for a place until one shows enough of the map."
 LEAST_SHOWN = 0.98
 "Of the ground around a photo: its share that the map has."
-MOST_DRAWS = 10_000
-"Pixels that are drawn until one lies in the flight's part of the map."
+MOST_DRAWS = 3000
+"Places that are drawn until one lies in the flight's part of the map, far enough from its edge."
 BLOCK_M, HELD_OUT_BLOCKS, MARGIN_SHARE = 160.0, 5, 0.2
 """Side of a block; one block in so many is held out; and the share of its side by which a held-out
 place keeps away from its border."""
@@ -86,18 +86,27 @@ def photos_over_map(settings: MapFlightSettings, place: int, count: int) -> MapP
             f"{settings.mosaic} cannot be flown over: {rejected.reason} ({rejected.found}); "
             "expected a georeferenced GeoTIFF"
         ) from None
-    for _ in range(MOST_TRIES):
+    tries = 0
+    for _ in range(MOST_DRAWS):
         poses = [draw_pose(settings, rng) for _ in range(count)]
         middle = _draw_point(settings, placement, rng)
         reaches_m = [_reach_m(pose) for pose in poses]
+        if _edge_m(settings.mosaic, placement, middle) < 0.95 * max(reaches_m):
+            continue  # known without reading
         widest = _window_around(settings.mosaic, placement, middle, max(reaches_m))
         if widest.shown_HW.mean() >= LEAST_SHOWN * 255:
             break
+        if (tries := tries + 1) == MOST_TRIES:
+            raise InputError(
+                f"{settings.mosaic} shows no ground for place {place} in {MOST_TRIES} tries: found "
+                f"{widest.shown_HW.mean() / 255:.0%} of the ground around the last one, expected "
+                f"{LEAST_SHOWN:.0%}; fly lower or steeper, or give a map without such gaps"
+            )
     else:
         raise InputError(
-            f"{settings.mosaic} shows no ground for place {place} in {MOST_TRIES} tries: found "
-            f"{widest.shown_HW.mean() / 255:.0%} of the ground around the last one, expected "
-            f"{LEAST_SHOWN:.0%}; fly lower or steeper, or give a larger map"
+            f"{settings.mosaic} is too small: no place in {MOST_DRAWS:,} lies as far from its edge "
+            f"as a photo reaches, some {max(reaches_m):.0f} m; fly lower or steeper, or give a "
+            "larger map"
         )
     photos = []
     for pose, reach_m in zip(poses, reaches_m, strict=True):
@@ -180,6 +189,13 @@ def is_in_part(part: Part, x_m: float, y_m: float) -> bool:
     if part == "learn":
         return not held_out
     return held_out and max(abs(right - 0.5), abs(down - 0.5)) < 0.5 - MARGIN_SHARE
+
+
+def _edge_m(path: str, placement: Placement, middle: tuple[float, float]) -> float:
+    """Metres from one of a map's pixels (column, row) to its nearest edge."""
+    dataset, (across_m, down_m) = open_mosaic(path), placement.pixel_m
+    x, y = middle
+    return float(min(min(x, dataset.width - x) * across_m, min(y, dataset.height - y) * down_m))
 
 
 def _window_around(
