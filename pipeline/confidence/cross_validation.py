@@ -13,7 +13,8 @@ from pipeline.core.arrays import Doubles, Strings
 
 FOLDS = 5
 UNDECIDED = 0.5
-"The threshold where examples of one kind only leave nothing to choose it by."
+"""The threshold where examples of one kind only leave nothing to choose it by, and the probability
+of examples without others to fit on."""
 
 
 def cross_validated_probabilities(
@@ -28,6 +29,9 @@ def cross_validated_probabilities(
     p_N = np.empty(len(x_NF))
     for fold in np.unique(fold_N):
         left_out_N = fold_N == fold
+        if left_out_N.all():  # too few locations to fit without one
+            p_N[left_out_N] = UNDECIDED
+            continue
         model = fit_logistic(x_NF[~left_out_N], yes_N[~left_out_N], weight_N[~left_out_N])
         p_N[left_out_N] = model.probabilities(x_NF[left_out_N])
     return p_N

@@ -175,6 +175,8 @@ def test_cross_validation_leaves_out_own_location() -> None:
     p = cross_validated_probabilities(x_NF, yes, np.ones(200), locations)
     assert ((p > 0.5) == (x_NF[:, 0] > 0))[odd].all()
     assert sigmoid(np.array([0.0]))[0] == 0.5
+    alone = cross_validated_probabilities(x_NF[:2], yes[:2], np.ones(2), np.array(["a", "a"]))
+    assert alone.tolist() == [0.5, 0.5]
 
 
 def test_calibration_unusable_examples_are_refused() -> None:
