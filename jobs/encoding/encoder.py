@@ -23,6 +23,7 @@ from model.inference.precision import (
     effective_precision,
 )
 from model.weights.builtin import BUILTIN, read_builtin
+from pipeline.camera.pose import Perspective
 from pipeline.core import storage
 from pipeline.core.arrays import Floats
 from pipeline.core.errors import InputError
@@ -124,13 +125,15 @@ def make_encoder_spec(
         open_set() if open_set else open_or_scan(embedding.shards, embedding.split, embedding.view)
     )
     count = PROBE_IMAGES + (CALIBRATION_IMAGES if precision == "int8" else 0)
-    images_B3HW = first_images(shards, size, settings.resizer, count)
+    perspective = settings.perspective or trained_perspective(checkpoint)
+    images_B3HW = first_images(shards, size, settings.resizer, count, perspective)
     calibration_B3HW = images_B3HW[PROBE_IMAGES:] if precision == "int8" else None
     encoding = EncodingConfig(
         mirror=trained_on_mirrors(checkpoint) if settings.mirror is None else settings.mirror,
         resizer=settings.resizer,
         precision=precision,
         calibration=digest_of(calibration_B3HW),
+        perspective=perspective,
     )
     total = sum(shard.samples for shard in shards.manifest.of(embedding.split, embedding.view))
     recipe = EncoderRecipe(
@@ -157,6 +160,11 @@ def trained_on_mirrors(checkpoint: Checkpoint) -> bool:
     return not isinstance(augmentation, dict) or augmentation.get("mirror") is not False
 
 
+def trained_perspective(checkpoint: Checkpoint) -> Perspective:
+    """How training saw UAV images; encoders of others see them as they were taken."""
+    return "overhead" if checkpoint.recipe.get("perspective") == "overhead" else "as_taken"
+
+
 def _available_precision(
     settings: EncoderSettings, embedding: EmbeddingSettings
 ) -> EffectivePrecision:
@@ -181,5 +189,7 @@ def digest_of(calibration_B3HW: ImageBytes | None) -> str | None:
 def encoder_fingerprint(checkpoint: Checkpoint, encoding: EncodingConfig) -> str:
     """Hash of all that an embedding depends on: weights, network and encoding."""
     preprocessing = f"{preprocessing_name(encoding.resizer)}, mirror {encoding.mirror}"
+    if encoding.perspective != "as_taken":  # so that fingerprints from before stay as they were
+        preprocessing += f", UAV images {encoding.perspective}"
     text = describe_preprocessing(preprocessing, encoding.precision, encoding.calibration)
     return fingerprint(checkpoint, text)

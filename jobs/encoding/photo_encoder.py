@@ -4,7 +4,8 @@ In: a checkpoint's bytes, and fingerprint and encoding from the index's metadata
 PhotoEncoder, whose embeddings the index can be searched with; no setting has to be repeated.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from model.checkpoint import build_encoder, loads
 from model.inference.int8 import PrecisionError, require_int8
 from model.inference.optimise import optimise_encoder
 from pipeline.batches.ordered import stack
+from pipeline.camera.overhead import overhead_view
 from pipeline.core.arrays import Floats, Pixels
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch_map
@@ -94,19 +96,24 @@ class PhotoEncoder:
         )
 
     def encode(
-        self, photos: Sequence[bytes], names: Sequence[str] | None = None
+        self,
+        photos: Sequence[bytes],
+        names: Sequence[str] | None = None,
+        geotags: Sequence[Mapping[str, Any] | None] | None = None,
     ) -> tuple[Floats, list[Rejection | None]]:
         """Unit embeddings (Q, D) of the photos that can be decoded, in order, and for each photo
         None or why it has no row.
 
-        `names` become the rejections' paths; by default the photos' numbers, from 1.
+        `names` become the rejections' paths; by default the photos' numbers, from 1. `geotags`: of
+        UAV images, by which an encoder of the perspective `overhead` sees them.
         """
         names = names or [f"photo {number}" for number in range(1, len(photos) + 1)]
         images: list[Pixels | DecodeError]
+        tagged = list(zip(photos, geotags or [None] * len(photos), strict=True))
         if len(photos) > 1:
-            images = list(prefetch_map(self._decode, photos, DECODE_THREADS, 4 * DECODE_THREADS))
+            images = list(prefetch_map(self._decode, tagged, DECODE_THREADS, 4 * DECODE_THREADS))
         else:
-            images = [*map(self._decode, photos)]
+            images = [*map(self._decode, tagged)]
         rejected = [
             Rejection(path=name, reason=image.reason, found=image.found)
             if isinstance(image, DecodeError)
@@ -127,9 +134,13 @@ class PhotoEncoder:
         """Pixels at the network's size."""
         return resize(image_HW3, self.image_size, self.encoding.resizer)
 
-    def _decode(self, data: bytes) -> Pixels | DecodeError:
+    def _decode(self, tagged: tuple[bytes, Mapping[str, Any] | None]) -> Pixels | DecodeError:
+        data, geotag = tagged
         try:
-            return self.to_input(decode_photo(data))
+            photo_HW3 = decode_photo(data)
+            if self.encoding.perspective == "overhead":
+                photo_HW3 = overhead_view(photo_HW3, geotag)
+            return self.to_input(photo_HW3)
         except DecodeError as error:
             return error
 
@@ -159,7 +170,9 @@ def _check_images(
     except PrecisionError as error:
         raise InputError(str(error)) from None
     count = PROBE_IMAGES + CALIBRATION_IMAGES
-    images_B3HW = first_images(open_or_scan(shards), size, encoding.resizer, count)
+    images_B3HW = first_images(
+        open_or_scan(shards), size, encoding.resizer, count, encoding.perspective
+    )
     calibration_B3HW = images_B3HW[PROBE_IMAGES:]
     if digest_of(calibration_B3HW) != encoding.calibration:
         raise InputError(

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.batches.ordered import CHANGED, decode_samples, stack
+from pipeline.camera.pose import Perspective
 from pipeline.core.arrays import Pixels
 from pipeline.core.errors import InputError
 from pipeline.images.decode import DecodeError
@@ -22,7 +23,13 @@ PROBE_IMAGES, CALIBRATION_IMAGES = 16, 128
 ImageBytes = npt.NDArray[np.uint8]
 
 
-def first_images(shards: ShardSet, size: int, resizer: Resizer, count: int) -> ImageBytes:
+def first_images(
+    shards: ShardSet,
+    size: int,
+    resizer: Resizer,
+    count: int,
+    perspective: Perspective = "as_taken",
+) -> ImageBytes:
     """The first images of a set, alternately of each split and view, (at most `count`, 3, size,
     size).
 
@@ -40,7 +47,7 @@ def first_images(shards: ShardSet, size: int, resizer: Resizer, count: int) -> I
     of_each = -(-count // len(first_shards))
     groups = []
     for shard in first_shards.values():
-        decoded = decode_samples(shards.samples(shard), size, 1, 4, resizer)
+        decoded = decode_samples(shards.samples(shard), size, 1, 4, resizer, perspective)
         images = (usable_pixels(shards, *one) for one in decoded)
         groups.append(list(islice((one for one in images if one is not None), of_each)))
     mixed = [group[rank] for rank in range(of_each) for group in groups if rank < len(group)]

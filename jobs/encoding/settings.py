@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from model.inference.precision import Precision
+from pipeline.camera.pose import Perspective
 from pipeline.images.transforms import Resizer
 
 Compiling = Literal["auto", "always", "never"]
@@ -22,6 +23,9 @@ class EncoderSettings:
     resizer: Resizer = "torch"
     """Whose bicubic resizes the images: torch's, or pillow's, which is faster on CPUs without AVX2;
     tables do not mix."""
+    perspective: Perspective | None = None
+    """How UAV images are seen: as they were taken, or laid on the ground north up where the shards
+    have the camera's pose; by default as the encoder was trained."""
     precision: Precision = "auto"
     """float32; bfloat16; int8, for CPUs that multiply 8-bit integers fast, calibrated by images of
     the shards; auto: bfloat16 on GPUs, else float32."""

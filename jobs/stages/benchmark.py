@@ -4,6 +4,7 @@ In: the methods' names and a budget. Out: a folder per method and seed, and the 
 stages are those of the other jobs, each of which keeps what is finished.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
@@ -31,6 +32,7 @@ from pipeline.evaluation.leaderboard import (
 )
 from pipeline.evaluation.published import PUBLISHED_SINCE, PUBLISHED_TABLE
 from pipeline.evaluation.settings import EvaluationSettings
+from pipeline.images.thumbnails import ImageLoader
 from pipeline.report.inputs import EvaluationResults, read_evaluation
 from pipeline.report.leaderboard import render_leaderboard
 from pipeline.shards.pack import pack
@@ -58,7 +60,9 @@ def benchmark(settings: BenchmarkSettings) -> str:
             if method not in costs:
                 costs[method] = cost_of(checkpoint)
             rows = leaderboard(evaluations, costs)
-            page = write_leaderboard(settings, out, rows)  # what is known by now
+            firsts = {name: runs[0] for name, runs in evaluations.items()}
+            # What is known by now.
+            page = write_leaderboard(settings, out, rows, firsts, open_shards(shards).fetch)
     results.print(leaderboard_markdown(rows), soft_wrap=True)
     print(f"leaderboard: {page}")
     return page
@@ -130,8 +134,16 @@ def cost_of(checkpoint: str) -> Cost:
     )
 
 
-def write_leaderboard(settings: BenchmarkSettings, out: str, rows: list[LeaderboardRow]) -> str:
-    """Write leaderboard.html, .md and .json; the page's path."""
+def write_leaderboard(
+    settings: BenchmarkSettings,
+    out: str,
+    rows: list[LeaderboardRow],
+    evaluations: Mapping[str, EvaluationResults],
+    images: ImageLoader,
+) -> str:
+    """Write leaderboard.html, .md and .json; the page's path. `evaluations`: one of each method,
+    of which the page shows queries.
+    """
     terms = (
         "each method's own network, rates, batch and whole schedule"
         if settings.published_sizes
@@ -151,6 +163,8 @@ def write_leaderboard(settings: BenchmarkSettings, out: str, rows: list[Leaderbo
         ],
         data=data,
         terms=terms,
+        evaluations=evaluations,
+        images=images,
     )
     storage.write_bytes(page, text.encode())
     storage.write_bytes(storage.join(out, "leaderboard.md"), leaderboard_markdown(rows).encode())

@@ -157,7 +157,11 @@ def embed_view(
     with progress(None, f"{view} images", "images") as meter:
         chosen = islice(samples, limit)
         while batch := list(islice(chosen, ENCODE_BATCH)):
-            block_BD, rejections = encoder.encode([sample.data for sample in batch])
+            drones = view == View.DRONE
+            block_BD, rejections = encoder.encode(
+                [sample.data for sample in batch],
+                geotags=[sample.metadata["geotag"] if drones else None for sample in batch],
+            )
             pairs = zip(batch, rejections, strict=True)
             records += [sample.metadata for sample, rejection in pairs if rejection is None]
             blocks.append(block_BD)

@@ -12,8 +12,8 @@ from dataclasses import replace
 from jobs.encoding.encoder import read_checkpoint_bytes
 from jobs.encoding.localizer import with_localizer
 from jobs.encoding.photo_encoder import PhotoEncoder
-from jobs.encoding.queries import Query, encode_photos, merge_by_folder, one_view
-from jobs.stages.matching import open_map, refine_answers, view_maker
+from jobs.encoding.queries import Query, ViewMaker, encode_photos, merge_by_folder, one_view
+from jobs.stages.matching import open_map, overhead_maker, refine_answers, view_maker
 from jobs.stages.settings import LocateSettings
 from pipeline.core import storage
 from pipeline.core.errors import Incomplete, InputError
@@ -68,7 +68,11 @@ def locate_photos(
     )
     gallery = read_gallery_map(index)
     windows = _open_map(settings, gallery)
-    make_views = view_maker(windows, settings) if windows else one_view
+    make_views: ViewMaker = one_view
+    if windows:
+        make_views = view_maker(windows, settings)
+    elif encoder.encoding.perspective == "overhead":
+        make_views = overhead_maker(settings)
     queries = encode_photos(photos, encoder, make_views)
     if settings.together:
         queries = merge_by_folder(queries)

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from jobs.encoding.photo_encoder import decode_photo
 from jobs.encoding.queries import Query, ViewMaker, read_photo
 from pipeline.camera.framing import PhotoViews, views_of_photo
+from pipeline.camera.overhead import overhead_view
 from pipeline.core import storage
 from pipeline.core.arrays import Pixels
 from pipeline.core.prefetch import prefetch_map
@@ -70,6 +71,17 @@ def view_maker(windows: MapWindows, pose: PoseSettings) -> ViewMaker:
     def make_views(photo_HW3: Pixels, tags: CameraTags) -> PhotoViews:
         known = pose_of_photo(tags, (photo_HW3.shape[1], photo_HW3.shape[0]), pose)
         return views_of_photo(photo_HW3, known, sides_m)
+
+    return make_views
+
+
+def overhead_maker(pose: PoseSettings) -> ViewMaker:
+    """Lays photos on the ground north up, as an encoder of that perspective sees them, as far as
+    tags and flags tell the camera."""
+
+    def make_views(photo_HW3: Pixels, tags: CameraTags) -> PhotoViews:
+        known = pose_of_photo(tags, (photo_HW3.shape[1], photo_HW3.shape[0]), pose)
+        return PhotoViews(images=[overhead_view(photo_HW3, vars(known))])
 
     return make_views
 

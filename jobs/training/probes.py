@@ -104,7 +104,9 @@ def probe_images(stream: TrainingStream, view: View) -> Iterator[Decoded]:
         if held_out
         else islice(samples, GAP_IMAGES)
     )
-    return decode_samples(chosen, config.image_size, config.threads, 2 * BATCH, config.resizer)
+    return decode_samples(
+        chosen, config.image_size, config.threads, 2 * BATCH, config.resizer, config.perspective
+    )
 
 
 def embedding_set(seen: ProbeFeatures) -> EmbeddingSet:

@@ -162,5 +162,10 @@ def read_images(state: TrainingState, shards: ShardSet, view: View) -> Iterator[
     config = state.stream.config
     samples = (s for one in shards.manifest.of(Split.TRAIN, view) for s in shards.samples(one))
     return decode_samples(
-        samples, config.image_size, config.threads, 2 * IMAGES_AT_ONCE, config.resizer
+        samples,
+        config.image_size,
+        config.threads,
+        2 * IMAGES_AT_ONCE,
+        config.resizer,
+        config.perspective,
     )

@@ -147,6 +147,7 @@ def open_stream(
         batch_size=recipe.batch_size,
         image_size=recipe.network.image_size,
         resizer=recipe.resizer,
+        perspective=recipe.perspective,
         augmentation=recipe.augmentation,
         seed=recipe.seed,
         threads=max(1, torch.get_num_threads()),

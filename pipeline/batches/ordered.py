@@ -8,9 +8,12 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.camera.overhead import overhead_view
+from pipeline.camera.pose import Perspective
 from pipeline.core.arrays import Pixels
 from pipeline.core.integrity import sha256_of
 from pipeline.core.prefetch import prefetch_map
+from pipeline.core.records import View
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.transforms import Resizer, resize
 from pipeline.shards.samples import Sample
@@ -36,22 +39,43 @@ def stack(images_HW3: Sequence[Pixels]) -> npt.NDArray[np.uint8]:
     return np.stack(images_HW3).transpose(0, 3, 1, 2)
 
 
+def open_image(sample: Sample, perspective: Perspective = "as_taken") -> Pixels:
+    """A sample's pixels, (H, W, 3), of UAV images in this perspective. Raises DecodeError."""
+    check_unchanged(sample)
+    image_HW3 = decode(sample.data)
+    if perspective == "overhead" and sample.metadata["view"] == View.DRONE:
+        return overhead_view(image_HW3, sample.metadata["geotag"])
+    return image_HW3
+
+
 def decode_samples(
-    samples: Iterable[Sample], image_size: int, threads: int, depth: int, resizer: Resizer = "torch"
+    samples: Iterable[Sample],
+    image_size: int,
+    threads: int,
+    depth: int,
+    resizer: Resizer = "torch",
+    perspective: Perspective = "as_taken",
 ) -> Iterator[Decoded]:
     """The samples' images in order, decoded and resized by threads that prefetch `depth` of them;
     an image that cannot be decoded is returned as its error.
     """
     return prefetch_map(
-        lambda sample: decode_sample(sample, image_size, resizer), samples, threads, depth
+        lambda sample: decode_sample(sample, image_size, resizer, perspective),
+        samples,
+        threads,
+        depth,
     )
 
 
-def decode_sample(sample: Sample, image_size: int, resizer: Resizer = "torch") -> Decoded:
+def decode_sample(
+    sample: Sample,
+    image_size: int,
+    resizer: Resizer = "torch",
+    perspective: Perspective = "as_taken",
+) -> Decoded:
     """One sample's image, decoded and resized, or why it cannot be."""
     try:
-        check_unchanged(sample)
-        return sample, resize(decode(sample.data), image_size, resizer)
+        return sample, resize(open_image(sample, perspective), image_size, resizer)
     except DecodeError as error:
         return sample, error
 

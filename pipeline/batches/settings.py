@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from pipeline.camera.pose import Perspective
 from pipeline.core.errors import InputError, require
 from pipeline.images.augmentation import Augmentation
 from pipeline.images.transforms import Resizer
@@ -40,6 +41,8 @@ class StreamConfig:
     "Side in pixels of the network's input."
     resizer: Resizer = "torch"
     "Whose bicubic resizes images to it."
+    perspective: Perspective = "as_taken"
+    "How UAV images are seen before they are resized."
     augmentation: Augmentation = field(default_factory=Augmentation)
     seed: int = 0
     shuffle_buffer: int = 4096

@@ -18,8 +18,8 @@ import webdataset as wds
 from pipeline.batches.holdout import exclude_locations, holdout_locations
 from pipeline.batches.ordered import (
     Decoded,
-    check_unchanged,
     is_damaged,
+    open_image,
     split_failed,
     stack,
 )
@@ -36,7 +36,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import Split, View, key_matches
 from pipeline.images.augmentation import augment
-from pipeline.images.decode import DecodeError, decode
+from pipeline.images.decode import DecodeError
 from pipeline.shards.samples import Sample
 from pipeline.shards.shard_set import ShardSet
 
@@ -251,8 +251,7 @@ class TrainingStream:
         # A generator for each image, so that its augmentation does not depend on the thread.
         seed = [config.seed, epoch, list(View).index(view), self.rank, number]
         try:
-            check_unchanged(sample)
-            image_HW3 = decode(sample.data)
+            image_HW3 = open_image(sample, config.perspective)
         except DecodeError as error:
             return sample, error
         return sample, augment(

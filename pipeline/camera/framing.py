@@ -106,21 +106,23 @@ def frame_photo(
     if known and side_m is not None:
         upright = replace(pose, heading_deg=pose.heading_deg or 0.0)
         to_ground_33 = photo_to_ground(upright.over(), (width, height))
-        if _shows_no_sky(to_ground_33, (width, height)):
-            framed = _on_ground(photo_HW3, to_ground_33, side_m)
+        if shows_no_sky(to_ground_33, (width, height)):
+            framed = lay_on_ground(photo_HW3, to_ground_33, side_m)
             return framed, "scale" if pose.heading_deg is None else "ground"
     if pose.heading_deg is not None:
         return _turned(photo_HW3, pose.heading_deg), "north"
     return photo_HW3, "none"
 
 
-def _shows_no_sky(to_ground_33: Doubles, size: tuple[int, int]) -> bool:
+def shows_no_sky(to_ground_33: Doubles, size: tuple[int, int]) -> bool:
+    """Whether all rays of a photo of `size` (width, height) meet the ground, and none far away."""
     weight_4 = np.c_[corners(size), np.ones(4)] @ to_ground_33[2]
     return bool(weight_4.min() > 0.05 * weight_4.max())
 
 
-def _on_ground(photo_HW3: Pixels, to_ground_33: Doubles, side_m: float) -> Pixels:
-    """The ground around the photo's middle, a square of `side_m` metres."""
+def lay_on_ground(photo_HW3: Pixels, to_ground_33: Doubles, side_m: float) -> Pixels:
+    """The ground around the photo's middle, a north-up square of `side_m` metres, (FRAME_PX,
+    FRAME_PX, 3), by the photo's homography to the ground."""
     height, width = photo_HW3.shape[:2]
     middle_2 = apply_homography(to_ground_33, np.array([[width / 2, height / 2]]))[0]
     half_m = side_m / 2

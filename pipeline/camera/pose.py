@@ -2,6 +2,11 @@
 
 from dataclasses import dataclass
 from math import cos, radians, sin, tan
+from typing import Literal
+
+Perspective = Literal["as_taken", "overhead"]
+"""Whether UAV images are seen as they were taken, or laid on the ground north up (`overhead.py`),
+where the shards say how the camera stood; other views always as they were taken."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -168,7 +168,10 @@ class ShardEmbedder:
 
     def _decode_one(self, sample: Sample) -> tuple[Decoded, float]:
         start = time.perf_counter()
-        decoded = decode_sample(sample, self._spec.image_size, self._spec.encoding.resizer)
+        encoding = self._spec.encoding
+        decoded = decode_sample(
+            sample, self._spec.image_size, encoding.resizer, encoding.perspective
+        )
         return decoded, time.perf_counter() - start
 
     def _infer(

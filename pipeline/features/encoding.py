@@ -8,6 +8,7 @@ import json
 from dataclasses import asdict, dataclass
 from typing import Literal
 
+from pipeline.camera.pose import Perspective
 from pipeline.core.json_files import from_json
 from pipeline.images.transforms import Resizer
 
@@ -23,6 +24,8 @@ class EncodingConfig:
     precision: Literal["float32", "bfloat16", "int8"]
     calibration: str | None = None
     "Digest of the images that calibrated int8; None in other precisions."
+    perspective: Perspective = "as_taken"
+    "How UAV images are seen before they are resized."
 
 
 def encode_config(config: EncodingConfig | None) -> str:

@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from jinja2 import Environment
+
 from pipeline.core.arrays import Floats
 from pipeline.core.templates import template_environment
 from pipeline.images.thumbnails import ImageLoader, ThumbnailCache
@@ -61,6 +63,35 @@ def render_report(
     keys = sorted(set[str]().union(*(choice.keys for choice in choices)))
     parts = {row["task"]: row["parts"] for row in results.parts}
     thumbnails, known = ThumbnailCache(images(keys)), vectors(keys) if parts else {}
+    return (
+        report_environment()
+        .get_template("report.html")
+        .render(
+            title=context.title,
+            fingerprint=results.metrics[0]["fingerprint"],
+            protocol=PROTOCOL_TEXTS[results.metrics[0]["protocol"]],
+            measures=METRIC_LABELS,
+            tasks=tasks,
+            beside=context.beside.name if context.beside else None,
+            evidence=[chart for chart in evidence if chart],
+            groups=group_tables(results.groups, names, r1),
+            parts=part_tables(results.parts, names, r1),
+            gaps=[svg.layout_scatter(scatter(gap, context.beside)) for gap in results.gaps],
+        metres=METRE_LABELS if any(task.geo for task in tasks) else {},
+            maps=[task.errors for task in single if task.errors],
+            training=training_charts(context.training),
+            sections=[
+                panel_section(choice, thumbnails, known, parts.get(choice.task.row["task"], 1))
+                for choice in choices
+            ],
+            geometry=svg,
+            map_size=map_sheet,
+        )
+    )
+
+
+def report_environment(**own: Callable[..., Any]) -> Environment:
+    """The environment of this room's templates and macros; filters of one's own come last."""
     environment = template_environment(Path(__file__).parent / "templates")
     filters: dict[str, Callable[..., Any]] = {
         "percent": lambda value: f"{100 * value:.2f}",
@@ -70,28 +101,8 @@ def render_report(
         "opened": lambda items: _numbered(items, opened=True),
         "folded": lambda items: _numbered(items, opened=False),
     }
-    environment.filters |= filters
-    return environment.get_template("report.html").render(
-        title=context.title,
-        fingerprint=results.metrics[0]["fingerprint"],
-        protocol=PROTOCOL_TEXTS[results.metrics[0]["protocol"]],
-        measures=METRIC_LABELS,
-        tasks=tasks,
-        beside=context.beside.name if context.beside else None,
-        evidence=[chart for chart in evidence if chart],
-        groups=group_tables(results.groups, names, r1),
-        parts=part_tables(results.parts, names, r1),
-        gaps=[svg.layout_scatter(scatter(gap, context.beside)) for gap in results.gaps],
-        metres=METRE_LABELS if any(task.geo for task in tasks) else {},
-        maps=[task.errors for task in single if task.errors],
-        training=training_charts(context.training),
-        sections=[
-            _section(choice, thumbnails, known, parts.get(choice.task.row["task"], 1))
-            for choice in choices
-        ],
-        geometry=svg,
-        map_size=map_sheet,
-    )
+    environment.filters |= filters | own
+    return environment
 
 
 def _numbered(items: Sequence[Any], opened: bool) -> list[tuple[int, Any]]:
@@ -100,7 +111,7 @@ def _numbered(items: Sequence[Any], opened: bool) -> list[tuple[int, Any]]:
     return [(i + 1, item) for i, item in enumerate(items) if (i in shown) == opened]
 
 
-def _section(
+def panel_section(
     choice: PanelChoice, thumbnails: ThumbnailCache, known: Mapping[str, Floats], parts: int
 ) -> dict[str, Any]:
     """The panels of one task, as the template takes them."""

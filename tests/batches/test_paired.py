@@ -131,7 +131,7 @@ def test_paired_k_resumes_at_any_step(
                      augmentation=Augmentation(pad=2, pair_mirror=True))  # fmt: skip
     complete, opened = epoch(shards, 2, reading=lively), count()
     monkeypatch.setattr(
-        "pipeline.batches.training.decode", lambda data: (next(opened), decode(data))[1]
+        "pipeline.batches.ordered.decode", lambda data: (next(opened), decode(data))[1]
     )
     rest = list(TrainingStream(open_shards(shards), lively).epoch(2, skip))
     assert len(rest) == len(complete) - skip == 6 - skip
@@ -185,7 +185,7 @@ def test_pairs_are_mirrored_together(
     """On images whose left half is black: both of a pair are mirrored, or neither."""
     half_HW3 = np.zeros((8, 8, 3), np.uint8)
     half_HW3[:, 4:] = 255
-    monkeypatch.setattr("pipeline.batches.training.decode", lambda data: half_HW3)
+    monkeypatch.setattr("pipeline.batches.ordered.decode", lambda data: half_HW3)
     still = replace(PAIRED.augmentation, pair_mirror=True)
     reading = replace(PAIRED, sampler=sampler, augmentation=still)  # type: ignore[arg-type]
     seen = []

@@ -102,7 +102,7 @@ def test_epoch_resumes_at_any_step(shards: str, skip: int, monkeypatch: pytest.M
     complete = epoch(shards, 2, reading=lively)
     opened = count()
     monkeypatch.setattr(
-        "pipeline.batches.training.decode", lambda data: (next(opened), decode(data))[1]
+        "pipeline.batches.ordered.decode", lambda data: (next(opened), decode(data))[1]
     )
     rest = list(TrainingStream(open_shards(shards), lively).epoch(2, skip))
     assert len(rest) == len(complete) - skip

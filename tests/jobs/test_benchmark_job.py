@@ -64,6 +64,10 @@ def test_benchmark_writes_leaderboard_and_keeps_finished_runs(
     text = page.read_text()
     assert "sample4geo" in text
     assert "without distractors" in text  # Sample4Geo's published row
+    assert "figure 3" in text
+    assert "Cosine of true pairs" in text
+    assert text.count('<article class="panel"') >= 4
+    assert text.count("data:image/webp;base64,") >= 10
     assert "| instance_loss | 1 |" in (tmp_path / "leaderboard.md").read_text()
     trained = (tmp_path / "runs/instance_loss-seed0/last.pt").stat().st_mtime_ns
     capsys.readouterr()

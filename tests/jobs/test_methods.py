@@ -18,8 +18,8 @@ from model.training import Training
 from tests.jobs.tiny_runs import settings
 
 METHODS = (
-    "instance_loss", "lcm_style", "lpn", "usam", "usam_lpn", "msba_style", "fsra", "mccg",
-    "sample4geo", "dac", "camp", "qdfl",
+    "instance_loss", "lcm_style", "lpn", "usam", "usam_lpn", "pcl_style", "msba_style", "fsra",
+    "mccg", "sample4geo", "dac", "camp", "qdfl",
 )  # fmt: skip
 LOSSES = {
     "msba_style": {"kl_loss"},

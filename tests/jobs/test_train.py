@@ -107,7 +107,7 @@ def test_train_counts_damaged_images_per_epoch(
             raise DecodeError("damaged image", "here")
         return decode(data)
 
-    monkeypatch.setattr("pipeline.batches.training.decode", failing)
+    monkeypatch.setattr("pipeline.batches.ordered.decode", failing)
     told: list[dict[str, object]] = []
     run = RunConfig(shards=tiny_shards, out=str(tmp_path / "run"), recipe=tiny(4), probe_epochs=0)
     train_worker(

@@ -16,6 +16,7 @@ from jobs.training.recipes.lcm import lcm_style
 from jobs.training.recipes.lpn import lpn, lpn_pvda_rates
 from jobs.training.recipes.mccg import mccg
 from jobs.training.recipes.msba import msba_style
+from jobs.training.recipes.pcl import pcl_style
 from jobs.training.recipes.pvda import (
     alpha_zero,
     constant_alpha,
@@ -48,6 +49,7 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
         lpn_pvda_rates,
         usam,
         usam_lpn,
+        pcl_style,
         msba_style,
         fsra,
         fsra_3,

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from model.config import LossWeights, Optimization, Precision, PVDAConfig, Start
 from model.schedule import Schedule
 from pipeline.batches.settings import Sampler, check_sampler
+from pipeline.camera.pose import Perspective
 from pipeline.core.errors import require
 from pipeline.images.augmentation import Augmentation
 from pipeline.images.transforms import Resizer
@@ -31,6 +32,9 @@ class Recipe:
     resizer: Resizer = "torch"
     """Whose bicubic resizes the images: torch's, or pillow's, which is faster on CPUs without AVX2
     [chosen]."""
+    perspective: Perspective = "as_taken"
+    """How UAV images are seen, in training and where the encoder embeds: as they were taken, or
+    laid on the ground north up where the shards have the camera's pose [PCL]."""
     adversary: bool = True
     "Train with a view discriminator; without it PVDA is LPN."
     sampler: Sampler = "independent"
