@@ -38,6 +38,7 @@ from pipeline.report.leaderboard import render_leaderboard
 from pipeline.shards.pack import pack
 from pipeline.shards.settings import PackingSettings
 from pipeline.shards.shard_set import open_shards
+from pipeline.shards.tile_reader import TileReader
 from pipeline.simulation.settings import SimulationSettings
 from pipeline.simulation.simulate import simulate
 from pipeline.sources.university1652 import University1652
@@ -62,7 +63,8 @@ def benchmark(settings: BenchmarkSettings) -> str:
             rows = leaderboard(evaluations, costs)
             firsts = {name: runs[0] for name, runs in evaluations.items()}
             # What is known by now.
-            page = write_leaderboard(settings, out, rows, firsts, open_shards(shards).fetch)
+            images = TileReader(open_shards(shards)).fetch
+            page = write_leaderboard(settings, out, rows, firsts, images)
     results.print(leaderboard_markdown(rows), soft_wrap=True)
     print(f"leaderboard: {page}")
     return page

@@ -77,7 +77,7 @@ def render_report(
             groups=group_tables(results.groups, names, r1),
             parts=part_tables(results.parts, names, r1),
             gaps=[svg.layout_scatter(scatter(gap, context.beside)) for gap in results.gaps],
-        metres=METRE_LABELS if any(task.geo for task in tasks) else {},
+            metres=METRE_LABELS if any(task.geo for task in tasks) else {},
             maps=[task.errors for task in single if task.errors],
             training=training_charts(context.training),
             sections=[
