@@ -14,9 +14,9 @@ from jobs.encoding.embed_test import embed_test
 from jobs.encoding.encoder import read_checkpoint_bytes
 from jobs.stages.benchmark_settings import BenchmarkSettings
 from jobs.training.driver import train
+from jobs.training.equal_budget import at_equal_budget
 from jobs.training.recipes import RECIPES
 from jobs.training.recipes.builtin import builtin
-from jobs.training.recipes.equal_budget import at_equal_budget
 from jobs.training.recipes.recipe import Recipe
 from jobs.training.settings import TrainSettings
 from model.checkpoint import build_encoder, loads

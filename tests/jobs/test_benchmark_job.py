@@ -8,8 +8,8 @@ import pytest
 
 from jobs.stages.benchmark import benchmark
 from jobs.stages.benchmark_settings import METHODS, BenchmarkSettings
+from jobs.training.equal_budget import at_equal_budget
 from jobs.training.recipes import RECIPES
-from jobs.training.recipes.equal_budget import at_equal_budget
 from jobs.training.recipes.recipe import Recipe
 from pipeline.core.errors import InputError
 
