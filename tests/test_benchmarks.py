@@ -70,7 +70,7 @@ CASES: dict[str, tuple[str, str]] = {
         r"(.|\n)*\| 18 to 24 \| no \| levels \|(.|\n)*levels, .* [\d.]+ x one level's photos",
     ),
     "region": (
-        "--out {out} --side 400 --resolution 0.5 --minutes 0 --photos 4 --checks 20 --height 60 80",
+        "--out {out} --side 600 --resolution 0.6 --minutes 0 --photos 1 --checks 20 --height 60 80",
         r"\| after, without \| [\d.]+% \|.* [\d.]+ x \|",
     ),
     "serve": (

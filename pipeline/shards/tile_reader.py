@@ -13,6 +13,7 @@ from typing import IO
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import View
+from pipeline.shards.manifest import Shard
 from pipeline.shards.shard_set import ShardSet
 from pipeline.shards.tar_reader import IMAGE_SUFFIXES
 
@@ -63,15 +64,19 @@ class TileReader:
     def _by_shard(self, keys: Iterable[str]) -> dict[str, list[str]]:
         if self._shard_of is None:
             self._shard_of = {
-                key: name
-                for name, shard in self._shards.items()
-                for key in self._set.records(shard, ["key"])["key"].to_pylist()
+                key: name for name, shard in self._shards.items() for key in self._keys(name, shard)
             }
         grouped: dict[str, list[str]] = {}
         for key in keys:
             if key in self._shard_of:
                 grouped.setdefault(self._shard_of[key], []).append(key)
         return grouped
+
+    def _keys(self, name: str, shard: Shard) -> list[str]:
+        try:
+            return list(self._set.records(shard, ["key"])["key"].to_pylist())
+        except InputError:  # without a record table the tar itself tells
+            return list(self._spans(name))
 
     def _read_spans(self, name: str) -> dict[str, Span]:
         path = self._set.tar(self._shards[name])

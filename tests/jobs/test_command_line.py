@@ -182,7 +182,8 @@ def test_pvda_lists_every_job_and_refuses_others(
         pvda.main()
     assert ended.value.code == 2
     assert (
-        "unknown job 'trian', expected one of: benchmark, build_index," in capsys.readouterr().err
+        "unknown job 'trian', expected one of: adapt, benchmark, build_index,"
+        in capsys.readouterr().err
     )
 
 

@@ -65,6 +65,7 @@ def test_recipes_are_listed_by_their_names() -> None:
         "lpn_pvda_rates",
         "usam",
         "usam_lpn",
+        "pcl_style",
         "msba_style",
         "fsra",
         "fsra_3",
