@@ -175,6 +175,7 @@ def test_index_is_opened_by_plain_faiss(table: str, tmp_path: Path) -> None:
     rows = pq.read_table(storage.join(out, "ids.parquet")).to_pylist()
     assert rows[205] == {
         "row": 205,
+        "side_m": None,
         "key": "gallery-1-5",
         "location": "10005",
         "view": "satellite",
