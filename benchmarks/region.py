@@ -11,7 +11,6 @@ built-in encoder, tiles alone, then matched, without any fitting) and after `ada
 """
 
 import argparse
-import csv
 import json
 import time
 from collections.abc import Sequence
@@ -24,17 +23,19 @@ from own_map import make_index, make_map, write_map
 from jobs.region.adapt import adapt
 from jobs.region.expect import outcome_of
 from jobs.region.settings import AdaptSettings
+from jobs.stages.calibrate_flight import flight_of
 from jobs.stages.locate import locate_photos
 from jobs.stages.settings import LocateSettings
 from model.weights.builtin import BUILTIN
 from pipeline.core import cluster
+from pipeline.core.records import GeoTag
 from pipeline.region.expectation import Expectation, Outcome, expect
-from pipeline.simulation.over_map.fly import fly
+from pipeline.simulation.over_map.fly import TABLE, fly
 from pipeline.simulation.over_map.settings import MapFlightSettings, TownMapSettings
 from pipeline.simulation.over_map.town_map import ANOTHER_DAY, MAP, SURFACE, make_town_map
 
-Truth = dict[str, tuple[float, float, float, float]]
-"Latitude, longitude, height and pitch by the photo's path."
+Truth = dict[str, GeoTag]
+"Where and how photos were taken, by their paths."
 
 
 def make_maps(options: argparse.Namespace, out: Path, seed: int) -> tuple[str, str, str | None]:
@@ -63,14 +64,7 @@ def take_photos(
             height=tuple(options.height),
         )
     )  # fmt: skip
-    with (flight / "photos.csv").open() as table:
-        return {
-            str(flight / row["path"]): (
-                float(row["lat"]), float(row["lon"]), float(row["altitude_m"]),
-                float(row["pitch_deg"]),
-            )
-            for row in csv.DictReader(table)
-        }  # fmt: skip
+    return {photo.path: photo.truth for photo in flight_of(str(flight / TABLE), count)}
 
 
 def locate_all(settings: LocateSettings, truth: Truth) -> tuple[list[Outcome], float]:
@@ -78,10 +72,7 @@ def locate_all(settings: LocateSettings, truth: Truth) -> tuple[list[Outcome], f
     begin = time.perf_counter()
     located = {one.name: one for one in locate_photos(settings)}
     seconds = (time.perf_counter() - begin) / len(truth)
-    outcomes = [
-        outcome_of(located[path], (lat, lon), settings.pose, height_m, pitch_deg)
-        for path, (lat, lon, height_m, pitch_deg) in truth.items()
-    ]
+    outcomes = [outcome_of(located[path], tag, settings.pose) for path, tag in truth.items()]
     return outcomes, seconds
 
 

@@ -3,7 +3,7 @@ REGION [--minutes 20]`
 
 Makes tiles, flies simulated UAVs over the map, fine-tunes the built-in encoder, builds the index,
 fits its confidence, and writes REGION/what_to_expect.html. Then: `locate.py --index REGION/index
---shards REGION/tiles --checkpoint REGION/encoder.safetensors --out where.geojson PHOTO...`
+--out where.geojson PHOTO...`
 """
 
 from jobs.command_line.cli import run

@@ -31,7 +31,7 @@ from pipeline.features.settings import EmbeddingSettings
 from pipeline.index.build import build_index
 from pipeline.index.settings import IndexSettings
 from pipeline.locate.photo_files import find_photos
-from pipeline.region.camera_ranges import CameraRanges, ranges_of_photos
+from pipeline.region.camera_ranges import ranges_of_photos
 from pipeline.region.expectation import (
     WITHIN_M,
     Expectation,
@@ -45,6 +45,7 @@ from pipeline.shards.settings import PackingSettings
 from pipeline.shards.shard_set import open_shards
 from pipeline.shards.tile_reader import TileReader
 from pipeline.simulation.over_map.fly import TABLE
+from pipeline.simulation.over_map.settings import CameraRanges
 from pipeline.sources.geotiff import GeoTiff
 
 OVERLAP = 0.5
@@ -107,14 +108,13 @@ def adapt(settings: AdaptSettings) -> list[Expectation]:
 
 def _cameras(settings: AdaptSettings) -> CameraRanges:
     """How the simulated UAV flies: as its photos' tags say, else by the settings."""
-    asked = CameraRanges(height_m=settings.height, pitch_deg=settings.pitch, fov_deg=settings.fov)
     if settings.photos is None:
-        return asked
-    found = ranges_of_photos(find_photos((settings.photos,)), asked)
+        return settings
+    found = ranges_of_photos(find_photos((settings.photos,)), settings)
     console.print(
-        f"{settings.photos}: {found.height_m[0]:.0f} to {found.height_m[1]:.0f} m high, pitch "
-        f"{found.pitch_deg[0]:.0f} to {found.pitch_deg[1]:.0f}, field of view "
-        f"{found.fov_deg[0]:.0f} to {found.fov_deg[1]:.0f} degrees",
+        f"{settings.photos}: {found.height[0]:.0f} to {found.height[1]:.0f} m high, pitch "
+        f"{found.pitch[0]:.0f} to {found.pitch[1]:.0f}, field of view "
+        f"{found.fov[0]:.0f} to {found.fov[1]:.0f} degrees",
         markup=False,
     )
     return found

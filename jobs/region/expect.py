@@ -1,7 +1,7 @@
 """Photos of known places, located by a region: what can be expected of it."""
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from jobs.region.folder import Region
 from jobs.stages.calibrate_flight import flight_of
 from jobs.stages.locate import locate_photos
 from jobs.stages.settings import LocateSettings
-from pipeline.core.records import ImageRecord, View
+from pipeline.core.records import GeoTag, ImageRecord, View
 from pipeline.features.table import open_table
 from pipeline.index.searcher import Index
 from pipeline.locate.geojson import LocatedPhoto
@@ -25,49 +25,12 @@ at least apart."""
 
 def located_outcomes(region: Region, table: str, most: int) -> list[Outcome]:
     """The photos of a table located with and without their tags, against the truth."""
-    photos = {photo.path: photo.truth for photo in flight_of(table, most)}
-    outcomes = []
-    for posed in (True, False):
-        settings = locate_settings(region, tuple(photos), posed)
-        for one in locate_photos(settings, {path: (t.lat, t.lon) for path, t in photos.items()}):
-            truth = photos[one.name]
-            outcomes.append(
-                outcome_of(one, (truth.lat, truth.lon), posed, truth.altitude_m, truth.pitch_deg)
-            )
-    return outcomes
-
-
-def locate_settings(region: Region, photos: tuple[str, ...], posed: bool) -> LocateSettings:
-    """Photos located by the region; its answers and page lie in its folder."""
-    way = "with-tags" if posed else "without-tags"
-    return LocateSettings(
-        photos=photos, checkpoint=region.encoder, index=region.index, shards=region.tiles,
-        pose=posed, out=region.path("expect", f"{way}.geojson"),
-        page=region.path("expect", f"{way}.html"),
-    )  # fmt: skip
-
-
-def outcome_of(
-    one: LocatedPhoto,
-    truth: tuple[float, float],
-    posed: bool,
-    height_m: float | None,
-    pitch_deg: float | None,
-) -> Outcome:
-    """An answer against the truth."""
-    answer = one.answer
-    error_m = distance_to_m(answer, truth) if answer else None
-    return Outcome(
-        name=one.name,
-        error_m=math.inf if error_m is None else error_m,
-        known=answer is not None and answer.known,
-        probability=answer.probability if answer else None,
-        within_m=answer.within_m if answer else None,
-        refined=answer is not None and answer.refinement is not None,
-        posed=posed,
-        height_m=math.nan if height_m is None else height_m,
-        pitch_deg=math.nan if pitch_deg is None else pitch_deg,
-    )
+    truths = {photo.path: photo.truth for photo in flight_of(table, most)}
+    return [
+        outcome
+        for posed, way in ((True, "with-tags"), (False, "without-tags"))
+        for outcome in _locate(region, truths, posed, way)
+    ]
 
 
 def real_photos(region: Region, folder: str | None) -> Expectation | None:
@@ -82,19 +45,36 @@ def real_photos(region: Region, folder: str | None) -> Expectation | None:
     }
     if not truths:
         return None
-    given = locate_settings(region, tuple(truths), posed=True)
-    given = replace(
-        given,
-        out=region.path("expect", "photos.geojson"),
-        page=region.path("expect", "photos.html"),
+    return expect("your photos, against their GPS", _locate(region, truths, True, "photos"))
+
+
+def _locate(region: Region, truths: Mapping[str, GeoTag], posed: bool, name: str) -> list[Outcome]:
+    """Photos located by the region, against the truth by their paths; the answers and their page
+    lie in its folder."""
+    settings = LocateSettings(
+        photos=tuple(truths), checkpoint=region.encoder, index=region.index, shards=region.tiles,
+        pose=posed, out=region.path("expect", f"{name}.geojson"),
+        page=region.path("expect", f"{name}.html"),
+    )  # fmt: skip
+    located = locate_photos(settings, {path: (tag.lat, tag.lon) for path, tag in truths.items()})
+    return [outcome_of(one, truths[one.name], posed) for one in located]
+
+
+def outcome_of(one: LocatedPhoto, truth: GeoTag, posed: bool) -> Outcome:
+    """An answer against the truth."""
+    answer = one.answer
+    error_m = distance_to_m(answer, (truth.lat, truth.lon)) if answer else None
+    return Outcome(
+        name=one.name,
+        error_m=math.inf if error_m is None else error_m,
+        known=answer is not None and answer.known,
+        probability=answer.probability if answer else None,
+        within_m=answer.within_m if answer else None,
+        refined=answer is not None and answer.refinement is not None,
+        posed=posed,
+        height_m=math.nan if truth.altitude_m is None else truth.altitude_m,
+        pitch_deg=math.nan if truth.pitch_deg is None else truth.pitch_deg,
     )
-    located = locate_photos(given, {path: (tag.lat, tag.lon) for path, tag in truths.items()})
-    outcomes = [
-        outcome_of(one, (truths[one.name].lat, truths[one.name].lon), True,
-                   truths[one.name].altitude_m, truths[one.name].pitch_deg)
-        for one in located
-    ]  # fmt: skip
-    return expect("your photos, against their GPS", outcomes)
 
 
 def lookalikes(region: Region, tile_m: float) -> list[Lookalike]:

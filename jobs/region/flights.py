@@ -5,11 +5,10 @@ from dataclasses import asdict, replace
 from jobs.region.folder import Region, print_command
 from jobs.region.settings import AdaptSettings
 from pipeline.core import storage
-from pipeline.region.camera_ranges import CameraRanges
 from pipeline.shards.pack import pack
 from pipeline.shards.settings import PackingSettings
 from pipeline.simulation.over_map.fly import TABLE, fly
-from pipeline.simulation.over_map.settings import MapFlightSettings
+from pipeline.simulation.over_map.settings import CameraRanges, MapFlightSettings
 from pipeline.sources.table import Table
 
 VIEWS = 4
@@ -29,8 +28,8 @@ def plan_flights(
     fitted on, and photos that tell what to expect. Each has days of its own."""
     base = MapFlightSettings(
         mosaic=settings.mosaic, surface=settings.surface, out="", part="held-out",
-        photos=settings.checks, height=cameras.height_m, pitch=cameras.pitch_deg,
-        fov=cameras.fov_deg,
+        photos=settings.checks, height=cameras.height, pitch=cameras.pitch,
+        fov=cameras.fov,
     )  # fmt: skip
     pairs = replace(base, overhead_m=settings.tile_m, size=LEARN_PX)
     places = min(MOST_PLACES, max(LEAST_PLACES, round(settings.minutes * PLACES_PER_MINUTE)))

@@ -1,6 +1,6 @@
 """The folder of a region: what lies where, and the command that makes each part alone."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -8,6 +8,7 @@ from jobs.region.settings import AdaptSettings
 from pipeline.core import json_files, storage
 from pipeline.core.errors import InputError
 from pipeline.core.progress import console
+from pipeline.simulation.resume import settings_record
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,9 +52,7 @@ def claim(region: Region, settings: AdaptSettings) -> None:
     """
     if not storage.is_file(settings.mosaic):
         raise InputError(f"no map at {settings.mosaic}, expected a GeoTIFF; check --mosaic")
-    about = {name: value for name, value in asdict(settings).items() if name != "out"}
-    about |= {name: list(value) for name, value in about.items() if isinstance(value, tuple)}
-    about["mosaic_bytes"] = storage.size(settings.mosaic)
+    about = settings_record(settings, ("out",)) | {"mosaic_bytes": storage.size(settings.mosaic)}
     path = region.path("region.json")
     if not storage.exists(path):
         if storage.is_folder(region.out) and storage.walk(region.out):

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from pipeline.core.errors import require
-from pipeline.simulation.over_map.settings import SURFACE_FLAG
+from pipeline.simulation.over_map.settings import SURFACE_FLAG, CameraRanges
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdaptSettings:
-    """The map, and how much is spent on it."""
+class AdaptSettings(CameraRanges):
+    """The map, how the UAV flies over it, and how much is spent on it."""
 
     mosaic: str
     "The map: a GeoTIFF of any coordinate system and size."
@@ -21,18 +21,12 @@ class AdaptSettings:
     surface: Annotated[str | None, SURFACE_FLAG] = None
     "A surface model (GeoTIFF, metres): relief and parallax. None: the ground is taken for flat."
     photos: str | None = None
-    """Folder of photos of the UAV, none of which is learned from: their tags set heights, pitch and
-    lens of the simulated ones, and where they have GPS, the page shows the real error."""
+    """Folder of photos of the UAV, none of which is learned from: their tags set --height, --pitch
+    and --fov of the simulated ones, and where they have GPS, the page shows the real error."""
     minutes: float = 20.0
     "Of fine-tuning the built-in encoder; 0 keeps it as it is."
     tile_m: float = 55.0
     "Side of a tile of the map, metres; the built-in encoder learned of such."
-    height: tuple[float, float] = (60.0, 120.0)
-    "Range of the UAV's height above the ground, metres; --photos with tags replace it."
-    pitch: tuple[float, float] = (-90.0, -45.0)
-    "Range of the camera's angle above the horizon, degrees; likewise."
-    fov: tuple[float, float] = (45.0, 65.0)
-    "Range of the field of view across a photo, degrees; likewise."
     checks: int = 80
     """Simulated photos of held-out places that the confidence is fitted on, and as many again that
     tell what to expect."""
@@ -40,6 +34,7 @@ class AdaptSettings:
     "Another seed flies elsewhere, on other days."
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require(self.minutes >= 0, "minutes", self.minutes, "0 or more")
         require(self.tile_m > 0, "tile_m", self.tile_m, "metres above 0")
         require(self.checks >= 20, "checks", self.checks, "20 or more")

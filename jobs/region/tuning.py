@@ -33,8 +33,9 @@ def choose_encoder(region: Region, minutes: float, learn: str, choose: str) -> N
                 out=region.path("run"),
             )
         )  # fmt: skip
+        test = pack_pairs(choose)
         before, after = (
-            _held_out_ap(region, choose, name, checkpoint)
+            _held_out_ap(region, test, name, checkpoint)
             for name, checkpoint in (("built-in", BUILTIN), ("tuned", tuned))
         )
         chosen = tuned if after >= before else BUILTIN
@@ -59,9 +60,9 @@ def _epochs(region: Region, minutes: float, shards: str) -> int:
     return epochs
 
 
-def _held_out_ap(region: Region, choose: str, name: str, checkpoint: str) -> float:
+def _held_out_ap(region: Region, shards: str, name: str, checkpoint: str) -> float:
     """Average precision of UAV -> map over the places held out, by an encoder."""
-    shards, table = pack_pairs(choose), region.path("choose", name, "table")
+    table = region.path("choose", name, "table")
     embed_test(shards, checkpoint, table)
     out = region.path("choose", name, "evaluation")
     rows = evaluate(

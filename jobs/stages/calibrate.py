@@ -33,7 +33,7 @@ from pipeline.locate.calibration import (
 from pipeline.locate.fitting.calibrate import CalibrationContext, fit_calibration
 from pipeline.locate.fitting.calibration_data import LabelledImages, make_examples
 from pipeline.locate.fitting.fit_matching import fit_matching
-from pipeline.locate.gallery_map import read_gallery_map
+from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
 from pipeline.locate.settings import CalibrationCriteria
 from pipeline.shards.shard_set import open_or_scan
 
@@ -73,7 +73,9 @@ def calibrate_index(settings: CalibrateSettings) -> Calibration:
         photo_selection=selection,
     )
     if settings.flight:
-        calibration = _calibrate_on_flight(settings, settings.flight, encoder, index, context)
+        calibration = _calibrate_on_flight(
+            settings, settings.flight, encoder, index, gallery, context
+        )
     else:
         trained_on = frozenset(loads(data, settings.checkpoint).locations)
         photos = embed_view(settings, encoder, settings.view, trained_on, settings.photos)
@@ -97,9 +99,9 @@ def _calibrate_on_flight(
     flight: str,
     encoder: PhotoEncoder,
     index: Index,
+    gallery: GalleryMap,
     context: CalibrationContext,
 ) -> Calibration:
-    gallery = read_gallery_map(index)
     windows = open_map(settings.shards, gallery)
     if windows is None:
         raise InputError(

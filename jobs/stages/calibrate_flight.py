@@ -9,12 +9,13 @@ Out: examples for `pipeline/locate/fitting/`.
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from jobs.encoding.photo_encoder import PhotoEncoder, decode_photo
 from jobs.encoding.queries import Query, encode_photos, read_photo
-from jobs.stages.matching import AHEAD, match_photo, view_maker
+from jobs.stages.matching import AHEAD, matchable_photo, view_maker
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch_map
@@ -27,10 +28,11 @@ from pipeline.locate.fitting.calibration_data import hits_outside_radius, search
 from pipeline.locate.fitting.fit_matching import MatchedExample
 from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.locate import CONSENSUS_CANDIDATES, answers_from_hits
+from pipeline.locate.refined import refine_answer
 from pipeline.locate.track import TRACK_CANDIDATES
 from pipeline.matching.map_windows import MapWindows
 from pipeline.matching.photo_pose import PoseSettings
-from pipeline.matching.refine import Refinement
+from pipeline.matching.refine import MatchablePhoto, Refinement
 from pipeline.sources.table import Table
 
 WAYS = (PoseSettings(pose=True), PoseSettings(pose=False))
@@ -94,18 +96,14 @@ def search_flight(
     for way in WAYS:
         queries = encode_photos(list(truth), encoder, view_maker(windows, way))
         decoded = [(one, one.views_VD) for one in queries if one.views_VD is not None]
-
-        def others(
-            number: int, hits: Sequence[Hit], decoded: Sequence[tuple[Query, object]] = decoded
-        ) -> list[Hit]:
-            tag = truth[decoded[number][0].name]
-            away_K = np.array([windows.apart_m(hit.side_m) for hit in hits])
-            return hits_outside_radius(hits, tag.lat, tag.lon, away_K)
-
-        views, levels = [one for _, one in decoded], [query.level for query, _ in decoded]
-        found = search_near_and_away(index, views, others, levels)
-        for (query, _), (hits, away) in zip(decoded, found, strict=True):
-            tag = truth[query.name]
+        tags = [truth[query.name] for query, _ in decoded]
+        found = search_near_and_away(
+            index,
+            [views_VD for _, views_VD in decoded],
+            partial(_elsewhere, windows, tags),
+            [query.level for query, _ in decoded],
+        )
+        for (query, _), tag, (hits, away) in zip(decoded, tags, found, strict=True):
             example = CalibrationExample(
                 location=_nearest_location(gallery, tag),
                 lat=tag.lat,
@@ -115,6 +113,14 @@ def search_flight(
             )
             searched.append(SearchedPhoto(query=query, way=way, example=example))
     return searched
+
+
+def _elsewhere(
+    windows: MapWindows, tags: Sequence[GeoTag], number: int, hits: Sequence[Hit]
+) -> list[Hit]:
+    """The hits whose windows do not show the ground of photo `number`."""
+    away_K = np.array([windows.apart_m(hit.side_m) for hit in hits])
+    return hits_outside_radius(hits, tags[number].lat, tags[number].lon, away_K)
 
 
 def _nearest_location(gallery: GalleryMap, tag: GeoTag) -> str:
@@ -131,8 +137,9 @@ def match_flight(
         contents = prefetch_map(read_photo, [one.query.name for one in searched], AHEAD, AHEAD)
         for one, data in zip(searched, contents, strict=True):
             if not isinstance(data, Rejection):  # else it was removed since it was embedded
+                photo = matchable_photo(decode_photo(data), one.query.tags, one.way)
                 inside, outside = (
-                    _match(one, data, hits, windows, calibration)
+                    _match(photo, hits, windows, calibration)
                     for hits in (one.example.inside, one.example.outside)
                 )
                 examples.append(
@@ -143,11 +150,7 @@ def match_flight(
 
 
 def _match(
-    one: SearchedPhoto,
-    data: bytes,
-    hits: Sequence[Hit],
-    windows: MapWindows,
-    calibration: Calibration,
+    photo: MatchablePhoto, hits: Sequence[Hit], windows: MapWindows, calibration: Calibration
 ) -> Refinement | None:
     [answer] = answers_from_hits([hits], CONSENSUS_CANDIDATES, calibration)
-    return match_photo(decode_photo(data), one.query.tags, answer, windows, one.way)
+    return refine_answer(answer, photo, windows)

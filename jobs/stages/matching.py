@@ -22,7 +22,7 @@ from pipeline.locate.locate import Answer
 from pipeline.locate.refined import refine_answer, with_refinement
 from pipeline.matching.map_windows import MapWindows
 from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
-from pipeline.matching.refine import Refinement
+from pipeline.matching.refine import MatchablePhoto, prepare_photo
 from pipeline.service.photo_map import PhotoMap
 from pipeline.shards.manifest import MANIFEST
 from pipeline.shards.shard_set import open_shards
@@ -86,12 +86,10 @@ def overhead_maker(pose: PoseSettings) -> ViewMaker:
     return make_views
 
 
-def match_photo(
-    photo_HW3: Pixels, tags: CameraTags, answer: Answer, windows: MapWindows, pose: PoseSettings
-) -> Refinement | None:
-    """The photo matched around its answer, by what its tags and the flags say of the camera."""
+def matchable_photo(photo_HW3: Pixels, tags: CameraTags, pose: PoseSettings) -> MatchablePhoto:
+    """The photo's features, with what its tags and the flags say of the camera."""
     height, width = photo_HW3.shape[:2]
-    return refine_answer(answer, photo_HW3, pose_of_photo(tags, (width, height), pose), windows)
+    return prepare_photo(photo_HW3, pose_of_photo(tags, (width, height), pose))
 
 
 def refine_answers(
@@ -110,7 +108,8 @@ def refine_answers(
         for query, answer, data in zip(queries, answers, contents, strict=True):
             found = None
             if not isinstance(data, Rejection):  # else it was removed since it was embedded
-                found = match_photo(decode_photo(data), query.tags, answer, windows, pose)
+                photo = matchable_photo(decode_photo(data), query.tags, pose)
+                found = refine_answer(answer, photo, windows)
             refined.append(with_refinement(answer, found, calibration, of_flight))
             meter.advance()
     return refined

@@ -56,11 +56,7 @@ def convert_fsra(state: dict[str, Tensor], name: str, image_size: int = 256) -> 
         model, model.encoder.backbone.adapt(given), f"{name} is no two_view_net of FSRA",
         "give the net_*.pth of a training run of FSRA", table | classifier_names(tuple(names)),
     )  # fmt: skip
-    modules = {
-        "encoder": model.encoder.state_dict(),
-        "classifier": model.classifier.state_dict(),
-    }
-    return ConvertedWeights(network=network, modules=modules, locations=locations, left_out=None)
+    return ConvertedWeights.of(network, model, locations)
 
 
 def _prefix(state: dict[str, Tensor], end: str, name: str) -> str:

@@ -30,16 +30,31 @@ OURS_TO_LPN = {
 
 @dataclass(frozen=True, kw_only=True)
 class ConvertedWeights:
-    """LPN's network as one of ours."""
+    """A public network as one of ours."""
 
     network: PVDAConfig
     modules: dict[str, dict[str, Tensor]]
     "State dicts of encoder and classifier, as in a checkpoint."
     locations: int
-    """L, the classifier's outputs. Their names are not in LPN's file: they are the training
-    folders', sorted."""
+    """L, the classifier's outputs. Their names are not in the file: they are the training folders',
+    sorted."""
     left_out: str | None
-    "LPN's backbone of a view that PVDA does not have, where it differs from the converted one."
+    "The network of a view that PVDA does not have, where it differs from the converted one."
+
+    @classmethod
+    def of(
+        cls,
+        network: PVDAConfig,
+        model: EncoderWithClassifier,
+        locations: int,
+        left_out: str | None = None,
+    ) -> "ConvertedWeights":
+        """An encoder with its classifier, once the public weights are loaded."""
+        modules = {
+            "encoder": model.encoder.state_dict(),
+            "classifier": model.classifier.state_dict(),
+        }
+        return cls(network=network, modules=modules, locations=locations, left_out=left_out)
 
 
 def convert_lpn(state: dict[str, Tensor], name: str, image_size: int = 256) -> ConvertedWeights:
@@ -81,13 +96,7 @@ def convert_lpn(state: dict[str, Tensor], name: str, image_size: int = 256) -> C
         model, given, f"{name} does not fit {backbone} with {len(numbers)} rings",
         "expected a three_view_net of LPN with average pooling", OURS_TO_LPN,
     )  # fmt: skip
-    modules = {
-        "encoder": model.encoder.state_dict(),
-        "classifier": model.classifier.state_dict(),
-    }
-    return ConvertedWeights(
-        network=network, modules=modules, locations=locations, left_out=left_out
-    )
+    return ConvertedWeights.of(network, model, locations, left_out)
 
 
 def backbone_of(state: dict[str, Tensor], view: str) -> dict[str, Tensor]:

@@ -66,12 +66,5 @@ def convert_mccg(state: dict[str, Tensor], name: str, image_size: int = 256) -> 
         "give the net_*.pth of a training run of MCCG with --block 2",
         OURS_TO_MCCG | classifier_names(MCCG_CLASSIFIERS), UNUSED_NORM,
     )  # fmt: skip
-    return ConvertedWeights(
-        network=network,
-        modules={
-            "encoder": model.encoder.state_dict(),
-            "classifier": model.classifier.state_dict(),
-        },
-        locations=locations,
-        left_out=STREET.strip(".") if any(key.startswith(STREET) for key in state) else None,
-    )
+    street = any(key.startswith(STREET) for key in state)
+    return ConvertedWeights.of(network, model, locations, STREET.strip(".") if street else None)

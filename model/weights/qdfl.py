@@ -89,12 +89,4 @@ def convert_qdfl(state: dict[str, Tensor], name: str, image_size: int = 280) -> 
         "give the checkpoint of a run of dino_b_QDFL.yaml or dino_s_QDFL.yaml",
         OURS_TO_QDFL, MASK_TOKEN,
     )  # fmt: skip
-    return ConvertedWeights(
-        network=network,
-        modules={
-            "encoder": model.encoder.state_dict(),
-            "classifier": model.classifier.state_dict(),
-        },
-        locations=locations,
-        left_out=None,
-    )
+    return ConvertedWeights.of(network, model, locations)

@@ -1,36 +1,25 @@
 """Answers of retrieval, and the map's pixels -> answers within metres.
 
-In: an answer with its candidates, a photo's pixels, and what is known of its camera. Out: the
+In: an answer with its candidates, and a photo's features with what is known of its camera. Out: the
 answer at the place that matching finds, where that holds; else as it was.
 """
 
 from collections.abc import Iterator
 from dataclasses import replace
 
-from pipeline.camera.pose import PartialPose
-from pipeline.core.arrays import Pixels
 from pipeline.locate.calibration import Calibration, confidence_features
 from pipeline.locate.locate import Answer, Position, consensus_of, consensus_scores
 from pipeline.matching.gate import holds
 from pipeline.matching.map_windows import MapWindows
-from pipeline.matching.refine import MatchablePhoto, Refinement, prepare_photo, refine
+from pipeline.matching.refine import MatchablePhoto, Refinement, refine
 
 MOST_WINDOWS = 3
 "Windows that a photo is matched with: around the answer, then around other candidates."
 
 
-def refine_answer(
-    answer: Answer, photo_HW3: Pixels, pose: PartialPose, windows: MapWindows
-) -> Refinement | None:
+def refine_answer(answer: Answer, photo: MatchablePhoto, windows: MapWindows) -> Refinement | None:
     """The photo matched with the map around an answer and around its other candidates; None where
     no view holds that a camera can have."""
-    return refine_prepared(answer, prepare_photo(photo_HW3, pose), windows)
-
-
-def refine_prepared(
-    answer: Answer, photo: MatchablePhoto, windows: MapWindows
-) -> Refinement | None:
-    """As `refine_answer`, of a photo whose features were found before."""
     near = windows.around(_positions(answer), MOST_WINDOWS, photo.reach_m)
     return refine(photo, near)
 

@@ -4,7 +4,6 @@ In: photos, and the ranges that stand where tags are silent. Out: ranges.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from pipeline.images.decode import DecodeError
 from pipeline.images.inspect import inspect
 from pipeline.locate.photo_files import read_photo_tags
 from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
+from pipeline.simulation.over_map.settings import CameraRanges
 
 QUANTILES = (0.05, 0.95)
 "Of the tags' values: a photo on the ground before take-off sets nothing."
@@ -24,27 +24,17 @@ MOST_PHOTOS = 300
 Range = tuple[float, float]
 
 
-@dataclass(frozen=True, kw_only=True)
-class CameraRanges:
-    """Ranges that simulated photos are drawn from."""
-
-    height_m: Range
-    pitch_deg: Range
-    fov_deg: Range
-
-
 def ranges_of_photos(photos: Sequence[str], otherwise: CameraRanges) -> CameraRanges:
     """The ranges of photos of one UAV; `otherwise` where their tags do not tell."""
     kept = np.unique(np.linspace(0, len(photos) - 1, min(len(photos), MOST_PHOTOS)).astype(int))
     poses = [pose for at in kept if (pose := _pose(photos[at])) is not None]
     pitches = [one.pitch_deg for one in poses if one.pitch_deg is not None]
     return CameraRanges(
-        height_m=_range([one.height_m for one in poses if one.height_m], otherwise.height_m),
-        pitch_deg=_range(
-            [pitch for pitch in pitches if STEEPEST_DEG <= pitch <= FLATTEST_DEG],
-            otherwise.pitch_deg,
+        height=_range([one.height_m for one in poses if one.height_m], otherwise.height),
+        pitch=_range(
+            [pitch for pitch in pitches if STEEPEST_DEG <= pitch <= FLATTEST_DEG], otherwise.pitch
         ),
-        fov_deg=_range([one.fov_deg for one in poses if one.fov_deg], otherwise.fov_deg),
+        fov=_range([one.fov_deg for one in poses if one.fov_deg], otherwise.fov),
     )
 
 

@@ -19,7 +19,7 @@ from pipeline.images.thumbnails import ImageLoader, shrink_to_webp, thumbnail_by
 from pipeline.locate.calibration import Calibration
 from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.locate import Answer
-from pipeline.locate.refined import refine_prepared, with_refinement
+from pipeline.locate.refined import refine_answer, with_refinement
 from pipeline.matching.map_windows import MapWindows
 from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
 from pipeline.matching.refine import MatchablePhoto, prepare_photo
@@ -117,7 +117,7 @@ class PhotoMap:
             return located
         began = time.perf_counter()
         try:
-            found = refine_prepared(answer, photo.matchable, self._windows)
+            found = refine_answer(answer, photo.matchable, self._windows)
             located = replace(located, answer=with_refinement(answer, found, calibration))
         except Exception as error:  # a damaged tar, a folder that went away, OpenCV's own
             located = replace(located, match_error=_sentence(error))

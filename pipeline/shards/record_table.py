@@ -57,6 +57,11 @@ def write_part(out: str, packed: Packed, rows: list[dict[str, Any]]) -> None:
     parquet.write_table(_path(out, packed.shard.name), table)
 
 
+def has_part(out: str, name: str) -> bool:
+    """Whether a shard has its part of the record table."""
+    return storage.exists(_path(out, name))
+
+
 def read_packed(out: str, name: str) -> Packed | None:
     """The result of a tar; None where its part is missing or cannot be read."""
     try:

@@ -61,6 +61,9 @@ class ShardSet:
         """The locations of one shard's samples, without reading its images."""
         return read_locations(self.tar(shard))
 
+    def has_records(self, shard: Shard) -> bool:
+        return record_table.has_part(self.path, shard.name)
+
     def records(self, shard: Shard, columns: list[str] | None = None) -> pa.Table:
         """The record table's rows of one shard.
 

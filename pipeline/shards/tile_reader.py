@@ -73,10 +73,9 @@ class TileReader:
         return grouped
 
     def _keys(self, name: str, shard: Shard) -> list[str]:
-        try:
-            return list(self._set.records(shard, ["key"])["key"].to_pylist())
-        except InputError:  # without a record table the tar itself tells
+        if not self._set.has_records(shard):  # then the tar itself tells
             return list(self._spans(name))
+        return list(self._set.records(shard, ["key"])["key"].to_pylist())
 
     def _read_spans(self, name: str) -> dict[str, Span]:
         path = self._set.tar(self._shards[name])

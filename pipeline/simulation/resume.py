@@ -3,13 +3,32 @@
 A run keeps its settings in `.parts/settings.json` until its last file, which has them too.
 """
 
+from collections.abc import Collection
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from pipeline.core import json_files
+from pipeline.core import json_files, storage
 from pipeline.core.errors import InputError
 
 BEGUN = Path(".parts") / "settings.json"
+
+
+def local_root(out: str) -> Path:
+    """The folder of a simulation, absolute. Raises InputError where it is not local or mounted."""
+    if not storage.is_local(out):
+        raise InputError(
+            f"--out is {out}, expected a local or mounted folder; write it there and copy it"
+        )
+    return Path(storage.resolve(out)[1]).absolute()
+
+
+def settings_record(settings: Any, left_out: Collection[str]) -> dict[str, Any]:
+    """A dataclass of settings as JSON gives it back, without those that change no output."""
+    kept = {name: value for name, value in asdict(settings).items() if name not in left_out}
+    return {
+        name: list(value) if isinstance(value, tuple) else value for name, value in kept.items()
+    }
 
 
 def is_complete(root: Path, metadata: dict[str, Any], last: str, what: str, job: str) -> bool:

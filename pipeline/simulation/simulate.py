@@ -17,7 +17,6 @@ import hashlib
 import shutil
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,7 @@ from pipeline.core.lock import locks_output
 from pipeline.core.progress import console, progress
 from pipeline.simulation.layout import LocationJob, Role, part_path, write_location, write_tables
 from pipeline.simulation.location import LocationSpec
-from pipeline.simulation.resume import begin, is_complete
+from pipeline.simulation.resume import begin, is_complete, local_root, settings_record
 from pipeline.simulation.settings import SimulationSettings
 from pipeline.simulation.texture import usable_textures
 
@@ -43,12 +42,7 @@ def simulate(settings: SimulationSettings) -> Path:
 
     Raises InputError for too few textures, and for a folder that holds something else.
     """
-    if not storage.is_local(settings.out):
-        raise InputError(
-            f"--out is {settings.out}, expected a local or mounted folder; "
-            "write it there and copy it"
-        )
-    root = Path(storage.resolve(settings.out)[1]).absolute()
+    root = local_root(settings.out)
     # Absolute paths: tasks may run in another working directory.
     textures, skipped = (
         usable_textures(storage.absolute(settings.textures)) if settings.textures else ([], 0)
@@ -135,8 +129,7 @@ def _write_locations(jobs: list[LocationJob], workers: int | None) -> Iterator[d
 
 def _settings_metadata(settings: SimulationSettings, textures: list[str]) -> dict[str, Any]:
     """The settings that determine the data set's content: without folders and workers."""
-    others = ("out", "textures", "workers")
-    metadata = {name: value for name, value in asdict(settings).items() if name not in others}
+    metadata = settings_record(settings, ("out", "textures", "workers"))
     if settings.textures:
         folder = storage.absolute(settings.textures)
         names = "\n".join(str(Path(path).relative_to(folder)) for path in textures)

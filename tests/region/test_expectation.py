@@ -15,10 +15,11 @@ from pipeline.core.filters import Filter
 from pipeline.core.records import View
 from pipeline.index.searcher import Hit
 from pipeline.region import camera_ranges
-from pipeline.region.camera_ranges import CameraRanges, ranges_of_photos
+from pipeline.region.camera_ranges import ranges_of_photos
 from pipeline.region.expectation import Outcome, expect, expectations, read_expectations, share_of
 from pipeline.region.lookalikes import find_lookalikes
 from pipeline.region.page import RegionPage, render_region
+from pipeline.simulation.over_map.settings import CameraRanges
 
 METRE = 1 / 111_195.08  # degrees of latitude
 
@@ -110,11 +111,11 @@ def test_ranges_of_photos_leave_out_what_tags_do_not_tell(monkeypatch: pytest.Mo
         "c": None,
     }
     monkeypatch.setattr(camera_ranges, "_pose", lambda path: poses[path])
-    otherwise = CameraRanges(height_m=(1, 2), pitch_deg=(-60, -50), fov_deg=(40, 60))
+    otherwise = CameraRanges(height=(1, 2), pitch=(-60, -50), fov=(40, 60))
     found = ranges_of_photos(["a", "b", "c"], otherwise)
-    assert np.allclose(found.height_m, (51, 69))
-    assert found.pitch_deg == (-90.0, -90.0)
-    assert found.fov_deg == (40, 60)
+    assert np.allclose(found.height, (51, 69))
+    assert found.pitch == (-90.0, -90.0)
+    assert found.fov == (40, 60)
 
 
 def photo() -> bytes:

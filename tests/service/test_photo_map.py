@@ -116,7 +116,7 @@ def test_photo_map_frames_by_what_the_request_knows(made: MadeMap) -> None:
     assert unmatched.refine(made.tile_answer(), framed).match_seconds is None
 
 
-@pytest.mark.parametrize("part", ["prepare_photo", "refine_prepared"])
+@pytest.mark.parametrize("part", ["prepare_photo", "refine_answer"])
 def test_photo_map_failure_leaves_the_tiles_answer(
     made: MadeMap, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:

@@ -10,7 +10,6 @@ Each place is one task, and a rerun resumes with the missing ones.
 """
 
 from collections.abc import Iterator
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -18,14 +17,13 @@ import ray
 
 from pipeline.camera.pose import Pose
 from pipeline.core import cluster, json_files, storage
-from pipeline.core.errors import InputError
 from pipeline.core.lock import locks_output
 from pipeline.core.progress import console, progress
 from pipeline.core.records import Split, View
 from pipeline.simulation.layout import write_table
 from pipeline.simulation.over_map.photo import MapPlace, photos_over_map
 from pipeline.simulation.over_map.settings import MapFlightSettings
-from pipeline.simulation.resume import begin, is_complete
+from pipeline.simulation.resume import begin, is_complete, local_root, settings_record
 
 TABLE, COMPLETE = "photos.csv", "flight.json"
 
@@ -36,14 +34,8 @@ def fly(settings: MapFlightSettings) -> Path:
 
     Raises InputError for a map that cannot be flown over, or a folder of another flight.
     """
-    if not storage.is_local(settings.out):
-        raise InputError(
-            f"--out is {settings.out}, expected a local or mounted folder; write it there and copy"
-        )
-    root = Path(storage.resolve(settings.out)[1]).absolute()
-    others = ("out", "workers")
-    about = {name: value for name, value in asdict(settings).items() if name not in others}
-    about |= {name: list(value) for name, value in about.items() if isinstance(value, tuple)}
+    root = local_root(settings.out)
+    about = settings_record(settings, ("out", "workers"))
     if is_complete(root, about, COMPLETE, "a flight with other settings,", "jobs/fly.py"):
         console.print(f"{root} is complete already; nothing to do")
         return root

@@ -16,7 +16,28 @@ Part = Literal["all", "learn", "held-out"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class MapFlightSettings:
+class CameraRanges:
+    """How a UAV flies and what lens it has: ranges that photos are drawn from."""
+
+    height: tuple[float, float] = (60.0, 120.0)
+    "Range of the camera's height above the ground, metres."
+    pitch: tuple[float, float] = (-90.0, -45.0)
+    "Range of the camera's angle above the horizon, degrees; -90 looks straight down."
+    fov: tuple[float, float] = (45.0, 65.0)
+    "Range of the field of view, degrees."
+
+    def __post_init__(self) -> None:
+        low, high = self.pitch
+        steep = "two angles from -90 to -35, the steeper first"
+        require(-90 <= low <= high <= -35, "pitch", self.pitch, steep)
+        low, high = self.height
+        require(0 < low <= high <= 2000, "height", self.height, "two heights up to 2,000 m")
+        low, high = self.fov
+        require(5 <= low <= high <= 120, "fov", self.fov, "two angles from 5 to 120 degrees")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapFlightSettings(CameraRanges):
     """The map, and the photos that are taken over it."""
 
     mosaic: str
@@ -36,12 +57,6 @@ class MapFlightSettings:
     the middle of each photo lies well within such a block, with `learn` in no such block."""
     surface: Annotated[str | None, SURFACE_FLAG] = None
     "A surface model (GeoTIFF, metres): relief and parallax. None: the ground is flat."
-    height: tuple[float, float] = (60.0, 120.0)
-    "Range of the camera's height above the ground, metres."
-    pitch: tuple[float, float] = (-90.0, -45.0)
-    "Range of the camera's angle above the horizon, degrees; -90 looks straight down."
-    fov: tuple[float, float] = (45.0, 65.0)
-    "Range of the field of view, degrees."
     size: int = 512
     "Side of a photo, pixels."
     heading_error: float = 3.0
@@ -57,18 +72,12 @@ class MapFlightSettings:
     after the other in this process."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require(self.photos >= 1, "photos", self.photos, "1 or more")
         require(self.views >= 1, "views", self.views, "1 or more")
         side = self.overhead_m
         require(side is None or side > 0, "overhead_m", side, "metres above 0")
         require(64 <= self.size <= 2048, "size", self.size, "64 to 2048 pixels")
-        low, high = self.pitch
-        steep = "two angles from -90 to -35, the steeper first"
-        require(-90 <= low <= high <= -35, "pitch", self.pitch, steep)
-        low, high = self.height
-        require(0 < low <= high <= 2000, "height", self.height, "two heights up to 2,000 m")
-        low, high = self.fov
-        require(5 <= low <= high <= 120, "fov", self.fov, "two angles from 5 to 120 degrees")
         for name in ("heading_error", "pitch_error", "height_error", "seed"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "0 or more")
         this = "0 (this process) or more"

@@ -8,7 +8,6 @@
 `fly.py --mosaic another_day.tif --surface surface.tif` takes photos of another day than the map's.
 """
 
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +16,11 @@ from numpy.typing import NDArray
 from rasterio.transform import Affine
 
 from pipeline.core import json_files, storage
-from pipeline.core.errors import InputError
 from pipeline.core.lock import locks_output
 from pipeline.core.progress import console
 from pipeline.simulation.appearance import Day, light_world, sample_day
 from pipeline.simulation.over_map.settings import TownMapSettings
-from pipeline.simulation.resume import begin, is_complete
+from pipeline.simulation.resume import begin, is_complete, local_root, settings_record
 from pipeline.simulation.town.town import build_town
 from pipeline.simulation.world import ByteMap, World
 
@@ -38,12 +36,8 @@ def make_town_map(settings: TownMapSettings) -> Path:
 
     Raises InputError for a folder that holds something else.
     """
-    if not storage.is_local(settings.out):
-        raise InputError(
-            f"--out is {settings.out}, expected a local or mounted folder; write it there and copy"
-        )
-    root = Path(storage.resolve(settings.out)[1]).absolute()
-    about = {name: value for name, value in asdict(settings).items() if name != "out"}
+    root = local_root(settings.out)
+    about = settings_record(settings, ("out",))
     if is_complete(root, about, TOWN_FILE, "a town", "jobs/town.py"):
         console.print(f"{root} is complete already; nothing to do")
         return root
