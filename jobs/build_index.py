@@ -2,7 +2,8 @@
 
 A finished index is changed by `--extend --table TABLE --out INDEX`, which adds the table's new
 parts, and by `--remove LOCATION ... --out INDEX`; `--verify --out INDEX` checks every byte of it.
-`--verify` with a table checks the table while building.
+`--verify` with a table checks the table while building. `--dry-run` builds nothing: it tries the
+plans on a sample and prints which one would be built, and why the others not.
 """
 
 from jobs.command_line.cli import run
@@ -23,9 +24,12 @@ def main(settings: BuildIndexSettings) -> None:
         else:
             verify_index(settings.out)
         return
-    from pipeline.index.build import build_index
+    from pipeline.index.build import build_index, plan_only
 
-    build_index(settings)
+    if settings.dry_run:
+        plan_only(settings)
+    else:
+        build_index(settings)
 
 
 if __name__ == "__main__":

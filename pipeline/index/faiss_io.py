@@ -13,7 +13,7 @@ from pipeline.core import storage
 from pipeline.core.arrays import Mask
 from pipeline.core.errors import InputError
 from pipeline.index.metadata import REBUILD_HINT
-from pipeline.index.plan import RERANK_FACTOR
+from pipeline.index.planning.plan import RERANK_FACTOR
 
 FAISS: Any = faiss
 "Without types: FAISS's stubs lack the keyword arguments."

@@ -15,7 +15,7 @@ from pipeline.core.integrity import FileChecksum, find_mismatch
 from pipeline.core.json_files import from_json, is_file_name
 from pipeline.core.records import excerpt
 from pipeline.features.encoding import EncodingConfig
-from pipeline.index.plan import Refine
+from pipeline.index.planning.families import Refine
 
 SCHEMA_VERSION = 3
 METADATA_FILE = "index.json"

@@ -76,7 +76,7 @@ class IndexPart:
         if allowed_N is not None and count <= FILTERED_EXACT_ROWS and self._reader is not None:
             row_C = np.flatnonzero(allowed_N)
             rows_QC = np.broadcast_to(row_C, (len(queries_QD), count))
-            return _top_k(self._exact_scores(queries_QD, row_C), rows_QC, k)
+            return top_k(self._exact_scores(queries_QD, row_C), rows_QC, k)
         wanted = min(count, max(k, k * params.rerank_factor))
         breadth = params.nprobe_or_ef
         if allowed_N is not None:  # the fewer rows match, the more lists hold as many of them
@@ -86,7 +86,7 @@ class IndexPart:
         )
         if params.rerank_factor > 1 and self._reader is not None:
             scores_QC = self._reranked_scores(queries_QD, rows_QC)
-        return _top_k(scores_QC, rows_QC, k)
+        return top_k(scores_QC, rows_QC, k)
 
     def vectors(self, row_R: Ints) -> Floats:
         """The table's vectors (R, D) of these rows, which must ascend."""
@@ -129,7 +129,7 @@ def _empty_result(queries: int, k: int) -> tuple[Floats, Ints]:
     return np.full((queries, k), -np.inf, np.float32), np.full((queries, k), NO_ROW, np.int64)
 
 
-def _top_k(scores_QC: Floats, rows_QC: Ints, k: int) -> tuple[Floats, Ints]:
+def top_k(scores_QC: Floats, rows_QC: Ints, k: int) -> tuple[Floats, Ints]:
     """The K best of C candidates: higher scores first, then the lower row; NO_ROW last."""
     scores_QC = np.where(rows_QC == NO_ROW, np.float32(-np.inf), scores_QC)
     order_QK = np.lexsort((rows_QC, -scores_QC), axis=1)[:, :k]

@@ -4,9 +4,9 @@ Shapes: Q queries, K neighbours, D dimensions.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import faiss
 import numpy as np
@@ -16,8 +16,8 @@ from pipeline.features.table import FeatureTable
 from pipeline.index.faiss_io import FAISS
 from pipeline.index.metadata import SearchParams
 from pipeline.index.part import NO_ROW
-from pipeline.index.plan import RERANK_FACTOR, Refine
-from pipeline.index.searcher import Index
+from pipeline.index.planning.families import Refine
+from pipeline.index.planning.plan import RERANK_FACTOR
 from pipeline.index.train import sample_rows
 
 RECALL_QUERIES = 256
@@ -26,7 +26,9 @@ MAX_EF_SEARCH = 1_024
 "Of a graph: beyond, its recall hardly grows."
 MAX_RERANK_FACTOR = 8 * RERANK_FACTOR
 TIMED_SECONDS = 0.1
-SINGLE_QUERIES = 32
+"For which the batches of a finished index are timed, and its single queries."
+MIN_TIMED, MAX_TIMED = 32, 1_024
+"Batches whose times give p50 and p99."
 Tuned = tuple[SearchParams, float, float]
 "Search parameters with their recall@1 and recall@10."
 
@@ -41,6 +43,14 @@ class RecallQueries:
     "The query's own row, excluded from recall; NO_ROW if the query is not indexed."
     source: str
     "Where the queries are from."
+
+
+class RowSearch(Protocol):
+    """An opened index, or one that is tried in memory."""
+
+    def search_rows(
+        self, queries_QD: Floats, k: int = NEIGHBOURS, *, params: SearchParams | None = None
+    ) -> tuple[Floats, Ints]: ...
 
 
 def sample_queries(
@@ -87,7 +97,7 @@ def without_own_row(rows_QK: Ints, own_row_Q: Ints) -> Ints:
 
 
 def measure_recall(
-    index: Index, queries: RecallQueries, params: SearchParams
+    index: RowSearch, queries: RecallQueries, params: SearchParams
 ) -> tuple[float, float]:
     """Shares of exact search's first row and of its first ten rows that the index finds."""
     exact_QK = queries.exact_QK
@@ -121,13 +131,20 @@ def search_param_grid(index: Any, refine: Refine) -> Iterator[SearchParams]:
 
 
 def tune(
-    index: Index, queries: RecallQueries, grid: Iterator[SearchParams], target: float
+    index: RowSearch,
+    queries: RecallQueries,
+    grid: Iterator[SearchParams],
+    target: float,
+    fast_enough: Callable[[SearchParams], bool] = lambda params: True,
 ) -> Tuned:
     """The first parameters of the grid that reach the target, with their recall@1 and @10; the best
-    ones where none does.
+    ones where none does. `fast_enough`: those that are not are left out, and those after them; the
+    first of the grid is kept.
     """
     best = SearchParams(nprobe_or_ef=1), -1.0, -1.0
-    for params in grid:
+    for number, params in enumerate(grid):
+        if number and not fast_enough(params):
+            break
         tuned = params, *measure_recall(index, queries, params)
         if tuned[2] > best[2]:
             best = tuned
@@ -137,7 +154,7 @@ def tune(
 
 
 def _lower_rerank_factor(
-    index: Index, queries: RecallQueries, tuned: Tuned, target: float
+    index: RowSearch, queries: RecallQueries, tuned: Tuned, target: float
 ) -> Tuned:
     """Halve the number of reranked candidates while the recall stays at the target: reading their
     vectors may be most of a search.
@@ -151,18 +168,31 @@ def _lower_rerank_factor(
     return tuned
 
 
-def measure_speed(index: Index, queries: RecallQueries, params: SearchParams) -> dict[str, float]:
-    """Queries a second in one batch, and the median milliseconds of a single one, ids included."""
+def measure_speed(
+    search: Callable[[Floats], object], queries_QD: Floats, batch: int, seconds: float
+) -> dict[str, float]:
+    """Queries a second, all in one batch; and milliseconds within which half and 99 of 100 batches
+    of `batch` queries were answered. Each of the two is timed for so many seconds, the latency by
+    at least MIN_TIMED batches.
+    """
     start, rounds = time.perf_counter(), 0
-    while (spent := time.perf_counter() - start) < TIMED_SECONDS or not rounds:
-        index.search(queries.queries_QD, NEIGHBOURS, params=params)
+    while (spent := time.perf_counter() - start) < seconds or not rounds:
+        search(queries_QD)
         rounds += 1
-    single = []
-    for query_D in queries.queries_QD[:SINGLE_QUERIES]:
+    times: list[float] = []
+    begin = time.perf_counter()
+    while len(times) < MIN_TIMED or (
+        len(times) < MAX_TIMED and time.perf_counter() - begin < seconds
+    ):
+        rows_B = (len(times) * batch + np.arange(batch)) % len(queries_QD)
+        batch_BD = queries_QD[rows_B]
         start = time.perf_counter()
-        index.search(query_D[None], NEIGHBOURS, params=params)
-        single.append(time.perf_counter() - start)
+        search(batch_BD)
+        times.append(time.perf_counter() - start)
+    p50, p99 = (float(np.quantile(times, share)) for share in (0.5, 0.99))
     return {
-        "queries_per_second": round(rounds * len(queries.queries_QD) / spent, 1),
-        "milliseconds_per_query": round(1e3 * float(np.median(single)), 3),
+        "queries_per_second": round(rounds * len(queries_QD) / spent, 1),
+        "p50_ms": round(1e3 * p50, 3),
+        "p99_ms": round(1e3 * p99, 3),
+        "timed_batches": len(times),
     }

@@ -29,6 +29,18 @@ class IndexSettings:
     or TB."""
     target_recall: float = 0.95
     "Recall@10 against exact search that the index is to reach."
+    p99_ms: float | None = None
+    """Milliseconds within which 99 of 100 batches of --batch queries are to be answered, at the
+    cost of recall where no index has both."""
+    batch: int = 1
+    "Queries that are asked at once, for --p99-ms."
+    build_minutes: float | None = None
+    "Minutes that building may take; by default any."
+    selectivity: float = 1.0
+    "Share of the rows that the filters of searches leave, where all searches have one."
+    dry_run: bool = False
+    """Try the plans on a sample and print what each is expected to reach and take; build
+    nothing."""
     factory: str | None = None
     "FAISS factory string; by default the planner chooses."
     refine: bool = False
@@ -45,6 +57,12 @@ class IndexSettings:
     def __post_init__(self) -> None:
         recall = self.target_recall
         require(0 < recall <= 1, "target_recall", recall, "a fraction above 0 and at most 1")
+        share = self.selectivity
+        require(0 < share <= 1, "selectivity", share, "a fraction above 0 and at most 1")
+        for name in ("p99_ms", "build_minutes"):
+            given = getattr(self, name)
+            require(given is None or given > 0, name, given, "a number above 0")
+        require(self.batch >= 1, "batch", self.batch, "at least 1")
         require(self.parts >= 1, "parts", self.parts, "at least 1")
         require(self.workers >= 0, "workers", self.workers, "0 or more")
         if self.refine and not self.factory:

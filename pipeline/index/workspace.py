@@ -165,6 +165,11 @@ class BuildWorkspace:
         )
 
 
+def unfinished_work(out: str) -> dict[str, Any] | None:
+    """The plan of the unfinished build of an index; None where there is none, or it is damaged."""
+    return _read_plan(storage.join(out, WORK_FOLDER, PLAN))
+
+
 def _read_plan(path: str) -> dict[str, Any] | None:
     """The plan of the unfinished work; None where there is none, or it is damaged."""
     try:

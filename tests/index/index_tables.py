@@ -14,11 +14,15 @@ from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings
 
 
-def clustered(count: int, dimension: int, seed: int, clusters: int = 30) -> Floats:
+def clustered(
+    count: int, dimension: int, seed: int, clusters: int = 30, noise: float = 0.6
+) -> Floats:
     """Unit vectors (count, dimension) around common centres."""
     rng = np.random.default_rng(seed)
     centres = np.random.default_rng(99).normal(size=(clusters, dimension))
-    vectors = centres[rng.integers(0, clusters, count)] + 0.6 * rng.normal(size=(count, dimension))
+    vectors = centres[rng.integers(0, clusters, count)] + noise * rng.normal(
+        size=(count, dimension)
+    )
     unit: Floats = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
     return unit
 

@@ -10,9 +10,9 @@ import pytest
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
-from pipeline.index import build as index_build
 from pipeline.index.build import build_index
-from pipeline.index.plan import GallerySpec, IndexPlan, plan_index
+from pipeline.index.planning import planner
+from pipeline.index.planning.plan import GallerySpec, IndexPlan, candidate_plans
 from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings, parse_bytes
 from tests.index.index_tables import answers, build, clustered, write_gallery, write_table_part
@@ -41,10 +41,11 @@ def test_lists_on_disk_answer_as_in_memory(
             reason="",
         )
 
-    monkeypatch.setattr(index_build, "plan_index", on_disk)
+    monkeypatch.setattr(planner, "candidate_plans", lambda gallery: [on_disk(gallery)])
     mapped = build(table, tmp_path / "mapped")
     assert (mapped.metadata.on_disk, len(mapped.metadata.parts)) == (True, 2)
-    monkeypatch.setattr(index_build, "plan_index", lambda gallery: on_disk(gallery, on_disk=False))
+    in_memory = [on_disk(None, on_disk=False)]
+    monkeypatch.setattr(planner, "candidate_plans", lambda gallery: in_memory)
     read = build(table, tmp_path / "read")
     assert answers(mapped, table) == answers(read, table)
     kinds = [
@@ -63,12 +64,13 @@ def test_build_passes_strong_directions_to_planner(tmp_path: Path) -> None:
     write_table_part(tmp_path / "table", 0, vectors)
     dimensions: list[int | None] = []
 
-    def recording(gallery: GallerySpec) -> IndexPlan:
+    def recording(gallery: GallerySpec) -> list[IndexPlan]:
         dimensions.append(gallery.effective_dimension)
-        return plan_index(replace(gallery, rows=10**6))
+        return candidate_plans(replace(gallery, rows=10**6))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(index_build, "plan_index", recording)
+        patch.setattr(planner, "candidate_plans", recording)
+        patch.setattr("pipeline.index.planning.plan.EXACT_ROWS", 1_000)
         index = build(
             str(tmp_path / "table"),
             tmp_path / "index",
@@ -77,7 +79,7 @@ def test_build_passes_strong_directions_to_planner(tmp_path: Path) -> None:
             memory_budget="2GB",
             target_recall=0.9,
         )
-    assert dimensions == [None, 32]
+    assert dimensions == [32]
     assert index.metadata.factory.startswith("PCA32,")
     assert index.metadata.measured["recall_at_10"] >= 0.9
 

@@ -97,8 +97,8 @@ class Killed(Exception):
 def test_build_redoes_damaged_work_of_a_killed_build(
     name: str, table: str, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.index.plan.MIN_UNIT_ROWS", 100)
-    monkeypatch.setattr("pipeline.index.plan.UNIT_SHARE", 0)
+    monkeypatch.setattr("pipeline.index.planning.plan.MIN_UNIT_ROWS", 100)
+    monkeypatch.setattr("pipeline.index.planning.plan.UNIT_SHARE", 0)
     left, expected = tmp_path / "left", answers(built, table)
 
     def killed(*arguments: Any) -> Any:

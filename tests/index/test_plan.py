@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core.errors import InputError
-from pipeline.index.plan import (
+from pipeline.index.planning.families import FAMILIES
+from pipeline.index.planning.plan import (
     EXACT_ROWS,
-    FAMILIES,
     GallerySpec,
     IndexPlan,
     plan_factory,

@@ -130,3 +130,16 @@ def test_strong_directions_counts_by_length() -> None:
     flat[:, 5:20] = clustered(2_000, 15, 3)
     assert effective_dimension(flat) == 32, "15 directions, rounded up"
     assert effective_dimension(np.eye(128, dtype=np.float32)) == 128
+
+
+def test_tune_leaves_out_what_is_too_slow(built: tuple[str, Index]) -> None:
+    table, index = built
+    queries = open_table(table).select(Split.QUERY).embeddings()
+    exact = exact_search(queries, open_table(table).select(Split.GALLERY), 10)
+    held = RecallQueries(
+        queries_QD=queries, exact_QK=exact, own_row_Q=np.full(len(queries), -1), source=""
+    )
+    grid = list(search_param_grid(new_index("IVF16,PQ4x4fs", 32), "table"))
+    limited = tune(index, held, iter(grid), 1.01, lambda params: params.nprobe_or_ef <= 2)[0]
+    assert limited.nprobe_or_ef <= 2
+    assert tune(index, held, iter(grid), 1.01, lambda params: False)[0] == grid[0]

@@ -24,7 +24,8 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 KILLED = """
     import os, signal, sys
-    from pipeline.index import plan as index_plan, workspace as index_work
+    from pipeline.index import workspace as index_work
+    from pipeline.index.planning import plan as index_plan
     from pipeline.index.build import build_index
     from pipeline.index.settings import IndexSettings
     from pipeline.core.records import Split, View
@@ -71,8 +72,8 @@ def test_build_killed_resumes_to_the_same_answers(
     done = sorted((out / "_building").glob("unit-*.faiss"))
     assert len(done) == left
     before = {unit: unit.stat().st_mtime_ns for unit in done}
-    monkeypatch.setattr("pipeline.index.plan.MIN_UNIT_ROWS", 250)
-    monkeypatch.setattr("pipeline.index.plan.UNIT_SHARE", 0)
+    monkeypatch.setattr("pipeline.index.planning.plan.MIN_UNIT_ROWS", 250)
+    monkeypatch.setattr("pipeline.index.planning.plan.UNIT_SHARE", 0)
     monkeypatch.setattr(
         workspace.BuildWorkspace, "clear", lambda self: None
     )  # to look at the units afterwards

@@ -27,8 +27,8 @@ def test_build_by_units_equals_one_pass(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factory: str
 ) -> None:
     whole = build(table, tmp_path / "whole", factory=factory)
-    monkeypatch.setattr("pipeline.index.plan.MIN_UNIT_ROWS", 250)
-    monkeypatch.setattr("pipeline.index.plan.UNIT_SHARE", 0)
+    monkeypatch.setattr("pipeline.index.planning.plan.MIN_UNIT_ROWS", 250)
+    monkeypatch.setattr("pipeline.index.planning.plan.UNIT_SHARE", 0)
     units = build(table, tmp_path / "units", factory=factory)
     assert units.metadata.unit_rows == 250
     assert len(units.metadata.parts) == 1
@@ -39,8 +39,8 @@ def test_build_by_ray_equals_one_process(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ray_cluster: None
 ) -> None:
     here = build(table, tmp_path / "here", factory="IVF8,SQ8")
-    monkeypatch.setattr("pipeline.index.plan.MIN_UNIT_ROWS", 250)
-    monkeypatch.setattr("pipeline.index.plan.UNIT_SHARE", 0)
+    monkeypatch.setattr("pipeline.index.planning.plan.MIN_UNIT_ROWS", 250)
+    monkeypatch.setattr("pipeline.index.planning.plan.UNIT_SHARE", 0)
     there = build(table, tmp_path / "there", factory="IVF8,SQ8", workers=2)
     assert (tmp_path / "there" / "index.faiss").read_bytes() == (
         tmp_path / "here" / "index.faiss"
@@ -89,8 +89,8 @@ def test_groups_are_consecutive_and_even(sizes: list[int], wanted: int) -> None:
 def test_merged_lists_have_exact_size(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.index.plan.MIN_UNIT_ROWS", 250)
-    monkeypatch.setattr("pipeline.index.plan.UNIT_SHARE", 0)
+    monkeypatch.setattr("pipeline.index.planning.plan.MIN_UNIT_ROWS", 250)
+    monkeypatch.setattr("pipeline.index.planning.plan.UNIT_SHARE", 0)
     monkeypatch.setattr(workspace.BuildWorkspace, "clear", lambda self: None)
     out = tmp_path / "index"
     build(table, out, factory="IVF8,SQ8")

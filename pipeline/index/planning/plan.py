@@ -1,18 +1,17 @@
-"""Chooses the FAISS index of a gallery: rows, dimension, memory and wanted recall in, a factory
-string with its reason out. A pure function.
+"""The plans of a gallery's index: rows, dimension, memory and wanted recall in, factory strings and
+what they take out, the most promising first. Pure functions.
 
-FAMILIES are ordered from the fastest to the slowest, as `benchmarks/index.py` measures them
-(docs/results.md). The first that fits the memory and is known to reach the recall is chosen; where
-none reaches it, the one that comes nearest.
+Plans that fit the memory and whose family is known to reach the recall come first, from the fastest
+to the slowest; then the others, the one with the highest recall first. `trial.py` tries them.
 """
 
 import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 from pipeline.core.errors import InputError
+from pipeline.index.planning.families import EXACT, FAMILIES, IndexFamily, Refine, factory_string
 
 EXACT_ROWS = 100_000
 "Rows up to which exact search is fast enough to need no planning."
@@ -29,8 +28,6 @@ TRAINING_SHARE = 0.25
 "Of the memory, for the rows that an index is trained on."
 TRAINING_COPIES = 1.75
 "FAISS's residuals and reduced copies of them, the rows themselves included."
-MERGE_FACTOR = 1.3
-"Multiple of the codes that merging them and reading them back took, with lists of 8-bit codes."
 MAX_TRAINING_ROWS = 2_000_000
 ROWS_PER_LIST = 50
 "That train a centroid: FAISS warns below 39 and uses no more than 256."
@@ -39,11 +36,8 @@ UNIT_SHARE = 1 / 16
 MIN_UNIT_ROWS = 20_000
 PART_SHARE = 1 / 3
 "Of the memory, for merging a part of an index whose lists then stay on the disk."
-SUBQUANTISER_DIM = 8
-"Dimensions of a 4-bit subquantiser: 256 subquantisers at 2,048 dimensions."
 RERANK_FACTOR = 10
 "Candidates per wanted row whose vectors are read from the table."
-Refine = Literal["none", "table"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +56,14 @@ class GallerySpec:
     "Other processes that build units, on machines with as much memory for all of them together."
     rows_readable: bool = True
     "Whether single vectors can be read from the table while searching."
+    p99_ms: float | None = None
+    "Milliseconds within which 99 of 100 batches are to be answered; None: any."
+    batch: int = 1
+    "Queries of such a batch."
+    build_seconds: float | None = None
+    "Seconds that training and adding may take; None: any."
+    selectivity: float = 1.0
+    "Share of the rows that the filters of searches leave."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,56 +94,17 @@ class IndexPlan:
         return max(self.search_bytes, self.build_bytes)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _IndexFamily:
-    """A kind of index."""
-
-    name: str
-    form: str
-    "Factory string with {lists} and {pieces}, the subquantisers."
-    ceiling: float
-    "Recall@10 that the most thorough search reaches: what quantisation leaves."
-    refine: Refine = "none"
-    on_disk: bool = False
-    graph: bool = False
-    "Built in one piece, for FAISS cannot merge graphs."
-    merging: float = MERGE_FACTOR
-    "Memory of its codes while units are merged, as a multiple of the codes: appended ones double."
-    reduces: bool = False
-    "Whether it is used behind a projection onto the leading directions, or without one."
-
-    def code_bytes(self, dimension: int) -> float:
-        """Size of one row's code with its id or its links."""
-        return {
-            "Flat": 4.0 * dimension,
-            "HNSW32,SQ8": dimension + 4.0 * 2 * 32 + 24,
-            "SQ8": dimension + 8.0,
-            "SQfp16": 2 * dimension + 8.0,
-            "PQfs": dimension / (2 * SUBQUANTISER_DIM) + 8,
-            "RaBitQ": dimension / 8 + 16,
-            "RaBitQ4": dimension / 2 + 24,
-        }[self.name]
-
-
-FAMILIES = (
-    _IndexFamily(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985, refine="table", reduces=True),
-    _IndexFamily(name="HNSW32,SQ8", form="HNSW32,SQ8", ceiling=0.985, graph=True, merging=2),
-    _IndexFamily(
-        name="PQfs", form="IVF{lists},PQ{pieces}x4fs", ceiling=0.98, refine="table", merging=2
-    ),
-    _IndexFamily(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985),
-    _IndexFamily(name="SQfp16", form="IVF{lists},SQfp16", ceiling=0.999),
-    _IndexFamily(
-        name="RaBitQ", form="IVF{lists},RaBitQ", ceiling=0.97, refine="table", on_disk=True
-    ),
-    _IndexFamily(name="RaBitQ4", form="IVF{lists},RaBitQ4", ceiling=0.9),
-    _IndexFamily(name="SQ8", form="IVF{lists},SQ8", ceiling=0.985, on_disk=True),
-)
-EXACT = _IndexFamily(name="Flat", form="Flat", ceiling=1.0, merging=2)
-
-
 def plan_index(gallery: GallerySpec) -> IndexPlan:
-    """The plan for a gallery.
+    """The most promising plan for a gallery, untried.
+
+    Raises InputError, with the memory that would do, where no family fits the budget.
+    """
+    return candidate_plans(gallery)[0]
+
+
+def candidate_plans(gallery: GallerySpec) -> list[IndexPlan]:
+    """The plans that fit the budget: first those whose family is known to reach the recall, from
+    the fastest to the slowest, then the others, the highest recall first.
 
     Raises InputError, with the memory that would do, where no family fits the budget.
     """
@@ -155,10 +118,9 @@ def plan_index(gallery: GallerySpec) -> IndexPlan:
             f"{gallery.budget / 1e9:.2f} GB; raise --memory-budget, or index the gallery in "
             "several indexes, by --split, --view or tables of their own"
         )
-    for plan in fitting:
-        if plan.expected_recall >= gallery.target_recall:
-            return plan
-    return max(fitting, key=lambda plan: plan.expected_recall)
+    reaching = [plan for plan in fitting if plan.expected_recall >= gallery.target_recall]
+    others = [plan for plan in fitting if plan not in reaching]
+    return reaching + sorted(others, key=lambda plan: -plan.expected_recall)
 
 
 def plan_factory(gallery: GallerySpec, factory: str, refine: Refine = "none") -> IndexPlan:
@@ -193,7 +155,7 @@ def _plans(gallery: GallerySpec) -> Iterator[IndexPlan]:
             yield _plan(family, gallery)
 
 
-def _plan(family: _IndexFamily, gallery: GallerySpec) -> IndexPlan:
+def _plan(family: IndexFamily, gallery: GallerySpec) -> IndexPlan:
     reduced = gallery.dimension
     if family.reduces and gallery.effective_dimension:
         reduced = gallery.effective_dimension
@@ -232,13 +194,6 @@ def _plan(family: _IndexFamily, gallery: GallerySpec) -> IndexPlan:
     )
 
 
-def factory_string(family: _IndexFamily, lists: int, dimension: int) -> str:
-    """A family's factory string. The number of subquantisers must divide the dimension."""
-    most = max(1, dimension // SUBQUANTISER_DIM)
-    pieces = next(count for count in range(most, 0, -1) if dimension % count == 0)
-    return family.form.format(lists=lists, pieces=pieces)
-
-
 def _lists(gallery: GallerySpec) -> int:
     """About twice the root of the rows, as a power of two; at most as many as the memory can
     train.
@@ -257,18 +212,10 @@ def _training_rows(gallery: GallerySpec, lists: int) -> int:
     return min(_max_training_rows(gallery), max(16_384, ROWS_PER_LIST * lists))
 
 
-def _reason(family: _IndexFamily, gallery: GallerySpec, reduced: int, code: float) -> str:
-    kind = {
-        "Flat": f"exact search: {gallery.rows:,} rows are few enough to compare each",
-        "HNSW32,SQ8": "a graph over 8-bit codes",
-        "SQfp16": "lists of 16-bit numbers",
-        "SQ8": "lists of 8-bit codes",
-        "PQfs": "lists of 4-bit product codes",
-        "RaBitQ": "lists of one-bit codes",
-        "RaBitQ4": "lists of four-bit codes",
-    }[family.name]
+def _reason(family: IndexFamily, gallery: GallerySpec, reduced: int, code: float) -> str:
+    kind = family.kind
     if family is EXACT:
-        return kind
+        return f"{kind}: {gallery.rows:,} rows are few enough to compare each"
     if family.reduces:
         kind += f" of vectors reduced from {gallery.dimension} to {reduced} directions"
     if family.on_disk:

@@ -1,0 +1,201 @@
+"""Tries a plan on a sample of the gallery's vectors before it is built: recall of its searches,
+queries a second, p99, bytes a row, and the seconds that the whole gallery will take.
+
+The plan is built twice, over the sample and over a quarter of it. What of the recall is lost at the
+most thorough search grows with the rows by a power that these two give; it is extrapolated to all
+rows. Times grow by the work that each kind of index does for a row or a query.
+Shapes: S rows of the sample, Q queries, K wanted rows, D dimensions.
+"""
+
+import math
+import re
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from pipeline.core.arrays import Floats, Ints, Mask
+from pipeline.index.faiss_io import FAISS, faiss_parameters
+from pipeline.index.metadata import SearchParams
+from pipeline.index.part import FILTERED_EXACT_ROWS, NO_ROW, top_k
+from pipeline.index.planning.choice import PlanTrial, TrialPoint
+from pipeline.index.planning.plan import ROWS_PER_LIST, TRAINING_SHARE, GallerySpec, IndexPlan
+from pipeline.index.recall import (
+    NEIGHBOURS,
+    RecallQueries,
+    measure_recall,
+    measure_speed,
+    search_param_grid,
+)
+from pipeline.index.train import new_index, train_index
+
+TRIAL_SHARE = 1 / 16
+"Of the rows: a trial takes a sixteenth of the building, about."
+MIN_TRIAL_ROWS, MAX_TRIAL_ROWS = 8_192, 32_768
+TRIAL_QUERIES = 256
+"Rows of the sample that are not indexed."
+TRIAL_SECONDS = 0.05
+"For which a setting's batches are timed, and its single ones."
+QUARTER = 4
+MOST_GROWTH = 0.5
+"""Largest power of the rows by which lost recall is taken to grow: two samples give it roughly, and
+one lost neighbour in a thousand is no trend."""
+
+
+def trial_rows(gallery: GallerySpec) -> int:
+    """Rows of the sample, its queries included; what FAISS copies of them fits the memory."""
+    memory = int(gallery.budget * TRAINING_SHARE / (2 * 4 * gallery.dimension))
+    wanted = max(MIN_TRIAL_ROWS, int(gallery.rows * TRIAL_SHARE))
+    return min(gallery.rows, memory, MAX_TRIAL_ROWS, wanted)
+
+
+def try_plan(plan: IndexPlan, gallery: GallerySpec, sample_SD: Floats) -> PlanTrial:
+    """Build a plan over a sample and search it: from the fastest search to the first that is
+    expected to reach the recall, and by the most thorough one where none is.
+    """
+    held_out_S = np.zeros(len(sample_SD), np.bool_)
+    queries = min(TRIAL_QUERIES, len(sample_SD) // 2)
+    held_out_S[np.linspace(0, len(sample_SD) - 1, queries).astype(np.int64)] = True
+    queries_QD, rows_SD = sample_SD[held_out_S], sample_SD[~held_out_S]
+    quarter = _SampleIndex(plan, gallery, rows_SD[: math.ceil(len(rows_SD) / QUARTER)])
+    lost_of_quarter = quarter.lost_at_most_thorough(queries_QD)
+    whole = _SampleIndex(plan, gallery, rows_SD)
+    lost = whole.lost_at_most_thorough(queries_QD)
+    noise = 1 / (2 * NEIGHBOURS * queries)
+    power = math.log((lost + noise) / (lost_of_quarter + noise)) / math.log(QUARTER)
+    growth = (gallery.rows / len(rows_SD)) ** min(MOST_GROWTH, max(0.0, power))
+    points: list[TrialPoint] = []
+    for params in whole.grid():
+        points.append(whole.point(params, queries_QD, growth))
+        if points[-1].recall >= gallery.target_recall:
+            break
+    return PlanTrial(
+        plan=plan,
+        points=tuple(points),
+        bytes_per_row=len(FAISS.serialize_index(whole.index)) / len(rows_SD),
+        build_seconds=whole.build_seconds,
+        sample_rows=len(rows_SD),
+    )
+
+
+class _SampleIndex:
+    """A plan, built over a sample in memory."""
+
+    def __init__(self, plan: IndexPlan, gallery: GallerySpec, rows_SD: Floats) -> None:
+        self._plan, self._gallery, self._rows_SD = plan, gallery, rows_SD
+        rows, share = len(rows_SD), len(rows_SD) / gallery.rows
+        lists = _lists(plan.factory)
+        fewer = _fewer_lists(lists, share, rows)
+        factory = _with_lists(plan.factory, fewer)
+        self.index: Any = new_index(factory, gallery.dimension)
+        start = time.perf_counter()
+        train_index(self.index, factory, rows_SD)
+        trained = time.perf_counter()
+        self.index.add(rows_SD)
+        added = time.perf_counter()
+        # Each row is compared with every centre, or with some of a graph for each doubling of it.
+        graph = math.log(gallery.rows) / math.log(rows) if _is_graph(self.index) else 1.0
+        more_lists = lists / fewer if lists else 1.0
+        training = min(plan.training_rows, gallery.rows) / rows * more_lists
+        adding = more_lists * graph / share
+        self.build_seconds = (trained - start) * training + (added - trained) * adding
+        # A query compares with every centre and with the rows of some lists.
+        lengths = (gallery.rows / lists) / (rows / fewer) if lists else 1 / share
+        self._slower = graph if _is_graph(self.index) else max(more_lists, lengths)
+        self._allowed_S = self._mask()
+        self._exact_QK: Ints | None = None
+
+    def _mask(self) -> Mask | None:
+        """Rows that a filter of the expected selectivity leaves; None where it leaves all, or so
+        few that a search compares each with the query.
+        """
+        share = self._gallery.selectivity
+        if share >= 1 or share * self._gallery.rows <= FILTERED_EXACT_ROWS:
+            return None
+        allowed_S: Mask = np.random.default_rng(0).random(len(self._rows_SD)) < share
+        return allowed_S
+
+    def grid(self) -> Iterator[SearchParams]:
+        """The settings of its search, from the fastest to the most thorough."""
+        return search_param_grid(self.index, self._plan.refine)
+
+    def search_rows(
+        self, queries_QD: Floats, k: int = NEIGHBOURS, params: SearchParams | None = None
+    ) -> tuple[Floats, Ints]:
+        """As `Index.search_rows`, over the sample."""
+        assert params is not None
+        wanted = min(len(self._rows_SD), k * params.rerank_factor)
+        breadth = params.nprobe_or_ef
+        if self._allowed_S is not None:
+            breadth = math.ceil(breadth * len(self._rows_SD) / max(1, self._allowed_S.sum()))
+        scores_QC, rows_QC = self.index.search(
+            queries_QD, wanted, params=faiss_parameters(self.index, breadth, self._allowed_S)
+        )
+        if params.rerank_factor > 1:
+            scores_QC = np.einsum("qcd,qd->qc", self._rows_SD[rows_QC], queries_QD)
+        return top_k(scores_QC, rows_QC, k)
+
+    def lost_at_most_thorough(self, queries_QD: Floats) -> float:
+        """Share of exact search's ten nearest that the most thorough search does not find."""
+        *_, hardest = self.grid()
+        return 1 - measure_recall(self, self._queries(queries_QD), hardest)[1]
+
+    def point(self, params: SearchParams, queries_QD: Floats, growth: float) -> TrialPoint:
+        """One setting, measured. `growth`: of the lost recall, up to all rows."""
+        recall = measure_recall(self, self._queries(queries_QD), params)[1]
+        speed = measure_speed(
+            lambda some_QD: self.search_rows(some_QD, params=params),
+            queries_QD,
+            self._gallery.batch,
+            TRIAL_SECONDS,
+        )
+        return TrialPoint(
+            nprobe_or_ef=params.nprobe_or_ef,
+            rerank_factor=params.rerank_factor,
+            recall=max(0.0, 1 - (1 - recall) * growth),
+            sample_recall=recall,
+            queries_per_second=speed["queries_per_second"] / self._slower,
+            p99_ms=speed["p99_ms"] * self._slower,
+        )
+
+    def _queries(self, queries_QD: Floats) -> RecallQueries:
+        if self._exact_QK is None:
+            flat = new_index("Flat", self._gallery.dimension)
+            flat.add(self._rows_SD)
+            wanted = min(NEIGHBOURS, len(self._rows_SD))
+            if self._allowed_S is not None:
+                wanted = min(wanted, int(self._allowed_S.sum()))
+            parameters = faiss_parameters(flat, 1, self._allowed_S)
+            self._exact_QK = flat.search(queries_QD, wanted, params=parameters)[1]
+        return RecallQueries(
+            queries_QD=queries_QD,
+            exact_QK=self._exact_QK,
+            own_row_Q=np.full(len(queries_QD), NO_ROW),
+            source="rows of the sample that are not indexed",
+        )
+
+
+def _is_graph(index: Any) -> bool:
+    kind = FAISS.downcast_index(index)
+    if isinstance(kind, FAISS.IndexPreTransform):
+        kind = FAISS.downcast_index(kind.index)
+    return isinstance(kind, FAISS.IndexHNSW)
+
+
+def _lists(factory: str) -> int:
+    """Inverted lists of a factory string; 0: none."""
+    found = re.search(r"IVF(\d+)", factory)
+    return int(found[1]) if found else 0
+
+
+def _fewer_lists(lists: int, share: float, rows: int) -> int:
+    """Lists of a sample: fewer by the root of its share, as the planner's are; a power of two."""
+    if not lists:
+        return 0
+    most = max(1, min(lists, rows // ROWS_PER_LIST))
+    return int(2 ** math.floor(math.log2(max(1, min(most, lists * math.sqrt(share))))))
+
+
+def _with_lists(factory: str, lists: int) -> str:
+    return re.sub(r"IVF\d+", f"IVF{lists}", factory)
