@@ -10,8 +10,9 @@ from pipeline.features.settings import EmbeddingSettings
 
 
 def embed_test(shards: str, checkpoint: str, table: str) -> None:
-    """Embed both splits of the test. Raises InputError or CheckpointError as `embed_gallery`."""
+    """Embed both splits of the test, in this process: small sets, for which Ray's workers take
+    longer to start. Raises InputError or CheckpointError as `embed_gallery`."""
     data = read_checkpoint_bytes(checkpoint)
     for split in (Split.QUERY, Split.GALLERY):
-        embedding = EmbeddingSettings(shards=shards, out=table, split=split)
+        embedding = EmbeddingSettings(shards=shards, out=table, split=split, workers=0)
         embed_gallery(embedding, make_encoder_spec(data, checkpoint, embedding))

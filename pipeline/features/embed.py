@@ -1,14 +1,16 @@
 """Shards + encoder -> feature table: the stage, in three steps: plan, run, report.
 
 In: a set of shards, and the encoder as a factory that is called on each worker. Out: the table, the
-list of the images and shards that have no row, and a summary. Ray actors write one part per shard;
-a rerun skips finished parts. However often workers or the stage itself are killed, the table ends
-up with the same bytes: a part is a function of its shard and appears atomically.
+list of the images and shards that have no row, and a summary. Ray actors, or this process, write
+one part per shard; a rerun skips finished parts. However often workers or the stage itself are
+killed, the table ends up with the same bytes: a part is a function of its shard and appears
+atomically.
 """
 
+import os
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -140,17 +142,24 @@ def requested_shards(settings: EmbeddingSettings, shard_set: ShardSet) -> list[S
 def run_workers(
     settings: EmbeddingSettings, encoder: EncoderSpec, plan: EmbeddingPlan
 ) -> EmbeddingRun:
-    """Embed the pending shards on an actor pool. Raises InputError, Incomplete."""
+    """Embed the pending shards, on an actor pool or in this process. Raises InputError,
+    Incomplete."""
     run = EmbeddingRun(skipped=dict(plan.skipped))
     shards = [shard for shard in plan.pending if shard.name not in plan.skipped]
     if not shards:
         return run
-    cluster.connect()
-    nodes = cluster.nodes()
-    placement = plan_placement(
-        nodes, len(shards), settings.workers, settings.cpus_per_worker, settings.gpus_per_worker
-    )
-    pool = ActorPool(pool_config(settings, plan.shard_set, encoder, placement, nodes))
+    pool: ActorPool | _ThisProcess
+    if settings.workers == 0:
+        job = embed_job(settings, plan.shard_set, settings.cpus_per_worker or os.cpu_count() or 1)
+        pool, where = _ThisProcess(job, encoder), "in this process"
+    else:
+        cluster.connect()
+        nodes = cluster.nodes()
+        placement = plan_placement(
+            nodes, len(shards), settings.workers, settings.cpus_per_worker, settings.gpus_per_worker
+        )
+        pool = ActorPool(pool_config(settings, plan.shard_set, encoder, placement, nodes))
+        where = f"over {placement.workers} workers of {placement}"
     start = time.monotonic()
     try:
         with progress(sum(shard.samples for shard in shards), "embedding") as meter:
@@ -173,10 +182,44 @@ def run_workers(
     idle = max(0.0, pool.seconds - spent["infer"])
     threads = ", ".join(f"{name} {spent[name]:.1f} s" for name in ("read", "decode", "write"))
     console.print(
-        f"{settings.out}: {run.images} images in {elapsed:.1f} s; over {placement.workers} workers "
-        f"of {placement}: infer {spent['infer']:.1f} s, idle {idle:.1f} s, beside it {threads}"
+        f"{settings.out}: {run.images} images in {elapsed:.1f} s; {where}: infer "
+        f"{spent['infer']:.1f} s, idle {idle:.1f} s, beside it {threads}"
     )
     return run
+
+
+class _ThisProcess:
+    """What an actor pool does, without actors: what fails unforeseen is raised, nothing retried."""
+
+    ready_workers = 1
+
+    def __init__(self, job: EmbedJob, encoder: EncoderSpec) -> None:
+        self._embedder, self.seconds = ShardEmbedder(job, encoder), 0.0
+
+    def work(self, shards: Iterable[Shard]) -> Iterator[tuple[Shard, ShardResult | Skipped]]:
+        for remark in self._embedder.start():
+            console.print(remark)
+        start = time.monotonic()
+        for shard in shards:
+            try:
+                yield shard, self._embedder.work(shard)
+            except InputError as error:
+                yield shard, Skipped(reason="unusable", found=str(error))
+        self.seconds = time.monotonic() - start
+
+
+def embed_job(
+    settings: EmbeddingSettings, shards: ShardSet, cpus: int, beside_gpu: bool = False
+) -> EmbedJob:
+    """The job of a worker that has so many CPU cores."""
+    return EmbedJob(
+        shards=shards.for_workers(),
+        out=settings.out,
+        batch_size=settings.batch_size,
+        dtype=settings.dtype,
+        threads=cpus,
+        decode_threads=settings.decode_threads or max(1, cpus - 1 if beside_gpu else cpus // 4),
+    )
 
 
 def pool_config(
@@ -188,14 +231,7 @@ def pool_config(
 ) -> PoolConfig:
     """The actor pool: what an actor is, and which errors skip a shard or end the stage."""
     cpus, gpus = placement.cpus, placement.gpus
-    job = EmbedJob(
-        shards=shards.for_workers(),
-        out=settings.out,
-        batch_size=settings.batch_size,
-        dtype=settings.dtype,
-        threads=cpus,
-        decode_threads=settings.decode_threads or max(1, cpus - 1 if gpus else cpus // 4),
-    )
+    job = embed_job(settings, shards, cpus, gpus > 0)
     remote: Any = ray.remote(num_cpus=cpus, num_gpus=gpus)(ShardEmbedder)
     actor = remote.options(max_concurrency=IN_FLIGHT)
     shared = ray.put(encoder)  # the weights travel to each node once

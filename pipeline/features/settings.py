@@ -29,7 +29,8 @@ class EmbeddingSettings:
     dtype: str = "float32"
     "Of the stored embeddings: float32, or float16 for half the space."
     workers: int | None = None
-    "Actors; by default one per GPU, or where there is none one per eight CPU cores."
+    """Actors of Ray; by default one per GPU, or where there is none one per eight CPU cores. 0:
+    this process embeds, without Ray."""
     cpus_per_worker: int | None = None
     "CPU cores of an actor; by default as many as let all actors fit on the nodes that are up."
     gpus_per_worker: float | None = None
@@ -46,9 +47,9 @@ class EmbeddingSettings:
     def __post_init__(self) -> None:
         require(self.batch_size >= 1, "batch_size", self.batch_size, "at least 1")
         require(self.dtype in ("float32", "float16"), "dtype", self.dtype, "float32 or float16")
-        for name in ("workers", "cpus_per_worker", "decode_threads"):
+        for name, least in (("workers", 0), ("cpus_per_worker", 1), ("decode_threads", 1)):
             value = getattr(self, name)
-            require(value is None or value >= 1, name, value, "at least 1")
+            require(value is None or value >= least, name, value, f"at least {least}")
         gpus = self.gpus_per_worker
         require(gpus is None or gpus >= 0, "gpus_per_worker", gpus, "0 or more")
 
