@@ -1,7 +1,7 @@
 # Each target sets up .venv by itself; nothing is installed outside it.
 PYTHON ?= python3
 BIN := .venv/bin
-# Processes that share the tests, each with a Ray of its own; 0: this one alone.
+# Processes that share the tests, of which one has the Ray; 0: this one alone.
 TEST_PROCESSES ?= 0
 
 .DEFAULT_GOAL := help
@@ -15,11 +15,11 @@ install: .venv/installed  ## install the project and its pinned dependencies int
 demo: .venv/installed  ## the complete road on simulated flights: at most six minutes on two cores
 	$(BIN)/python jobs/demo.py --out runs/demo
 
-test: .venv/installed  ## all tests: 22 minutes on two quiet cores
+test: .venv/installed  ## all tests: at most 22 minutes on two quiet cores
 	$(BIN)/pytest -n $(TEST_PROCESSES) --no-loadscope-reorder
 
-test-fast: .venv/installed  ## the tests without Ray, training and browsers: some minutes
-	$(BIN)/pytest -m "not slow"
+test-fast: .venv/installed  ## the tests without Ray, training, fuzzing and browsers: minutes
+	$(BIN)/pytest -n $(TEST_PROCESSES) -m "not slow"
 
 check: .venv/installed  ## formatting, lint and types
 	$(BIN)/ruff format --check .

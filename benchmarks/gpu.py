@@ -12,9 +12,9 @@ without a GPU it measures the CPU. Needs no Ray.
 
 import argparse
 import json
-import subprocess
 import sys
 import time
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -59,17 +59,20 @@ def measure(name: str, out: Path, settings: dict[str, Any]) -> None:
     keep(out, name, measurement)
 
 
-def measure_in_child(name: str, seconds: float) -> str | None:
-    """Measure in a process with the same flags; why there are no figures, or None.
+def measure_in_child(name: str, out: Path, settings: dict[str, Any], seconds: float) -> str | None:
+    """Measure in a process of its own; why there are no figures, or None.
 
     A crash, for want of memory say, and a hang leave the other measurements alone.
     """
-    command = [sys.executable, __file__, *sys.argv[1:], "--only", name]
-    try:
-        code = subprocess.run(command, timeout=seconds).returncode
-    except subprocess.TimeoutExpired:
+    # This process has not imported torch, so that its copy does so afresh.
+    child = get_context("fork").Process(target=measure, args=(name, out, settings))
+    child.start()
+    child.join(seconds)
+    if child.is_alive():
+        child.kill()
+        child.join()
         return "stopped by --minutes"
-    return f"failed with exit code {code}" if code else None
+    return f"failed with exit code {child.exitcode}" if child.exitcode else None
 
 
 def lines(name: str, figures: dict[str, Any]) -> list[str]:
@@ -120,7 +123,6 @@ def main() -> int:
     add("--out", type=Path, required=True, help=f"folder of {FILE}")
     add("--minutes", type=float, default=9.5, help="then it stops with what it has")
     add("--networks", nargs="+", choices=NETWORKS, default=NETWORKS, help="to measure")
-    add("--only", help="one measurement, in this process")
     add("--width", type=float, default=1.0, help="channels of the networks, as a multiple")
     add("--size", type=int, default=256, help="side of their images, pixels")
     add("--batch", type=int, help="images embedded at a time; 256 on CUDA, else 8")
@@ -133,9 +135,6 @@ def main() -> int:
     add("--compile-training", action="store_true", help="compile the networks for training too")
     args = parser.parse_args()
     settings = {name: getattr(args, name) for name in SETTINGS}
-    if args.only:
-        measure(args.only, args.out, settings)
-        return 0
     deadline, missing = time.monotonic() + 60 * args.minutes, list[str]()
     for name in (f"{kind}, {network}" for network in args.networks for kind in KINDS):
         problem = None
@@ -144,7 +143,7 @@ def main() -> int:
         elif time.monotonic() >= deadline:
             problem = "stopped by --minutes"
         else:
-            problem = measure_in_child(name, deadline - time.monotonic())
+            problem = measure_in_child(name, args.out, settings, deadline - time.monotonic())
         if problem:
             missing.append(name)
             print(f"{name}: not measured: {problem}", flush=True)

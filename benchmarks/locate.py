@@ -81,7 +81,7 @@ def prepare(args: argparse.Namespace) -> None:
     recipe = replace(smoke(epochs=args.epochs), hold_out=args.hold_out)
     checkpoint = train(TrainSettings(recipe=recipe, shards=shards, out=run, workers=0))
     for split, view in ((Split.QUERY, View.DRONE), (Split.GALLERY, View.SATELLITE)):
-        embedding = EmbeddingSettings(shards=shards, out=table, split=split, view=view)
+        embedding = EmbeddingSettings(shards=shards, out=table, split=split, view=view, workers=0)
         spec = make_encoder_spec(storage.read_bytes(checkpoint), checkpoint, embedding)
         embed_gallery(embedding, spec)
     build_index(IndexSettings(table=table, out=index, split=Split.GALLERY, view=View.SATELLITE))

@@ -95,7 +95,7 @@ def make_index(out: Path, tiles: str, checkpoint: str) -> str:
     """Embed and index the tiles by one encoder; the index."""
     out.mkdir(parents=True, exist_ok=True)
     table, index = str(out / "table"), str(out / "index")
-    embedding = EmbeddingSettings(shards=tiles, out=table)
+    embedding = EmbeddingSettings(shards=tiles, out=table, workers=0)
     spec = make_encoder_spec(read_checkpoint_bytes(checkpoint), checkpoint, embedding)
     embed_gallery(embedding, spec)
     build_index(IndexSettings(table=table, out=index))

@@ -11,8 +11,9 @@ import hypothesis
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
-from tests.launcher import Launcher
-from tests.processes import one_start_of_ray
+from tests.chaos.workspace import hooked
+from tests.launcher import ROOT, Launcher
+from tests.processes import Cluster, start_cluster
 
 if TYPE_CHECKING:
     from model.pvda import FeatureEncoder
@@ -40,63 +41,50 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("house")
 
-SLOW_FIXTURES = {"ray_cluster", "prepared", "browser", "workspace"}
-"Tests that use one of them start Ray, jobs or Chromium: `make test-fast` leaves them out."
-USES_RAY = re.compile(
-    r"\b(ray_cluster|ray_address|prepared|workspace|start_cluster|ray job|ray\.init)\b"
-)
-"""In a file of tests: it starts a cluster of Ray, or jobs that do. Other files may not: each
-process that runs some would start one of its own."""
-RAY_UNITS = (
-    ("tests/chaos/", "tests/core/", "tests/service/", "tests/test_benchmarks.py",
-     "tests/jobs/test_signals.py", "tests/jobs/test_submit.py"),
-    ("tests/",),
-)  # fmt: skip
-"""Beginnings of such files' names: of several test processes (pytest -n) each runs one of these
-units to its end, then single files of the others."""
+RAY_FIXTURES = {"ray_session", "ray_cluster"}
+"Tests that start Ray ask for one of them."
+SLOW_FIXTURES = RAY_FIXTURES | {"prepared", "browser"}
+"""Tests that use one of them start Ray, jobs or Chromium: `make test-fast` leaves them out. So it
+does with tests/fuzz, and with tests and files that are marked."""
+STARTS = re.compile(r"\b(ray_session|ray_cluster|ray_address|prepared)\b")
+"In a file of tests: it needs the session's Ray, or the process that starts jobs."
+START_UNIT = "files that use Ray or start jobs"
+"""Of several test processes (pytest -n), one runs them all: another would start a Ray and a
+launcher of its own. Of the others, each file is a unit."""
 
 
 @cache
-def uses_ray(file: str) -> bool:
-    return bool(USES_RAY.search((Path(__file__).parents[1] / file).read_text()))
-
-
-def unit_of(node: str) -> int:
-    """The number of a test's unit; beyond the last one for tests that do not use Ray."""
-    file = node.partition("::")[0]
-    if not uses_ray(file):
-        return len(RAY_UNITS)
-    return next(number for number, starts in enumerate(RAY_UNITS) if file.startswith(starts))
+def unit_of(file: str) -> str:
+    """The name of a file's unit."""
+    return START_UNIT if STARTS.search((ROOT / file).read_text()) else file
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for item in items:
-        if SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
+        fuzzes = item.nodeid.startswith("tests/fuzz/")
+        if fuzzes or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
-    if hasattr(config, "workerinput"):  # a process of pytest-xdist
-        items.sort(key=lambda item: unit_of(item.nodeid))
+    if hasattr(config, "workerinput"):  # a process of pytest-xdist: the longest unit first
+        items.sort(key=lambda item: unit_of(item.nodeid.partition("::")[0]) != START_UNIT)
 
 
-class RayUnitScheduling(LoadScopeScheduling):  # type: ignore[misc]
-    """A unit of RAY_UNITS is one piece of work, of the other tests each file is one.
-
-    `--dist loadgroup` would do, but xdist 3.8 finds no groups with pytest 9.2.
+class UnitScheduling(LoadScopeScheduling):  # type: ignore[misc]
+    """Units instead of files. `--dist loadgroup` would do, but xdist 3.8 finds no groups with
+    pytest 9.2.
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        unit = unit_of(nodeid)
-        file: str = nodeid.partition("::")[0]
-        return f"Ray {unit}" if unit < len(RAY_UNITS) else file
+        return unit_of(nodeid.partition("::")[0])
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadScopeScheduling:
-    return RayUnitScheduling(config, log)
+    return UnitScheduling(config, log)
 
 
 @pytest.fixture(autouse=True)
-def _no_ray_in_other_files(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    if not uses_ray(request.node.nodeid.partition("::")[0]):
+def _no_ray_unasked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not RAY_FIXTURES & set(request.fixturenames):
         monkeypatch.setattr(
             "pipeline.core.cluster.connect",
             lambda: pytest.fail("starts Ray: ask for the fixture ray_cluster"),
@@ -104,18 +92,31 @@ def _no_ray_in_other_files(request: pytest.FixtureRequest, monkeypatch: pytest.M
 
 
 @pytest.fixture(scope="session")
-def ray_cluster() -> Iterator[None]:
-    """A local Ray of this test session, or of this process of several.
-
-    Ray gives itself 30 s to start, which a busy machine exceeds now and then: tried three times.
+def storage_faults(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file that asks for faults of storage in the session's Ray, see tests/chaos/hook; normally
+    there is none.
     """
+    return tmp_path_factory.mktemp("faults") / "fault.json"
+
+
+@pytest.fixture(scope="session")
+def ray_session(storage_faults: Path) -> Iterator[Cluster]:
+    """A Ray of two cores for all tests of this process."""
+    with start_cluster(2, hooked(storage_faults)) as cluster:
+        yield cluster
+
+
+@pytest.fixture(scope="session")
+def ray_cluster(ray_session: Cluster) -> Iterator[None]:
+    """This process is connected with that Ray."""
     import ray
 
     from pipeline.core import cluster
     from pipeline.core.errors import Incomplete
 
-    with one_start_of_ray():
-        for attempt in (1, 2, 3):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_ADDRESS", ray_session.address)
+        for attempt in (1, 2, 3):  # a busy machine exceeds Ray's 30 s now and then
             try:
                 cluster.connect()
                 break
@@ -169,13 +170,10 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Launcher]:
 
 
 @pytest.fixture
-def ray_address(ray_cluster: None, monkeypatch: pytest.MonkeyPatch) -> str:
+def ray_address(ray_session: Cluster, ray_cluster: None, monkeypatch: pytest.MonkeyPatch) -> str:
     """The session's Ray, for jobs in separate processes: in their environment."""
-    import ray
-
-    address: str = ray.get_runtime_context().gcs_address
-    monkeypatch.setenv("RAY_ADDRESS", address)
-    return address
+    monkeypatch.setenv("RAY_ADDRESS", ray_session.address)
+    return ray_session.address
 
 
 def make_lively_encoder() -> "FeatureEncoder":

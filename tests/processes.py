@@ -12,8 +12,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+
+LOG, STARTED = "head.log", "Ray runtime started"
+"Where `ray start` writes, and what, when its node takes drivers."
 
 
 def command_line(pid: int) -> str:
@@ -85,51 +89,83 @@ def one_start_of_ray() -> Iterator[None]:
         yield
 
 
+@dataclass(frozen=True, kw_only=True)
+class Cluster:
+    """A cluster of Ray on this machine."""
+
+    pid: int
+    "Of the process above all of its processes."
+    address: str
+    "Of drivers: RAY_ADDRESS."
+    dashboard: str
+    "URL for `ray job submit`: RAY_API_SERVER_ADDRESS."
+
+
 @contextmanager
-def start_cluster(cpus: int, environment: dict[str, str]) -> Iterator[tuple[int, str]]:
-    """A Ray cluster on this machine: the pid of the process above all of it, and its address.
+def start_cluster(cpus: int, environment: dict[str, str]) -> Iterator[Cluster]:
+    """A Ray cluster on ports and in a session folder of its own.
 
     Tried three times: Ray gives its parts 30 s each, which a busy machine exceeds now and then.
     """
-    with one_start_of_ray():
-        for attempt in (1, 2, 3):
-            head, address = _start_head(cpus, environment)
-            if _wait_for_raylet(head):
-                break
+    # Not in pytest's folder: the paths of Ray's sockets may have 107 characters.
+    with tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True) as scratch:
+        with one_start_of_ray():
+            for attempt in (1, 2, 3):
+                head, cluster = _start_head(cpus, environment, scratch)
+                if _wait_until_started(head, Path(scratch, LOG)):
+                    break
+                _end(head)
+                if attempt == 3:
+                    raise RuntimeError("Ray has not started")
+        try:
+            yield cluster
+        finally:
             _end(head)
-            if attempt == 3:
-                raise RuntimeError("Ray has not started")
-    try:
-        yield head.pid, address
-    finally:
-        _end(head)
 
 
-def _start_head(cpus: int, environment: dict[str, str]) -> tuple["subprocess.Popen[bytes]", str]:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+def free_ports(count: int) -> list[int]:
+    with ExitStack() as open_sockets:
+        sockets = [open_sockets.enter_context(socket.socket()) for _ in range(count)]
+        for one in sockets:
+            one.bind(("127.0.0.1", 0))
+        return [int(one.getsockname()[1]) for one in sockets]
+
+
+def _start_head(
+    cpus: int, environment: dict[str, str], scratch: str
+) -> tuple["subprocess.Popen[bytes]", Cluster]:
+    port, dashboard, client, agent, metrics, environments = free_ports(6)
     # With its dashboard: Ray Train asks it whether a controller is alive, and without it keeps the
     # resources of a dead one reserved.
-    words = ["start", "--head", "--block", f"--port={port}", f"--num-cpus={cpus}"]
-    ray = Path(sys.executable).with_name("ray")
+    # Ports of agents that are given need not be waited for: the raylet waits 15 s, and dies.
+    words = (
+        f"start --head --block --disable-usage-stats --node-ip-address=127.0.0.1 --port={port} "
+        f"--dashboard-port={dashboard} --dashboard-agent-listen-port={agent} "
+        f"--dashboard-agent-grpc-port={metrics} --runtime-env-agent-port={environments} "
+        f"--ray-client-server-port={client} --num-cpus={cpus} --temp-dir={scratch}"
+    )
     environment = os.environ | environment
     environment.pop("RAY_ADDRESS", None)  # of another cluster
-    head = subprocess.Popen(
-        [str(ray), *words, "--disable-usage-stats", "--node-ip-address=127.0.0.1"],
-        env=environment,
-        start_new_session=True,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
+    with Path(scratch, LOG).open("wb") as log:
+        head = subprocess.Popen(
+            [str(Path(sys.executable).with_name("ray")), *words.split()],
+            env=environment,
+            start_new_session=True,
+            stdout=log,
+            stderr=log,
+        )
+    return head, Cluster(
+        pid=head.pid,
+        address=f"127.0.0.1:{port}",
+        dashboard=f"http://127.0.0.1:{dashboard}",
     )
-    return head, f"127.0.0.1:{port}"
 
 
-def _wait_for_raylet(head: "subprocess.Popen[bytes]") -> bool:
-    """Whether it starts within a minute and a half."""
-    deadline = time.monotonic() + 90
+def _wait_until_started(head: "subprocess.Popen[bytes]", log: Path) -> bool:
+    """Whether it starts within two minutes: its node is known then, and takes drivers."""
+    deadline = time.monotonic() + 120
     while head.poll() is None and time.monotonic() < deadline:
-        if any("raylet/raylet" in command_line(child) for child in descendants(head.pid)):
+        if STARTED in log.read_text(errors="replace"):
             return True
         time.sleep(0.1)
     return False

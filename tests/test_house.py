@@ -8,6 +8,7 @@ import ast
 import re
 from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -57,9 +58,22 @@ def module_of(path: Path) -> str:
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
-def imports_of(path: Path) -> Iterator[str]:
+KNOWN = {module_of(path) for path in SOURCES}
+
+
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
+def imports_of(path: Path) -> tuple[str, ...]:
     """Every module that a file imports, wherever in the file."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    return tuple(_imports_of(path))
+
+
+def _imports_of(path: Path) -> Iterator[str]:
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -69,10 +83,9 @@ def imports_of(path: Path) -> Iterator[str]:
 
 def own_module(name: str) -> str:
     """The longest prefix of a dotted name that is a module of this project, else ""."""
-    known = {module_of(path) for path in SOURCES}
     parts = name.split(".")
     prefixes = (".".join(parts[:end]) for end in range(len(parts), 0, -1))
-    return next((prefix for prefix in prefixes if prefix in known), "")
+    return next((prefix for prefix in prefixes if prefix in KNOWN), "")
 
 
 def room_of(module: str) -> str:
@@ -84,7 +97,7 @@ def room_of(module: str) -> str:
 def public_names(path: Path) -> list[str]:
     """The names without an underscore that a module defines at its top."""
     names: list[str] = []
-    for node in ast.parse(path.read_text()).body:
+    for node in parsed(path).body:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             names.append(node.name)
         elif isinstance(node, ast.Assign):
@@ -136,7 +149,7 @@ def test_a_file_fits_one_sitting(path: Path) -> None:
     assert max(map(len, text.split("\n"))) <= MOST_COLUMNS
     assert path.name not in {"utils.py", "common.py", "helpers.py"}
     if path.name != "__init__.py" or path in SOURCES:
-        assert ast.get_docstring(ast.parse(text)), "no module docstring"
+        assert ast.get_docstring(parsed(path)), "no module docstring"
 
 
 @pytest.mark.parametrize(
@@ -173,7 +186,7 @@ def test_importing_a_job_does_nothing(path: Path) -> None:
     """At a module's top stand imports, definitions, constants and the guard: no bare call."""
     calls = [
         node
-        for node in ast.parse(path.read_text()).body
+        for node in parsed(path).body
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
     ]
     assert not calls

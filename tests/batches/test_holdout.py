@@ -22,6 +22,7 @@ def test_holdout_is_about_the_share_asked_for() -> None:
     assert 70 <= len(holdout_locations(NAMES, 0.1)) <= 130
 
 
+@pytest.mark.slow
 @given(st.sets(st.sampled_from(NAMES), min_size=200))
 def test_holdout_depends_on_the_name_alone(some: set[str]) -> None:
     assert holdout_locations(sorted(some), 0.2) == holdout_locations(NAMES, 0.2) & some

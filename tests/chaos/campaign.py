@@ -103,8 +103,8 @@ def run_trial(workspace: Workspace, case: Case) -> TrialResult:
 
 
 def _is_distributed(workspace: Workspace, case: Case, rng: random.Random) -> bool:
-    """Whether Ray's workers run the stage, for a stage that could run in one process."""
-    return not case.stage.in_process or (rng.random() < 0.5 and not workspace.quick)
+    """Whether Ray's workers run the stage, which one process can run."""
+    return rng.random() < 0.5 and not workspace.quick
 
 
 def _inject_kills(

@@ -16,6 +16,8 @@ from pipeline.index.searcher import Index
 
 Content = dict[str, Any]
 "What a rerun has to reproduce, by name."
+IN_PROCESS = "--workers 0"
+"Arguments that have a job's own process do the work."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +32,6 @@ class Stage:
     arguments: str
     distributed: str
     "Arguments that have Ray's workers do the work."
-    in_process: str
-    """Arguments that have this process, or else a single worker, do the work; empty for a stage
-    that has no such choice."""
     verify_output: str | None = None
     "Arguments that check every byte of the output; None if `verify_input` or a rerun does."
     verify_input: str = ""
@@ -44,7 +43,7 @@ class Stage:
     def command(self, folder: Path, distributed: bool, verified: bool = False) -> list[str]:
         words = (
             self.arguments,
-            self.distributed if distributed else self.in_process,
+            self.distributed if distributed else IN_PROCESS,
             self.verify_input if verified else "",
         )
         return " ".join(words).format(here=folder).split()
@@ -121,8 +120,7 @@ STAGES = (
         job="simulate",
         reads=(),
         writes="flights",
-        in_process="",
-        distributed="",
+        distributed="--workers 2",
         undetectable=("output",),
         content=file_hashes,
         arguments="--out {here}/flights --train-locations 8 --test-locations 4 --distractors 4 "
@@ -133,7 +131,6 @@ STAGES = (
         job="make_shards",
         reads=("flights",),
         writes="shards",
-        in_process="--workers 0",
         distributed="--workers 2",
         arguments="--source university1652 --root {here}/flights --out {here}/shards "
         "--samples-per-shard 4",
@@ -146,7 +143,6 @@ STAGES = (
         job="train",
         reads=("shards",),
         writes="run",
-        in_process="--workers 0",
         distributed="--workers 1",
         arguments="smoke --shards {here}/shards --out {here}/run --checkpoint-minutes 0 --keep 3 "
         "--epochs 2 --batch-size 2 --part-dim 16 --discriminator-channels 16 --probe-epochs 0",
@@ -158,7 +154,6 @@ STAGES = (
         job="embed_gallery",
         reads=("shards", "run"),
         writes="table",
-        in_process="--workers 1",
         distributed="--workers 2",
         arguments="--shards {here}/shards --checkpoint {here}/run/last.pt --out {here}/table "
         "--batch-size 2 --cpus-per-worker 1",
@@ -170,7 +165,6 @@ STAGES = (
         job="build_index",
         reads=("table",),
         writes="index",
-        in_process="--workers 0",
         distributed="--workers 2",
         arguments="--table {here}/table --out {here}/index --factory IVF4,SQ8 --refine --parts 3",
         verify_output="--verify --out {here}/index",
@@ -182,7 +176,6 @@ STAGES = (
         job="evaluate",
         reads=("table", "shards"),
         writes="evaluation",
-        in_process="--workers 0",
         distributed="--workers 2",
         arguments="--table {here}/table --shards {here}/shards --out {here}/evaluation --panels 2",
         verify_input="--verify",

@@ -3,15 +3,16 @@
 `python -m tests.chaos` is the long one. The faults that it found stand here first, by their seeds.
 """
 
-from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from tests.chaos.__main__ import line, table
 from tests.chaos.campaign import Case, TrialResult, cases, run_trial
 from tests.chaos.stages import STAGES, Stage
-from tests.chaos.workspace import Workspace, open_workspace
+from tests.chaos.workspace import ENVIRONMENT, Workspace
 from tests.launcher import Launcher
+from tests.processes import Cluster
 
 FOUND = {
     ("pack", "read ends early"): 0,  # the image was rejected for good
@@ -38,9 +39,15 @@ tests/jobs/test_checkpoints.py."""
 
 
 @pytest.fixture(scope="module")
-def workspace(tmp_path_factory: pytest.TempPathFactory, prepared: Launcher) -> Iterator[Workspace]:
-    with open_workspace(tmp_path_factory.mktemp("chaos"), quick=prepared) as opened:
-        yield opened
+def workspace(
+    tmp_path_factory: pytest.TempPathFactory,
+    ray_session: Cluster,
+    storage_faults: Path,
+    prepared: Launcher,
+) -> Workspace:
+    """On the session's Ray."""
+    scratch = tmp_path_factory.mktemp("chaos")
+    return Workspace(scratch, ray_session, storage_faults, ENVIRONMENT, quick=prepared)
 
 
 def short_campaign(stage: Stage) -> list[Case]:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.chaos.faults import STORAGE
-from tests.chaos.stages import Content, Stage
+from tests.chaos.stages import IN_PROCESS, Content, Stage
 from tests.launcher import PYTHON_PATH, JobResult, Launcher, RunningJob
-from tests.processes import busy_workers, ray_daemons, start_cluster
+from tests.processes import Cluster, busy_workers, ray_daemons, start_cluster
 
 TIMEOUT_S = 180.0
 "A run counts as hung after this plus ten times an undisturbed run's duration."
@@ -35,22 +35,24 @@ class Workspace:
     def __init__(
         self,
         scratch: Path,
+        cluster: Cluster,
+        fault: Path,
         environment: Mapping[str, str],
-        head: int,
-        address: str,
         quick: Launcher | None = None,
     ) -> None:
-        """`head`: process above the Ray cluster at `address`.
+        """`fault`: the file that CHAOS names in the processes of the cluster.
 
         `quick`: starts the jobs, and a stage that can run in one process always does; how long it
         takes with Ray's workers is not measured.
         """
         self.quick = quick is not None
         self.folder, self._intact = scratch / "here", scratch / "pristine"
-        self._fault, self._counter = scratch / "fault.json", scratch / "operations"
-        self._environment = {**environment, "CHAOS": str(self._fault)}
+        self._fault, self._counter = fault, scratch / "operations"
+        self._environment = {**environment, "CHAOS": str(fault)}
         self._launcher = quick or Launcher(scratch, self._environment)
-        self._head, self._address = head, address
+        self._cluster = cluster
+        self._others = set[int]()
+        "Busy workers of the cluster that are none of the job's that runs."
         self._baselines: dict[str, Baseline] = {}
         self._seconds: dict[tuple[str, bool], float] = {}
 
@@ -69,7 +71,8 @@ class Workspace:
     def start(
         self, stage: Stage, distributed: bool, own_cluster: bool = False, verified: bool = False
     ) -> RunningJob:
-        address = "local" if own_cluster else self._address
+        self._others = set(busy_workers(self._cluster.pid))
+        address = "local" if own_cluster else self._cluster.address
         command = stage.command(self.folder, distributed, verified)
         return self._start(stage.job, command, address)
 
@@ -83,9 +86,9 @@ class Workspace:
     def verify_output(self, stage: Stage) -> JobResult:
         """Run the stage's own check of every byte that it wrote."""
         assert stage.verify_output
-        where = stage.in_process if self.quick else ""
+        where = IN_PROCESS if self.quick else ""
         words = f"{stage.verify_output} {where}".format(here=self.folder).split()
-        return self._start(stage.job, words, self._address).end(self.timeout_s(stage))
+        return self._start(stage.job, words, self._cluster.address).end(self.timeout_s(stage))
 
     def _start(self, job: str, words: list[str], address: str) -> RunningJob:
         return self._launcher.start(job, words, **self._environment, RAY_ADDRESS=address)
@@ -96,7 +99,8 @@ class Workspace:
             return [job.pid]
         if kind.startswith("cluster"):
             return ray_daemons(job.pid)
-        return busy_workers(self._head) + busy_workers(job.pid)
+        workers = busy_workers(self._cluster.pid) + busy_workers(job.pid)
+        return [worker for worker in workers if worker not in self._others]
 
     def arm(self, kind: str, at: int) -> None:
         """Let the file operation of number `at` meet a fault; -1: only count operations."""
@@ -122,8 +126,6 @@ class Workspace:
 
     def seconds(self, stage: Stage, distributed: bool) -> float:
         """The stage's undisturbed duration; measured on first use."""
-        # Without an argument for it, Ray's workers run the stage anyway.
-        distributed = distributed and bool(stage.in_process)
         if distributed and self.quick:  # a worker starts and imports for as long at least
             return self.seconds(stage, distributed=False) + WORKER_STARTS_S
         if (stage.name, distributed) not in self._seconds:
@@ -166,15 +168,21 @@ ENVIRONMENT = {
 }
 
 
+def hooked(fault: Path) -> dict[str, str]:
+    """The environment of processes that meet the storage faults which the file `fault` asks for."""
+    paths = [PYTHON_PATH[0], *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {"CHAOS": str(fault), "PYTHONPATH": os.pathsep.join(paths)}
+
+
 @contextmanager
-def open_workspace(scratch: Path, quick: Launcher | None = None) -> Iterator[Workspace]:
+def open_workspace(scratch: Path) -> Iterator[Workspace]:
     """A workspace in an emptied folder, with a Ray cluster of its own."""
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
     scratch = scratch.resolve()
-    hook = {"CHAOS": str(scratch / "fault.json"), "PYTHONPATH": os.pathsep.join(PYTHON_PATH)}
-    with start_cluster(2, ENVIRONMENT | hook) as (head, address):
-        workspace = Workspace(scratch, ENVIRONMENT, head, address, quick)
+    fault = scratch / "fault.json"
+    with start_cluster(2, ENVIRONMENT | hooked(fault)) as cluster:
+        workspace = Workspace(scratch, cluster, fault, ENVIRONMENT)
         try:
             yield workspace
         finally:

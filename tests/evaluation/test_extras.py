@@ -127,6 +127,7 @@ def test_read_column_reads_the_records_beside_the_shards(tiny_shards: str) -> No
         breakdowns.read_column(open_shards(tiny_shards), "colour")
 
 
+@pytest.mark.slow
 def test_evaluate_measures_distances_from_positions(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

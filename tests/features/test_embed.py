@@ -58,11 +58,9 @@ def test_embed_writes_one_row_per_image(
     assert np.allclose(np.linalg.norm(table.embeddings(), axis=1), 1, atol=1e-6)
 
 
-def test_embed_rerun_embeds_missing_parts_only(
-    tmp_path: Path, tiny_shards: str, ray_cluster: None
-) -> None:
+def test_embed_rerun_embeds_missing_parts_only(tmp_path: Path, tiny_shards: str) -> None:
     settings = EmbeddingSettings(
-        shards=tiny_shards, out=str(tmp_path), split=Split.GALLERY, view=View.DRONE
+        workers=0, shards=tiny_shards, out=str(tmp_path), split=Split.GALLERY, view=View.DRONE
     )
     shards = read_manifest(tiny_shards).of(Split.GALLERY, View.DRONE)
     assert len(shards) > 1
@@ -79,11 +77,9 @@ def test_embed_rerun_embeds_missing_parts_only(
     )
 
 
-def test_embed_rejects_table_of_another_network(
-    tmp_path: Path, tiny_shards: str, ray_cluster: None
-) -> None:
+def test_embed_rejects_table_of_another_network(tmp_path: Path, tiny_shards: str) -> None:
     settings = EmbeddingSettings(
-        shards=tiny_shards, out=str(tmp_path), split=Split.QUERY, view=View.SATELLITE
+        workers=0, shards=tiny_shards, out=str(tmp_path), split=Split.QUERY, view=View.SATELLITE
     )
     embed_gallery(settings, mean_colour_encoder())
     with pytest.raises(
@@ -105,7 +101,7 @@ def test_embed_names_absent_split_or_view(tmp_path: Path, tiny_shards: str) -> N
 
 
 def test_embed_skips_and_reports_undecodable_image(
-    tmp_path: Path, tiny_shards: str, ray_cluster: None, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, tiny_shards: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Packing rejects such images; this one was changed later, with the checksums of tar and
     manifest.
@@ -118,7 +114,11 @@ def test_embed_skips_and_reports_undecodable_image(
     (tmp_path / f"{shard.name}.tar").write_bytes(data)
     update_checksum(tmp_path, shard.name)
     settings = EmbeddingSettings(
-        shards=str(tmp_path), out=str(tmp_path / "table"), split=Split.QUERY, view=View.SATELLITE
+        workers=0,
+        shards=str(tmp_path),
+        out=str(tmp_path / "table"),
+        split=Split.QUERY,
+        view=View.SATELLITE,
     )
     embed_gallery(settings, mean_colour_encoder())
     footer = read_footer(str(tmp_path / "table" / f"{shard.name}.parquet"))
@@ -133,9 +133,9 @@ def test_embed_skips_and_reports_undecodable_image(
     assert embed_gallery(settings, mean_colour_encoder()) == 0
 
 
-def test_embed_accepts_uris(tmp_path: Path, tiny_shards: str, ray_cluster: None) -> None:
+def test_embed_accepts_uris(tmp_path: Path, tiny_shards: str) -> None:
     out = (tmp_path / "table").as_uri()
     settings = EmbeddingSettings(
-        shards=Path(tiny_shards).as_uri(), out=out, split=Split.QUERY, view=View.DRONE
+        workers=0, shards=Path(tiny_shards).as_uri(), out=out, split=Split.QUERY, view=View.DRONE
     )
     assert embed_gallery(settings, mean_colour_encoder()) == open_table(out).rows > 0

@@ -120,6 +120,7 @@ def test_truncation_is_found_by_inspect_or_decode(data: bytes, share: float) -> 
         assert np.array_equal(decode(cut), decode(data))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of Pillow, over metadata that makes no sense
 @settings(max_examples=300)
 @given(

@@ -85,6 +85,7 @@ def test_resize_by_torch_gives_memory_of_its_own() -> None:
 @pytest.mark.skipif(
     not Path("/proc/self/task").exists(), reason="threads are counted as Linux shows them"
 )
+@pytest.mark.slow
 def test_resize_in_threads_starts_no_threads_of_its_own() -> None:
     script = (
         "import os, numpy, torch\n"

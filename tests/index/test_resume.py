@@ -15,6 +15,8 @@ from pipeline.index import workspace
 from pipeline.index.searcher import Index
 from tests.index.index_tables import answers, build, write_gallery
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory: pytest.TempPathFactory) -> str:

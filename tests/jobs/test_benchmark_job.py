@@ -13,6 +13,8 @@ from jobs.training.recipes import RECIPES
 from jobs.training.recipes.recipe import Recipe
 from pipeline.core.errors import InputError
 
+pytestmark = pytest.mark.slow
+
 SAME = ("start", "optimization", "augmentation", "batch_size", "joint_bn", "pair_repeats", "seed")
 OWN = ("losses", "sampler", "adversary")
 

@@ -29,6 +29,8 @@ from pipeline.core.errors import Incomplete
 from tests.launcher import Launcher, RunningJob
 from tests.processes import command_line, descendants, send_signal
 
+pytestmark = pytest.mark.slow
+
 TIMES = {"seconds", "images_per_second"}
 FLAGS = (
     "--epochs",

@@ -43,6 +43,7 @@ print(json.dumps(found))
 """
 
 
+@pytest.mark.slow
 def test_help_and_refused_flags_import_nothing_heavy() -> None:
     command = [sys.executable, "-c", HELP_OF_ALL]
     ended = subprocess.run(command, capture_output=True, cwd=ROOT, check=True, text=True)

@@ -8,6 +8,7 @@ they are frozen here.
 import socket
 from pathlib import Path
 
+import pytest
 import torch
 from torch import Tensor, nn
 from torch.multiprocessing import spawn  # type: ignore[attr-defined]
@@ -17,6 +18,8 @@ from model.checkpoint import Checkpoint
 from model.config import Optimization, PVDAConfig
 from model.schedule import ScheduleState
 from model.training import Training
+
+pytestmark = pytest.mark.slow
 
 CONFIG = PVDAConfig(
     backbone="resnet18",

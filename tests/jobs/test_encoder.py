@@ -113,10 +113,9 @@ def test_table_records_the_encoding_and_remarks_are_printed(
     tmp_path: Path,
     tiny_shards: str,
     checkpoint: bytes,
-    ray_cluster: None,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    embedding = settings_of(tiny_shards, out=str(tmp_path), split=Split.QUERY)
+    embedding = settings_of(tiny_shards, out=str(tmp_path), split=Split.QUERY, workers=0)
     spec = make_encoder_spec(checkpoint, "it", embedding, EncoderSettings(resizer="pillow"))
     embed_gallery(embedding, spec)
     assert "folded encoder in float32" in capsys.readouterr().err

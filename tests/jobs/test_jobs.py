@@ -35,6 +35,7 @@ def test_job_has_help(prepared: Launcher, job: str) -> None:
     assert "--out" in ended.output
 
 
+@pytest.mark.slow
 def test_job_runs_as_a_module() -> None:
     command = [sys.executable, "-m", "jobs.make_shards", "--help"]
     assert subprocess.run(command, capture_output=True, cwd=ROOT, check=False).returncode == 0
@@ -219,26 +220,12 @@ def test_jobs_run_the_road_and_rerun_as_no_ops(
     )
     ways = ("--multi-query", "--protocol", "queried-only")
     assert forked("evaluate", *pair, *ways, "--out", tmp_path / "pair").code == 0
-    assert (
-        forked(
-            "train",
-            "smoke",
-            "--shards",
-            tiny_shards,
-            "--out",
-            tmp_path / "run2",
-            *small,
-            "--seed",
-            5,
-        ).code
-        == 0
-    )
     mixed = forked(
         "embed_gallery",
         "--shards",
         tiny_shards,
         "--checkpoint",
-        tmp_path / "run2/last.pt",
+        "builtin",
         "--out",
         table,
     )

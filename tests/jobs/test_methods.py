@@ -17,6 +17,8 @@ from model.schedule import schedule_at
 from model.training import Training
 from tests.jobs.tiny_runs import settings
 
+pytestmark = pytest.mark.slow
+
 METHODS = (
     "instance_loss", "lcm_style", "lpn", "usam", "usam_lpn", "pcl_style", "msba_style", "fsra",
     "mccg", "sample4geo", "dac", "camp", "qdfl",

@@ -27,6 +27,8 @@ from pipeline.core import parquet
 from pipeline.core.errors import InputError
 from tests.jobs.tiny_runs import rows, settings, tiny, weights
 
+pytestmark = pytest.mark.slow
+
 
 def unlabelled(**changes: Any) -> Recipe:
     """Two rounds of two epochs, three steps each."""

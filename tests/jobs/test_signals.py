@@ -24,6 +24,8 @@ from model.checkpoint import Checkpoint, dumps
 from model.pvda import FeatureEncoder
 from tests.launcher import Launcher
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 ALL = os.environ.get("PVDA_INTERRUPTS") == "all"
 MARK = "PVDA_INTERRUPTED"

@@ -1,34 +1,34 @@
-"""`ray job submit --working-dir . -- python jobs/X.py …` against a cluster that this test starts
-and ends itself.
-"""
+"""`ray job submit --working-dir . -- python jobs/X.py …` against the session's Ray."""
 
 import os
-import shutil
-import signal
-import socket
 import subprocess
 import sys
-import tempfile
 import time
 import urllib.request
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 import pytest
 
+from tests.processes import Cluster
+
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
 
 
-def free_ports(count: int) -> list[int]:
-    sockets = [socket.socket() for _ in range(count)]
-    for one in sockets:
-        one.bind(("127.0.0.1", 0))
-    ports = [int(one.getsockname()[1]) for one in sockets]
-    for one in sockets:
-        one.close()
-    return ports
+@pytest.fixture
+def submit_environment(ray_session: Cluster) -> dict[str, str]:
+    """The environment of `ray job submit`, once the session's Ray takes jobs."""
+    environment = os.environ | {
+        "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}",
+        "RAY_API_SERVER_ADDRESS": ray_session.dashboard,
+    }
+    environment.pop("RAY_ADDRESS", None)
+    deadline = time.monotonic() + 120
+    while not takes_jobs(ray_session.dashboard):
+        assert time.monotonic() < deadline
+        time.sleep(0.2)
+    return environment
 
 
 def takes_jobs(address: str) -> bool:
@@ -37,55 +37,6 @@ def takes_jobs(address: str) -> bool:
             return bool(answered.status == 200)
     except OSError:  # it does not listen yet, or cannot tell yet
         return False
-
-
-@pytest.fixture(scope="module")
-def submit_environment() -> Iterator[dict[str, str]]:
-    """A head node of its own ports and session folder; ended by its process group, never by `ray
-    stop`.
-    """
-    port, dashboard, client = free_ports(3)
-    # Not in pytest's folder: the paths of Ray's sockets may have 107 characters.
-    scratch = Path(tempfile.mkdtemp(prefix="ray-"))
-    environment = os.environ | {
-        "RAY_AUTH_MODE": "disabled",
-        "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}",
-    }
-    environment.pop("RAY_ADDRESS", None)
-    command = [
-        str(BIN / "ray"),
-        "start",
-        "--head",
-        "--block",
-        "--node-ip-address=127.0.0.1",
-        f"--port={port}",
-        f"--dashboard-port={dashboard}",
-        f"--ray-client-server-port={client}",
-        "--num-cpus=2",
-        f"--temp-dir={scratch}",
-        "--disable-usage-stats",
-        f"--dashboard-agent-listen-port={free_ports(1)[0]}",
-    ]
-    with (scratch / "head.log").open("wb") as log:
-        head = subprocess.Popen(
-            command, env=environment, stdout=log, stderr=log, start_new_session=True
-        )
-    address = f"http://127.0.0.1:{dashboard}"
-    try:
-        deadline = time.monotonic() + 120
-        while not takes_jobs(address):
-            over = head.poll() is not None or time.monotonic() > deadline
-            assert not over, (scratch / "head.log").read_text()
-            time.sleep(0.2)
-        yield environment | {"RAY_API_SERVER_ADDRESS": address}
-    finally:
-        head.terminate()  # `--block` ends the processes that it started, and then itself
-        try:
-            head.wait(timeout=1)
-        except subprocess.TimeoutExpired:
-            os.killpg(head.pid, signal.SIGKILL)
-            head.wait()
-        shutil.rmtree(scratch, ignore_errors=True)
 
 
 def submit(environment: dict[str, str], job: str, *arguments: object) -> "subprocess.Popen[str]":

@@ -27,6 +27,8 @@ from pipeline.images.decode import DecodeError, decode
 from pipeline.shards.samples import read_samples
 from tests.jobs.tiny_runs import initial_checkpoint, rows, rows_of, settings, tiny, weights
 
+pytestmark = pytest.mark.slow
+
 
 def test_train_writes_checkpoint_curves_and_encoder(tiny_shards: str, tmp_path: Path) -> None:
     path = train(settings(tiny_shards, tmp_path, tiny()))

@@ -66,6 +66,7 @@ def fitted() -> Calibration:
     return fit_calibration(made(900, np.random.default_rng(0)), CalibrationCriteria(), GALLERY)
 
 
+@pytest.mark.slow
 def test_calibration_holds_for_unseen_photos(fitted: Calibration) -> None:
     fresh = made(900, np.random.default_rng(1))
     for low, high in ((0, 0.2), (0.2, 0.8), (0.8, 1)):
@@ -82,6 +83,7 @@ def test_calibration_holds_for_unseen_photos(fitted: Calibration) -> None:
         )
 
 
+@pytest.mark.slow
 def test_calibration_threshold_figures_hold_for_unseen_photos(
     fitted: Calibration,
 ) -> None:
@@ -101,6 +103,7 @@ def test_calibration_threshold_figures_hold_for_unseen_photos(
     assert outside > 0.8
 
 
+@pytest.mark.slow
 def test_calibration_smaller_outside_share_raises_probability(fitted: Calibration) -> None:
     data = made(900, np.random.default_rng(0))
     rare = fit_calibration(data, CalibrationCriteria(outside=0.1), GALLERY)

@@ -205,6 +205,7 @@ def test_format_distance_and_short_name() -> None:
     assert short_name("/long/way/0001/image.jpg") == "0001/image.jpg"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"
 )

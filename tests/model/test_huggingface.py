@@ -25,6 +25,7 @@ from tests.model.tiny_training import LOCATIONS, NOW, make
 NAMES = [name for name, where in BACKBONES.items() if "huggingface" in where]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "parameters", "channels", "stride"),
     [

@@ -15,6 +15,8 @@ from model.errors import CheckpointError
 from model.inference.embed import embed
 from pipeline.core.errors import InputError
 
+pytestmark = pytest.mark.slow
+
 MEAN, STD = (torch.tensor(v)[:, None, None] for v in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)))
 
 

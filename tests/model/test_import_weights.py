@@ -40,6 +40,8 @@ from tests.model.lpn_twin import (
     without,
 )
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize(
     ("blocks", "grown", "parts", "size"),
@@ -225,9 +227,7 @@ def test_import_weights_lists_names_of_another_depth(tmp_path: Path) -> None:
         import_weights(ImportWeightsSettings(torchvision=given, out=str(tmp_path / "o.pt")))
 
 
-def test_import_weights_feeds_embed_gallery(
-    tmp_path: Path, tiny_shards: str, ray_cluster: None
-) -> None:
+def test_import_weights_feeds_embed_gallery(tmp_path: Path, tiny_shards: str) -> None:
     imported(tmp_path, three_view_net(made_up()))
     table = str(tmp_path / "table")
     embed_gallery(
@@ -237,6 +237,7 @@ def test_import_weights_feeds_embed_gallery(
             out=table,
             split=Split.QUERY,
             view=View.SATELLITE,
+            workers=0,
         )
     )
     assert open_table(table).embeddings().shape == (3, 96)

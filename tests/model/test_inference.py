@@ -138,6 +138,7 @@ def test_compile_is_skipped_where_it_does_not_pay(
         )
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_compiled_encoder_equals_plain(lively_encoder: FeatureEncoder) -> None:
     encoder, said = fast(lively_encoder, compiled=True)
@@ -156,17 +157,19 @@ def test_compiled_encoder_equals_plain(lively_encoder: FeatureEncoder) -> None:
     torch.testing.assert_close(one_BE, embed(lively_encoder, images(1, seed=9)), rtol=0, atol=1e-5)
 
 
-def test_compile_without_compiler_gives_one_reason(lively_encoder: FeatureEncoder) -> None:
-    module = MirroredEncoder(lively_encoder, mirror=False)
+@pytest.mark.slow
+def test_compile_without_compiler_gives_one_reason() -> None:
+    module = torch.nn.Softmax(dim=1)
     with (
         torch._inductor.config.patch(
             {"cpp.cxx": ("/there/is/none",), "force_disable_caches": True}
         ),
         pytest.raises(NotCompiled, match=r"^[^\n]+$"),
     ):
-        compile_frozen(module, images(2))
+        compile_frozen(module, torch.rand(2, 3, 8, 8))
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_int8_agrees_on_other_images(lively_encoder: FeatureEncoder) -> None:
     pytest.importorskip("torchao", reason="int8 is optional: pip install 'pvda[int8]'")
@@ -183,6 +186,7 @@ def test_int8_agrees_on_other_images(lively_encoder: FeatureEncoder) -> None:
     assert (found_BE * embed(lively_encoder, images(5, seed=5))).sum(1).mean() > 0.99
 
 
+@pytest.mark.slow
 def test_int8_ranges_do_not_depend_on_threads(
     lively_encoder: FeatureEncoder,
 ) -> None:

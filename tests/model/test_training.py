@@ -27,6 +27,8 @@ from tests.model.tiny_training import (
     weights,
 )
 
+pytestmark = pytest.mark.slow
+
 
 def watched_step(training: Training) -> list[dict[str, dict[str, Tensor]]]:
     """One iteration; the weights before it, and after each optimiser's step in the order in which

@@ -15,6 +15,8 @@ from model.training import Training
 from model.two_views import EncoderWithClassifier
 from tests.model.tiny_training import LOCATIONS, NOW, TINY, assert_same, batch, make
 
+pytestmark = pytest.mark.slow
+
 
 def test_step_scales_each_groups_rate() -> None:
     training = make()

@@ -4,10 +4,14 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from pipeline.report.figures import write_figures
 from tests.report.test_error_map import A, B, query
 from tests.report.test_page import TOWN, jpeg
 from tests.report.test_sections import full, merged
+
+pytestmark = pytest.mark.slow
 
 VIEWS = tuple(
     {

@@ -77,6 +77,7 @@ def brute(
 SPARSE_SHARES = (-1, math.inf)  # never and always the path that gathers the entries that matter
 
 
+@pytest.mark.slow
 @given(sides(), cuts, st.integers(1, 12), st.sampled_from(SPARSE_SHARES))
 @settings(max_examples=150)
 def test_rank_equals_brute_force_for_any_block_sizes(

@@ -200,9 +200,7 @@ def test_scan_tars_skips_tars_of_another_view(foreign: str) -> None:
     assert [shard.name for shard in found] == ["part-00", "query-drone-000000"]
 
 
-def test_external_shards_are_embedded_and_resumed(
-    foreign: str, tmp_path: Path, ray_cluster: None
-) -> None:
+def test_external_shards_are_embedded_and_resumed(foreign: str, tmp_path: Path) -> None:
     def factory(threads: int) -> Encoder:
         def encode(images_B3HW: np.ndarray) -> np.ndarray:
             mean_B3 = images_B3HW.mean((2, 3)).astype(np.float32) + 1
@@ -213,7 +211,7 @@ def test_external_shards_are_embedded_and_resumed(
 
     network = EncoderSpec(fingerprint="f" * 64, encoding=ENCODING, image_size=16, factory=factory)
     out, (split, view) = str(tmp_path / "table"), TWO
-    settings = EmbeddingSettings(shards=foreign, out=out, workers=1, split=split, view=view)
+    settings = EmbeddingSettings(shards=foreign, out=out, workers=0, split=split, view=view)
     assert embed_gallery(settings, network) == 10
     assert embed_gallery(settings, network) == 0
     table = open_table(out)

@@ -188,6 +188,7 @@ def test_read_members_errors_do_not_name_the_stream() -> None:
     assert str(error.value).endswith("have it packed again with plain names")
 
 
+@pytest.mark.slow
 def test_packing_imports_neither_torch_nor_webdataset() -> None:
     code = "import sys, pipeline.shards.pack; print({'torch', 'webdataset'} & {*sys.modules})"
     command = [sys.executable, "-c", code]

@@ -123,6 +123,7 @@ def test_fly_held_out_pairs_are_a_test_set(tmp_path: Path) -> None:
         ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_fly_over_an_unusable_map_is_refused(tmp_path: Path) -> None:
     write_map(tmp_path / "map.tif", crs=None)
     with pytest.raises(InputError, match="cannot be flown over"):

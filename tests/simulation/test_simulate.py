@@ -116,6 +116,7 @@ def test_tables_hold_every_location_and_every_uav_image(
         )
 
 
+@pytest.mark.slow
 def test_interrupted_run_resumes_without_partial_locations(
     tmp_path: Path, in_process: Callable[[int | None], None]
 ) -> None:
@@ -221,6 +222,7 @@ def test_output_that_is_no_folder_is_rejected() -> None:
         )
 
 
+@pytest.mark.slow
 def test_mean_colour_alone_does_not_find_the_location() -> None:
     satellites, drones = [], []
     for location in range(1, 41):
