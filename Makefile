@@ -1,8 +1,8 @@
 # Each target sets up .venv by itself; nothing is installed outside it.
 PYTHON ?= python3
 BIN := .venv/bin
-# Processes that share the tests, of which one has the Ray; 0: this one alone.
-TEST_PROCESSES ?= 0
+# Processes that share the tests, of which two have a Ray; 0: this one alone.
+TEST_PROCESSES ?= 2
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-fast check format bench chaos

@@ -52,12 +52,14 @@ TILE_M = 55.0
 "The satellite images of the encoder's training show as much."
 
 
-def make_map(imagery: Path, side: int, seed: int) -> Pixels:
-    """A mosaic of side x side images, (H, W, 3)."""
+def make_map(imagery: Path, side: int, seed: int, number: int = 0) -> Pixels:
+    """A mosaic of side x side images, (H, W, 3); those of other `number`s share none of them."""
     files = sorted(path for path in imagery.iterdir() if path.suffix == ".jpg")
-    order = np.random.default_rng(seed).permutation(len(files))[: side * side]
-    if len(order) < side * side:
-        raise SystemExit(f"{imagery} has {len(files)} images, expected {side * side}")
+    images = side * side
+    order = np.random.default_rng(seed).permutation(len(files))[number * images :][:images]
+    if len(order) < images:
+        expected = (number + 1) * images
+        raise SystemExit(f"{imagery} has {len(files)} images, expected {expected}")
     tiles = [
         np.asarray(Image.open(files[at]).convert("RGB").resize((TILE_PX, TILE_PX))) for at in order
     ]

@@ -38,19 +38,23 @@ Truth = dict[str, GeoTag]
 "Where and how photos were taken, by their paths."
 
 
-def make_maps(options: argparse.Namespace, out: Path, seed: int) -> tuple[str, str, str | None]:
-    """A map, what photos are taken over (the same ground), and its surface model."""
+def make_maps(options: argparse.Namespace, out: Path, number: int) -> tuple[str, str, str | None]:
+    """A map, what photos are taken over (the same ground), and its surface model. Maps of different
+    numbers show different ground."""
     if options.imagery is None:
         town = make_town_map(
             TownMapSettings(
-                out=str(out), side=options.side, resolution=options.resolution, seed=seed
+                out=str(out),
+                side=options.side,
+                resolution=options.resolution,
+                seed=options.seed + number,
             )
         )
         return str(town / MAP), str(town / ANOTHER_DAY), str(town / SURFACE)
     out.mkdir(parents=True, exist_ok=True)
     path = out / "map.tif"
     if not path.exists():
-        write_map(make_map(options.imagery, options.tiles, seed), path)
+        write_map(make_map(options.imagery, options.tiles, options.seed, number), path)
     return str(path), str(path), None
 
 
@@ -61,7 +65,7 @@ def take_photos(
     flight = fly(
         MapFlightSettings(
             mosaic=over, surface=surface, out=str(out), photos=count, seed=1000 + options.seed,
-            height=tuple(options.height),
+            height=tuple(options.height), pitch=tuple(options.pitch),
         )
     )  # fmt: skip
     return {photo.path: photo.truth for photo in flight_of(str(flight / TABLE), count)}
@@ -112,12 +116,13 @@ def main() -> None:
     parser.add_argument("--checks", type=int, default=80)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--height", type=float, nargs=2, default=(60.0, 120.0), help="metres")
+    parser.add_argument("--pitch", type=float, nargs=2, default=(-90.0, -45.0), help="degrees")
     options = parser.parse_args()
     out: Path = options.out
     cluster.connect()
-    mosaic, over, surface = make_maps(options, out / "map", options.seed)
+    mosaic, over, surface = make_maps(options, out / "map", 0)
     truth = take_photos(options, over, surface, out / "photos", options.photos)
-    _, far, far_surface = make_maps(options, out / "elsewhere-map", options.seed + 100)
+    _, far, far_surface = make_maps(options, out / "elsewhere-map", 1)
     strangers = take_photos(
         options, far, far_surface, out / "elsewhere", max(1, options.photos // 4)
     )
@@ -127,6 +132,7 @@ def main() -> None:
         AdaptSettings(
             mosaic=mosaic, surface=surface, out=str(region), minutes=options.minutes,
             checks=options.checks, seed=options.seed, height=tuple(options.height),
+            pitch=tuple(options.pitch),
         )
     )  # fmt: skip
     print(f"adapt: {(time.perf_counter() - begin) / 60:.1f} minutes")

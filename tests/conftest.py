@@ -11,11 +11,11 @@ import hypothesis
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
-from tests.chaos.workspace import hooked
-from tests.launcher import ROOT, Launcher
+from tests.launcher import ROOT, Launcher, hooked
 from tests.processes import Cluster, start_cluster
 
 if TYPE_CHECKING:
+    from jobs.region.settings import AdaptSettings
     from model.pvda import FeatureEncoder
 
 # The same for every Ray process that the tests start.
@@ -36,6 +36,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 hypothesis.settings.register_profile(
     "house",
     deadline=None,
+    max_examples=50,
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
     derandomize="PVDA_FUZZ_EXAMPLES" not in os.environ,
 )
@@ -48,15 +49,17 @@ SLOW_FIXTURES = RAY_FIXTURES | {"prepared", "browser"}
 does with tests/fuzz, and with tests and files that are marked."""
 STARTS = re.compile(r"\b(ray_session|ray_cluster|ray_address|prepared)\b")
 "In a file of tests: it needs the session's Ray, or the process that starts jobs."
-START_UNIT = "files that use Ray or start jobs"
-"""Of several test processes (pytest -n), one runs them all: another would start a Ray and a
-launcher of its own. Of the others, each file is a unit."""
+RAY_UNITS = ("tests/jobs/", "tests/")
+"""Beginnings of such files' names: of several test processes (pytest -n), one runs a unit to its
+end, with a Ray and a launcher of its own. Of the others, each file is a unit."""
 
 
 @cache
 def unit_of(file: str) -> str:
     """The name of a file's unit."""
-    return START_UNIT if STARTS.search((ROOT / file).read_text()) else file
+    if not STARTS.search((ROOT / file).read_text()):
+        return file
+    return next(unit for unit in RAY_UNITS if file.startswith(unit))
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -64,8 +67,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         fuzzes = item.nodeid.startswith("tests/fuzz/")
         if fuzzes or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
-    if hasattr(config, "workerinput"):  # a process of pytest-xdist: the longest unit first
-        items.sort(key=lambda item: unit_of(item.nodeid.partition("::")[0]) != START_UNIT)
+    if hasattr(config, "workerinput"):  # a process of pytest-xdist: the longest units first
+        items.sort(key=lambda item: unit_of(item.nodeid.partition("::")[0]) not in RAY_UNITS)
 
 
 class UnitScheduling(LoadScopeScheduling):  # type: ignore[misc]
@@ -159,6 +162,31 @@ def tiny_shards(tmp_path_factory: pytest.TempPathFactory, tiny_world: Path) -> s
     settings = PackingSettings(root=str(tiny_world), out=out, samples_per_shard=8, workers=0)
     pack(University1652(), settings)
     return out
+
+
+@pytest.fixture(scope="session")
+def adapted_region(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) -> "AdaptSettings":
+    """A localizer of a town of 400 m, with a moment of training on fewer places than anybody would
+    learn from. Beside it lies the town, as benchmarks/region.py arranges them.
+    """
+    from jobs.region import flights
+    from jobs.region.adapt import adapt
+    from jobs.region.settings import AdaptSettings
+    from pipeline.simulation.over_map.settings import TownMapSettings
+    from pipeline.simulation.over_map.town_map import MAP, SURFACE, make_town_map
+
+    root = tmp_path_factory.mktemp("adapted")
+    town = make_town_map(TownMapSettings(out=str(root / "map"), side=400.0, resolution=0.5))
+    settings = AdaptSettings(
+        mosaic=str(town / MAP), surface=str(town / SURFACE), out=str(root / "region"),
+        minutes=0.01, checks=20, height=(60.0, 80.0), pitch=(-90.0, -75.0),
+    )  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(flights, "LEAST_PLACES", 24)
+        patch.setattr(flights, "TESTED_PLACES", 2)
+        patch.setattr(flights, "VIEWS", 1)
+        adapt(settings)
+    return settings
 
 
 @pytest.fixture(scope="session")

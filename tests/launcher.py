@@ -38,6 +38,12 @@ TIMEOUT_S = 300.0
 "Longest run of a job on a busy machine."
 
 
+def hooked(fault: Path) -> dict[str, str]:
+    """The environment of processes that meet the storage faults which the file `fault` asks for."""
+    paths = [PYTHON_PATH[0], *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {"CHAOS": str(fault), "PYTHONPATH": os.pathsep.join(paths)}
+
+
 @dataclass(frozen=True, kw_only=True)
 class JobResult:
     """The outcome of a run."""

@@ -65,12 +65,13 @@ CASES: dict[str, tuple[str, str]] = {
         r"without_turns \| [\d.]+% \[.*\] \| [+-][\d.]+% \[",
     ),
     "own_map": (
-        "--imagery {images} --out {out} --tiles 3 --photos 2 --height 12 16 --higher 1.5",
-        r"built-in, matched, pose: [\d.]+% within 1 m, .* of 2 photos, [\d.]+ x ImageNet's tiles"
+        "--imagery {images} --out {out} --tiles 3 --photos 1 --height 12 16 --higher 1.5",
+        r"built-in, matched, pose: [\d.]+% within 1 m, .* of 1 photos, [\d.]+ x ImageNet's tiles"
         r"(.|\n)*\| 18 to 24 \| no \| levels \|(.|\n)*levels, .* [\d.]+ x one level's photos",
     ),
     "region": (
-        "--out {out} --side 600 --resolution 0.6 --minutes 0 --photos 1 --checks 20 --height 60 80",
+        "--out {adapted} --side 400 --resolution 0.5 --minutes 0.01 --photos 1 --checks 20 "
+        "--height 60 80 --pitch -90 -75",
         r"\| after, without \| [\d.]+% \|.* [\d.]+ x \|",
     ),
     "serve": (
@@ -159,6 +160,8 @@ def test_script_prints_a_ratio(
         folders["images"] = request.getfixturevalue("images")
     if "{tiny}" in arguments:
         folders["tiny"] = Path(request.getfixturevalue("tiny_shards"))
+    if "{adapted}" in arguments:
+        folders["adapted"] = Path(request.getfixturevalue("adapted_region").out).parent
     if "{trained}" in arguments:
         folders["trained"] = request.getfixturevalue("trained")[0]
     output = run(prepared, name, arguments, **folders)

@@ -12,12 +12,11 @@ from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("pipeline", "model", "jobs")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
+ROOMS = sorted({path.parent for path in SOURCES})
 ALL = [*SOURCES, *TESTS, *sorted((ROOT / "benchmarks").rglob("*.py"))]
 TOP = {"pipeline": {"pipeline"}, "model": {"model"}, "jobs": {"jobs", "pipeline", "model"}}
 FOREIGN_TO_MODEL = {"ray", "webdataset", "pyarrow", "faiss", "fsspec"}
@@ -108,25 +107,25 @@ def public_names(path: Path) -> list[str]:
     return [name for name in names if not name.startswith("_")]
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=module_of)
-def test_packages_import_in_one_direction(path: Path) -> None:
-    own = path.relative_to(ROOT).parts[0]
-    reached = {name.split(".")[0] for name in imports_of(path)}
-    assert reached & set(PACKAGES) <= TOP[own]
-    if own == "model":
-        assert not reached & FOREIGN_TO_MODEL
+def test_packages_import_in_one_direction() -> None:
+    for path in SOURCES:
+        own = path.relative_to(ROOT).parts[0]
+        reached = {name.split(".")[0] for name in imports_of(path)}
+        assert reached & set(PACKAGES) <= TOP[own], module_of(path)
+        assert own != "model" or not reached & FOREIGN_TO_MODEL, module_of(path)
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=module_of)
-def test_rooms_import_by_the_table(path: Path) -> None:
-    own = room_of(module_of(path))
-    if not own:
-        assert path.parts[-2] != "pipeline" or path.name == "__init__.py", "a module outside rooms"
-        return
-    reached = {room_of(own_module(name)) for name in imports_of(path)} - {"", own}
-    assert reached <= MAY_IMPORT[own]
-    for room in reached:
-        assert path.stem in ONLY_FROM.get((own, room), {path.stem})
+def test_rooms_import_by_the_table() -> None:
+    for path in SOURCES:
+        own = room_of(module_of(path))
+        if not own:
+            alone = path.parts[-2] == "pipeline" and path.name != "__init__.py"
+            assert not alone, f"{path} is a module outside rooms"
+            continue
+        reached = {room_of(own_module(name)) for name in imports_of(path)} - {"", own}
+        assert reached <= MAY_IMPORT[own], module_of(path)
+        for room in reached:
+            assert path.stem in ONLY_FROM.get((own, room), {path.stem}), module_of(path)
 
 
 def test_there_is_no_import_cycle() -> None:
@@ -142,54 +141,46 @@ def test_rooms_depend_on_each_other_without_a_cycle() -> None:
     assert list(TopologicalSorter(MAY_IMPORT).static_order())
 
 
-@pytest.mark.parametrize("path", ALL, ids=module_of)
-def test_a_file_fits_one_sitting(path: Path) -> None:
-    text = path.read_text()
-    assert text.count("\n") <= MOST_LINES
-    assert max(map(len, text.split("\n"))) <= MOST_COLUMNS
-    assert path.name not in {"utils.py", "common.py", "helpers.py"}
-    if path.name != "__init__.py" or path in SOURCES:
-        assert ast.get_docstring(parsed(path)), "no module docstring"
+def test_a_file_fits_one_sitting() -> None:
+    for path in ALL:
+        text = path.read_text()
+        assert text.count("\n") <= MOST_LINES, path
+        assert max(map(len, text.split("\n"))) <= MOST_COLUMNS, path
+        assert path.name not in {"utils.py", "common.py", "helpers.py"}
+        if path.name != "__init__.py" or path in SOURCES:
+            assert ast.get_docstring(parsed(path)), f"{path} has no module docstring"
 
 
-@pytest.mark.parametrize(
-    "room", sorted({path.parent for path in SOURCES}), ids=lambda path: path.name
-)
-def test_a_room_has_a_door_and_no_crowd(room: Path) -> None:
-    files = [path for path in room.glob("*.py") if path.name != "__init__.py"]
-    assert len(files) <= (MOST_JOBS if room.name == "jobs" else MOST_FILES)
-    door = ast.get_docstring(ast.parse((room / "__init__.py").read_text())) or ""
-    assert len(door.splitlines()) >= (5 if room.parent.name == "pipeline" else 1)
+def test_a_room_has_a_door_and_no_crowd() -> None:
+    for room in ROOMS:
+        files = [path for path in room.glob("*.py") if path.name != "__init__.py"]
+        assert len(files) <= (MOST_JOBS if room.name == "jobs" else MOST_FILES), room
+        door = ast.get_docstring(parsed(room / "__init__.py")) or ""
+        assert len(door.splitlines()) >= (5 if room.parent.name == "pipeline" else 1), room
 
 
-@pytest.mark.parametrize(
-    "room", sorted({path.parent for path in SOURCES}), ids=lambda path: path.name
-)
-def test_a_public_name_is_unique_within_its_room(room: Path) -> None:
-    if room.name == "jobs":  # each entry script has its own main and Settings
-        return
-    names = Counter(name for path in sorted(room.glob("*.py")) for name in set(public_names(path)))
-    assert not [name for name, count in names.items() if count > 1]
+def test_a_public_name_is_unique_within_its_room() -> None:
+    for room in ROOMS:
+        if room.name == "jobs":  # each entry script has its own main and Settings
+            continue
+        files = sorted(room.glob("*.py"))
+        names = Counter(name for path in files for name in set(public_names(path)))
+        assert not [name for name, count in names.items() if count > 1], room
 
 
-@pytest.mark.parametrize("path", TESTS, ids=module_of)
-def test_a_test_name_is_short(path: Path) -> None:
-    names = [name for name in public_names(path) if name.startswith("test_")]
-    assert not [name for name in names if len(name) > LONGEST_TEST_NAME]
-    assert len(names) == len(set(names)), "a test hides another of the same name"
+def test_a_test_name_is_short() -> None:
+    for path in TESTS:
+        names = [name for name in public_names(path) if name.startswith("test_")]
+        assert not [name for name in names if len(name) > LONGEST_TEST_NAME], path
+        assert len(names) == len(set(names)), f"a test of {path} hides another of the same name"
 
 
-@pytest.mark.parametrize(
-    "path", [path for path in SOURCES if path.parts[-2] == "jobs"], ids=module_of
-)
-def test_importing_a_job_does_nothing(path: Path) -> None:
+def test_importing_a_job_does_nothing() -> None:
     """At a module's top stand imports, definitions, constants and the guard: no bare call."""
-    calls = [
-        node
-        for node in parsed(path).body
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
-    ]
-    assert not calls
+    for path in (ROOT / "jobs").glob("*.py"):
+        for node in parsed(path).body:
+            call = isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
+            assert not call, path
 
 
 def test_every_dependency_says_why() -> None:

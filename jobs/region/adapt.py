@@ -122,8 +122,11 @@ def _cameras(settings: AdaptSettings) -> CameraRanges:
 
 def _index(region: Region) -> None:
     table = region.path("table")
-    print_command("embed_gallery", shards=region.tiles, checkpoint=region.encoder, out=table)
-    embedding = EmbeddingSettings(shards=region.tiles, out=table)
+    print_command(
+        "embed_gallery", shards=region.tiles, checkpoint=region.encoder, out=table, workers=0
+    )
+    # The tiles are of our own making: nothing that a worker has to be risked for.
+    embedding = EmbeddingSettings(shards=region.tiles, out=table, workers=0)
     data = read_checkpoint_bytes(region.encoder)
     embed_gallery(embedding, make_encoder_spec(data, region.encoder, embedding))
     print_command("build_index", table=table, out=region.index)

@@ -1,7 +1,6 @@
 """Where a campaign runs its stages: intact folders, a scratch folder to damage, a Ray cluster."""
 
 import json
-import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -10,7 +9,7 @@ from pathlib import Path
 
 from tests.chaos.faults import STORAGE
 from tests.chaos.stages import IN_PROCESS, Content, Stage
-from tests.launcher import PYTHON_PATH, JobResult, Launcher, RunningJob
+from tests.launcher import JobResult, Launcher, RunningJob, hooked
 from tests.processes import Cluster, busy_workers, ray_daemons, start_cluster
 
 TIMEOUT_S = 180.0
@@ -166,12 +165,6 @@ ENVIRONMENT = {
     # Ray gives a lost cluster up after a minute otherwise.
     "RAY_gcs_rpc_server_reconnect_timeout_s": "5",
 }
-
-
-def hooked(fault: Path) -> dict[str, str]:
-    """The environment of processes that meet the storage faults which the file `fault` asks for."""
-    paths = [PYTHON_PATH[0], *filter(None, [os.environ.get("PYTHONPATH")])]
-    return {"CHAOS": str(fault), "PYTHONPATH": os.pathsep.join(paths)}
 
 
 @contextmanager

@@ -1,5 +1,8 @@
 """Features to the field's .mat file and back, the challenge's answer file, and invalid files."""
 
+import io
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +16,35 @@ from pipeline.core.records import Split, View
 from pipeline.evaluation import exports
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.settings import EvaluationSettings
+from pipeline.features import mat_file
 from pipeline.features.import_mat import import_features
 from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.features.settings import ImportSettings
 from pipeline.features.table import open_table
 from tests.evaluation.test_evaluate import TEST_SET, made_table
 
-pytestmark = pytest.mark.slow
-
 FIGURES = ("queries", "gallery", "r1", "r5", "r10", "r1p", "ap")
+
+
+@pytest.fixture
+def read_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reader's code runs in this process: a new one takes a second to start."""
+
+    def run(command: list[str], **options: Any) -> subprocess.CompletedProcess[bytes]:
+        out, error = io.BytesIO(), io.BytesIO()
+        with monkeypatch.context() as patch:
+            for name, stream in (
+                ("stdin", io.BytesIO(options["input"])),
+                ("stdout", out),
+                ("stderr", error),
+            ):
+                patch.setattr(sys, name, io.TextIOWrapper(stream, write_through=True))
+            code = mat_file.main()
+            for name in ("stdin", "stdout", "stderr"):
+                getattr(sys, name).detach()
+        return subprocess.CompletedProcess(command, code, out.getvalue(), error.getvalue())
+
+    monkeypatch.setattr(subprocess, "run", run)
 
 
 def saved(path: Path, **changed: Any) -> str:
@@ -40,6 +63,7 @@ def saved(path: Path, **changed: Any) -> str:
     return str(path)
 
 
+@pytest.mark.slow
 def test_import_mat_round_trip_keeps_measures(tmp_path: Path) -> None:
     queries, gallery = (
         made_table(tmp_path / "q", TEST_SET[:1]),
@@ -74,6 +98,7 @@ def test_import_mat_round_trip_keeps_measures(tmp_path: Path) -> None:
     assert [len(line.split("\t")) for line in lines] == [10] * 10
 
 
+@pytest.mark.usefixtures("read_here")
 @pytest.mark.parametrize(
     ("stated", "judgement"),
     [
@@ -91,6 +116,7 @@ def test_import_mat_judges_stated_figures(
     assert f"stated R@1 {stated[0]:.2f} and AP {stated[1]:.2f}: {judgement}" in printed
 
 
+@pytest.mark.usefixtures("read_here")
 def test_import_mat_judges_nothing_of_several_matches(tmp_path: Path) -> None:
     written = import_features(
         ImportSettings(
@@ -102,6 +128,7 @@ def test_import_mat_judges_nothing_of_several_matches(tmp_path: Path) -> None:
     assert "not judged, since queries have up to 2 true matches" in sentence
 
 
+@pytest.mark.usefixtures("read_here")
 def test_import_mat_locations_from_paths_or_labels(tmp_path: Path) -> None:
     import_features(ImportSettings(mat=saved(tmp_path / "p.mat"), out=str(tmp_path / "p")))
     table = open_table(str(tmp_path / "p" / "gallery"))
@@ -119,6 +146,7 @@ def test_import_mat_locations_from_paths_or_labels(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.usefixtures("read_here")
 @pytest.mark.parametrize("cells", [False, True])
 def test_import_mat_takes_text_labels_as_names(tmp_path: Path, cells: bool) -> None:
     """Names of unlike length, as a matrix of padded characters or as cells."""
@@ -134,12 +162,14 @@ def test_import_mat_takes_text_labels_as_names(tmp_path: Path, cells: bool) -> N
         assert table.labels().locations.tolist() == ["tower", "07"]
 
 
+@pytest.mark.usefixtures("read_here")
 def test_import_mat_takes_whole_floats_as_numbers(tmp_path: Path) -> None:
     mat = saved(tmp_path / "f.mat", query_label=[839.0, 7.0], query_path=None)
     import_features(ImportSettings(mat=mat, out=str(tmp_path / "f")))
     assert open_table(str(tmp_path / "f" / "queries")).labels().locations.tolist() == ["839", "7"]
 
 
+@pytest.mark.usefixtures("read_here")
 def test_import_mat_views_from_paths(tmp_path: Path) -> None:
     turned = {
         "query_path": ["/d/query_satellite/0839/a.jpg", "/d/query_satellite/0007/b.jpg"],
@@ -152,11 +182,13 @@ def test_import_mat_views_from_paths(tmp_path: Path) -> None:
     assert open_table(str(tmp_path / "t" / "gallery")).counts == {(Split.GALLERY, View.DRONE): 3}
 
 
+@pytest.mark.usefixtures("read_here")
 def test_import_mat_drops_junk_as_official_code(tmp_path: Path) -> None:
     mat = saved(tmp_path / "j.mat", gallery_label=[839, -1, 7])
     assert import_features(ImportSettings(mat=mat, out=str(tmp_path / "j")))["gallery"][1] == 2
 
 
+@pytest.mark.usefixtures("read_here")
 @pytest.mark.parametrize(
     ("changed", "sentence"),
     [

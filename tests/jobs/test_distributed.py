@@ -11,7 +11,10 @@ from pathlib import Path
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.multiprocessing import spawn  # type: ignore[attr-defined]
+from torch.multiprocessing import (  # type: ignore[attr-defined]
+    set_forkserver_preload,
+    start_processes,
+)
 
 from jobs.training.ray_group import broadcast_from_first, wrap_ddp
 from model.checkpoint import Checkpoint
@@ -93,7 +96,8 @@ def test_two_workers_have_the_gradients_of_one(
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = int(free.getsockname()[1])
-    spawn(work, (port, str(tmp_path)), nprocs=WORKERS)  # type: ignore[no-untyped-call]
+    set_forkserver_preload([__name__])  # imports it once for both
+    start_processes(work, (port, str(tmp_path)), WORKERS, start_method="forkserver")
     torch.manual_seed(0)
     alone = frozen(Training(CONFIG, Optimization(), LOCATIONS))
     for _ in range(2):

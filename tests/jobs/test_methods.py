@@ -89,7 +89,11 @@ def test_fsra_trains_from_its_public_weights(tmp_path: Path, tiny_shards: str) -
         schedule=replace(recipe.schedule, epochs=1),
         batch_size=2,
     )
-    path = train(settings(tiny_shards, tmp_path / "run", recipe, weights=str(tmp_path / "vit.pth")))
+    given = settings(
+        tiny_shards, tmp_path / "run", recipe, weights=str(tmp_path / "vit.pth"),
+        checkpoint_minutes=60.0,
+    )  # fmt: skip
+    path = train(given)
     trained = loads(Path(path).read_bytes())
     assert trained.history[0]["triplet_loss"] >= 0
     encoder = build_encoder(trained)

@@ -2,7 +2,6 @@
 what is refused."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,43 +9,15 @@ import numpy as np
 import pytest
 
 from jobs.encoding.localizer import with_localizer
-from jobs.region import flights
 from jobs.region.adapt import PAGE, adapt
 from jobs.region.settings import AdaptSettings
 from jobs.stages.settings import LocateSettings
 from model.weights.builtin import BUILTIN
 from pipeline.core.errors import InputError
-from pipeline.simulation.over_map.settings import TownMapSettings
-from pipeline.simulation.over_map.town_map import MAP, SURFACE, make_town_map
 
 
-@pytest.fixture(scope="module")
-def small() -> Iterator[None]:
-    """Fewer places than anybody would learn from."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(flights, "LEAST_PLACES", 24)
-        patch.setattr(flights, "TESTED_PLACES", 4)
-        patch.setattr(flights, "VIEWS", 1)
-        yield
-
-
-@pytest.fixture(scope="module")
-def settings(
-    tmp_path_factory: pytest.TempPathFactory, ray_cluster: None, small: None
-) -> AdaptSettings:
-    """A region of a town of 400 m, with a moment of training."""
-    root = tmp_path_factory.mktemp("adapt")
-    town = make_town_map(TownMapSettings(out=str(root / "town"), side=400.0, resolution=0.5))
-    given = AdaptSettings(
-        mosaic=str(town / MAP), surface=str(town / SURFACE), out=str(root / "region"),
-        minutes=0.01, checks=20, height=(60.0, 80.0), pitch=(-90.0, -75.0),
-    )  # fmt: skip
-    adapt(given)
-    return given
-
-
-def test_adapt_makes_a_localizer_and_says_what_to_expect(settings: AdaptSettings) -> None:
-    out = Path(settings.out)
+def test_adapt_makes_a_localizer_and_says_what_to_expect(adapted_region: AdaptSettings) -> None:
+    out = Path(adapted_region.out)
     assert "What to expect of map.tif" in (out / PAGE).read_text()
     figures = json.loads((out / "expect" / "figures.json").read_text())
     assert [one["photos"] for one in figures["expectations"][:2]] == [20, 20]
@@ -66,13 +37,13 @@ def test_adapt_makes_a_localizer_and_says_what_to_expect(settings: AdaptSettings
     (out / "elsewhere.json").rename(out / "index" / "localizer.json")
 
 
-def test_adapt_again_makes_nothing_anew(settings: AdaptSettings) -> None:
-    made = [path for path in Path(settings.out).rglob("*") if path.is_file()]
+def test_adapt_again_makes_nothing_anew(adapted_region: AdaptSettings) -> None:
+    made = [path for path in Path(adapted_region.out).rglob("*") if path.is_file()]
     kept = {path: path.stat().st_mtime_ns for path in made}
-    adapt(settings)
+    adapt(adapted_region)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
     with pytest.raises(InputError, match="adapted with another seed"):
-        adapt(replace(settings, seed=1))
+        adapt(replace(adapted_region, seed=1))
 
 
 def test_adapt_without_a_map_is_refused(tmp_path: Path) -> None:
