@@ -15,7 +15,7 @@ install: .venv/installed  ## install the project and its pinned dependencies int
 demo: .venv/installed  ## the complete road on simulated flights: at most six minutes on two cores
 	$(BIN)/python jobs/demo.py --out runs/demo
 
-test: .venv/installed  ## all tests: at most 22 minutes on two quiet cores
+test: .venv/installed  ## all tests, shared by two processes
 	$(BIN)/pytest -n $(TEST_PROCESSES) --no-loadscope-reorder
 
 test-fast: .venv/installed  ## the tests without Ray, training, fuzzing and browsers: minutes
