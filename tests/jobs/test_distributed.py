@@ -97,7 +97,9 @@ def test_two_workers_have_the_gradients_of_one(
         free.bind(("127.0.0.1", 0))
         port = int(free.getsockname()[1])
     set_forkserver_preload([__name__])  # imports it once for both
-    start_processes(work, (port, str(tmp_path)), WORKERS, start_method="forkserver")
+    start_processes(  # type: ignore[no-untyped-call]
+        work, (port, str(tmp_path)), WORKERS, start_method="forkserver"
+    )
     torch.manual_seed(0)
     alone = frozen(Training(CONFIG, Optimization(), LOCATIONS))
     for _ in range(2):
