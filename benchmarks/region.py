@@ -6,19 +6,24 @@
 The map is a mosaic of overhead images, or a town with its surface model. Photos of another seed
 (over the town: of another day's sun, season and haze, with relief) are then located with the
 camera's tags (heading wrong by 3 degrees, pitch by 1, height by 3 %) and without: before (the
-built-in encoder, tiles alone, then matched, without any fitting) and after `adapt`. Beside it: what
-`adapt` promised, photos of another map, and how often matching makes a right tile's answer worse.
+built-in encoder, tiles alone, then matched, without any fitting) and after `adapt`; matched around
+the first candidate alone; and by plain SIFT over the whole map. Beside it: what `adapt` promised,
+photos of another map, and how often matching makes a right tile's answer worse.
 """
 
 import argparse
 import json
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from own_map import make_index, make_map, write_map
+from PIL import Image
+from whole_map import open_whole_map
 
 from jobs.region.adapt import adapt
 from jobs.region.expect import outcome_of
@@ -28,7 +33,9 @@ from jobs.stages.locate import locate_photos
 from jobs.stages.settings import LocateSettings
 from model.weights.builtin import BUILTIN
 from pipeline.core import cluster
+from pipeline.core.geo import haversine_m
 from pipeline.core.records import GeoTag
+from pipeline.locate import refined
 from pipeline.region.expectation import Expectation, Outcome, expect
 from pipeline.simulation.over_map.fly import TABLE, fly
 from pipeline.simulation.over_map.settings import MapFlightSettings, TownMapSettings
@@ -78,6 +85,36 @@ def locate_all(settings: LocateSettings, truth: Truth) -> tuple[list[Outcome], f
     seconds = (time.perf_counter() - begin) / len(truth)
     outcomes = [outcome_of(located[path], tag, settings.pose) for path, tag in truth.items()]
     return outcomes, seconds
+
+
+def locate_by_sift(mosaic: str, truth: Truth) -> tuple[list[Outcome], float]:
+    """The outcomes of plain SIFT over the whole map, and the seconds a photo; the map's features
+    are found before."""
+    whole, outcomes = open_whole_map(Path(mosaic)), []
+    begin = time.perf_counter()
+    for path, tag in truth.items():
+        place = whole.place(np.asarray(Image.open(path).convert("RGB")))
+        error_m = math.inf
+        if place is not None:
+            error_m = float(haversine_m(np.array(place), np.array((tag.lat, tag.lon))))
+        outcomes.append(
+            Outcome(
+                name=path, error_m=error_m, known=place is not None, probability=None,
+                within_m=None, refined=place is not None, posed=False, height_m=tag.altitude_m or 0,
+                pitch_deg=tag.pitch_deg or 0,
+            )
+        )  # fmt: skip
+    return outcomes, (time.perf_counter() - begin) / len(truth)
+
+
+@contextmanager
+def windows_per_photo(count: int) -> Iterator[None]:
+    """Matching tries so many windows of the map."""
+    usual, refined.MOST_WINDOWS = refined.MOST_WINDOWS, count
+    try:
+        yield
+    finally:
+        refined.MOST_WINDOWS = usual
 
 
 def print_row(name: str, outcomes: Sequence[Outcome], seconds: float, baseline: float) -> float:
@@ -162,6 +199,10 @@ def main() -> None:
                 seen[posed] = found
             elif name == "after, tiles":
                 by_tiles[posed] = found
+        with windows_per_photo(1):
+            first = locate_all(replace(after, match=True, pose=posed), truth)
+        print_row(f"after, around the first candidate alone, {way}", *first, baseline)
+    print_row("plain SIFT over the whole map, without", *locate_by_sift(mosaic, truth), baseline)
     print_promises(promised, seen)
     pairs = [
         pair for posed in seen for pair in zip(by_tiles[posed], seen[posed], strict=True)

@@ -11,7 +11,7 @@ import ray
 from tests.launcher import ROOT, Launcher
 
 FOLDER = ROOT / "benchmarks"
-HELPERS = {"synthetic", "ablation_data", "embedding_worker", "gpu_measurements"}
+HELPERS = {"synthetic", "ablation_data", "embedding_worker", "gpu_measurements", "whole_map"}
 "Modules that other benchmarks import."
 RESNET = "--backbone resnet18 --width 0.25 --size 128"
 "The smallest network of the embedding benchmarks."
@@ -22,6 +22,10 @@ CASES: dict[str, tuple[str, str]] = {
         "--textures {images} --out {out} --seeds 1 --period 1 --recipes paper --town-epochs 1 "
         "--scale 0.01",
         r"1 seeds: d2s_r1 \d",
+    ),
+    "big_map": (
+        "--out {out} --side-px 2000 --resolution 0.1 --photos 1",
+        r"locate \| 200 .* \| 1.00 x(.|\n)*locate \| 2,000 .* [\d.]+ x \|",
     ),
     "damage": (
         "--rows 512 --depth 18 --repeats 1",
@@ -72,7 +76,8 @@ CASES: dict[str, tuple[str, str]] = {
     "region": (
         "--out {adapted} --side 400 --resolution 0.5 --minutes 0.01 --photos 1 --checks 20 "
         "--height 60 80 --pitch -90 -75",
-        r"\| after, without \| [\d.]+% \|.* [\d.]+ x \|",
+        r"\| after, without \| [\d.]+% \|.* [\d.]+ x \|(.|\n)*"
+        r"\| plain SIFT over the whole map, without .* [\d.]+ x \|",
     ),
     "serve": (
         "--checkpoint {trained}/run/last.pt --index {trained}/index "
