@@ -3,7 +3,8 @@ REGION [--minutes 20]`
 
 Makes tiles, flies simulated UAVs over the map, fine-tunes the built-in encoder, builds the index,
 fits its confidence, and writes REGION/what_to_expect.html. Then: `locate.py --index REGION/index
---out where.geojson PHOTO...`
+--out where.geojson PHOTO...`. A neighbouring map joins it by `adapt.py --extend --mosaic more.tif
+--out REGION`.
 """
 
 from jobs.command_line.cli import run
@@ -15,8 +16,12 @@ def main(settings: AdaptSettings) -> None:
     confidence, and a page that says what to expect.
     """
     from jobs.region.adapt import adapt
+    from jobs.region.extend import extend_region
 
-    adapt(settings)
+    if settings.extend:
+        extend_region(settings)
+    else:
+        adapt(settings)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from rich.table import Table
 from jobs.encoding.encoder import make_encoder_spec, read_checkpoint_bytes
 from jobs.encoding.localizer import write_localizer
 from jobs.region.expect import located_outcomes, lookalikes, real_photos
-from jobs.region.flights import plan_flights, take_flight
+from jobs.region.flights import CHECK, EXPECT, plan_flights, take_flight
 from jobs.region.folder import Region, claim, print_command, with_absolute_paths
 from jobs.region.settings import AdaptSettings
 from jobs.region.tuning import choose_encoder
@@ -72,7 +72,7 @@ def adapt(settings: AdaptSettings) -> list[Expectation]:
         results.print(f"{region.out} is complete; nothing to do", soft_wrap=True)
         return found
     seconds: dict[str, float] = {}
-    cameras = _cameras(settings)
+    cameras = camera_ranges(settings)
     with step(seconds, "1 tiles", "the map as a gallery"):
         print_command("make_shards", source="geotiff", root=settings.mosaic, out=region.tiles,
                  tile_m=settings.tile_m, overlap=OVERLAP)  # fmt: skip
@@ -84,29 +84,25 @@ def adapt(settings: AdaptSettings) -> list[Expectation]:
     with step(seconds, "3 encoder", "the built-in one, fine-tuned on this map"):
         choose_encoder(region, settings.minutes, *flights[:2])
     with step(seconds, "4 index", "the tiles embedded and indexed"):
-        _index(region)
+        embed_tiles(region)
+        print_command("build_index", table=region.table, out=region.index)
+        build_index(IndexSettings(table=region.table, out=region.index))
     with step(seconds, "5 confidence", "fitted on photos of places that were not learned"):
-        flight = storage.join(flights[2], TABLE)
-        fitting = CalibrateSettings(
-            checkpoint=region.encoder, shards=region.tiles, index=region.index, flight=flight
-        )
-        print_command("calibrate", checkpoint=region.encoder, shards=region.tiles,
-                      index=region.index, flight=flight)  # fmt: skip
-        calibrate_index(fitting)
+        fit_confidence(region)
     with step(seconds, "6 what to expect", "other photos of such places, located"):
-        outcomes = located_outcomes(region, storage.join(flights[3], TABLE), settings.checks)
+        outcomes = located_outcomes(region, [storage.join(flights[3], TABLE)], settings.checks)
         real = real_photos(region, settings.photos)
         found = expectations(outcomes)
     write_localizer(region.index, "../encoder.safetensors", "../tiles")
-    _write_page(region, settings, seconds, found, outcomes, real)
+    write_page(region, settings, seconds, found, outcomes, real, [settings.mosaic], [EXPECT])
     results.print(expectation_table([*found, *([real] if real else [])]))
     results.print(
-        f"what to expect: {region.path(PAGE)}\nnow: {_locate_command(region)}", soft_wrap=True
+        f"what to expect: {region.path(PAGE)}\nnow: {locate_command(region)}", soft_wrap=True
     )
     return found
 
 
-def _cameras(settings: AdaptSettings) -> CameraRanges:
+def camera_ranges(settings: AdaptSettings) -> CameraRanges:
     """How the simulated UAV flies: as its photos' tags say, else by the settings."""
     if settings.photos is None:
         return settings
@@ -120,40 +116,52 @@ def _cameras(settings: AdaptSettings) -> CameraRanges:
     return found
 
 
-def _index(region: Region) -> None:
-    table = region.path("table")
+def embed_tiles(region: Region) -> None:
+    """The tiles that have no row of the feature table yet."""
     print_command(
-        "embed_gallery", shards=region.tiles, checkpoint=region.encoder, out=table, workers=0
+        "embed_gallery", shards=region.tiles, checkpoint=region.encoder, out=region.table, workers=0
     )
     # The tiles are of our own making: nothing that a worker has to be risked for.
-    embedding = EmbeddingSettings(shards=region.tiles, out=table, workers=0)
+    embedding = EmbeddingSettings(shards=region.tiles, out=region.table, workers=0)
     data = read_checkpoint_bytes(region.encoder)
     embed_gallery(embedding, make_encoder_spec(data, region.encoder, embedding))
-    print_command("build_index", table=table, out=region.index)
-    build_index(IndexSettings(table=table, out=region.index))
 
 
-def _locate_command(region: Region) -> str:
+def fit_confidence(region: Region) -> None:
+    """The calibration, by the flight that is there for it; again where the gallery has changed."""
+    flight = region.path("flights", CHECK, TABLE)
+    fitting = CalibrateSettings(
+        checkpoint=region.encoder, shards=region.tiles, index=region.index, flight=flight
+    )
+    print_command("calibrate", checkpoint=region.encoder, shards=region.tiles,
+                  index=region.index, flight=flight)  # fmt: skip
+    calibrate_index(fitting)
+
+
+def locate_command(region: Region) -> str:
     return f"pvda locate --index {region.index} --out where.geojson --page where.html PHOTO..."
 
 
-def _write_page(
+def write_page(
     region: Region,
     settings: AdaptSettings,
     seconds: dict[str, float],
     found: list[Expectation],
     outcomes: list[Outcome],
     real: Expectation | None,
+    maps: Sequence[str],
+    flights: Sequence[str],
 ) -> None:
+    """Write the page, and the figures, by which the region counts as complete for these maps."""
     page = RegionPage(
-        name=settings.mosaic.rpartition("/")[2],
+        name=" and ".join(one.rpartition("/")[2] for one in maps),
         flat=settings.surface is None,
         expectations=found,
         real=real,
         outcomes=outcomes,
         lookalikes=lookalikes(region, settings.tile_m),
         seconds=seconds,
-        commands=[_locate_command(region)],
+        commands=[locate_command(region)],
     )
 
     def load_photos(paths: Iterable[str]) -> dict[str, bytes]:
@@ -163,6 +171,8 @@ def _write_page(
     storage.write_bytes(region.path(PAGE), html.encode())
     rows = [*found, *([real] if real else [])]
     figures = {
+        "maps": list(maps),
+        "flights": list(flights),
         "expectations": [asdict(one) for one in rows],
         "outcomes": [asdict(one) for one in outcomes],
     }

@@ -1,7 +1,7 @@
 """Photos of known places, located by a region: what can be expected of it."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -23,9 +23,11 @@ LOOKALIKES, LOOKALIKE_ROWS, APART_TILES = 6, 1000, 3
 at least apart."""
 
 
-def located_outcomes(region: Region, table: str, most: int) -> list[Outcome]:
-    """The photos of a table located with and without their tags, against the truth."""
-    truths = {photo.path: photo.truth for photo in flight_of(table, most)}
+def located_outcomes(region: Region, tables: Sequence[str], most: int) -> list[Outcome]:
+    """The photos of tables, at most `most` of each, located with and without their tags, against
+    the truth."""
+    photos = [photo for table in tables for photo in flight_of(table, most)]
+    truths = {photo.path: photo.truth for photo in photos}
     return [
         outcome
         for posed, way in ((True, "with-tags"), (False, "without-tags"))
@@ -79,7 +81,7 @@ def outcome_of(one: LocatedPhoto, truth: GeoTag, posed: bool) -> Outcome:
 
 def lookalikes(region: Region, tile_m: float) -> list[Lookalike]:
     index = Index(region.index)
-    table = open_table(region.path("table")).select(None, View.SATELLITE)
+    table = open_table(region.table).select(None, View.SATELLITE)
     labels = table.labels()
     rows = np.unique(np.linspace(0, table.rows - 1, min(table.rows, LOOKALIKE_ROWS)).astype(int))
     positions_N2 = np.stack([labels.lats, labels.lons], axis=1)[rows]

@@ -11,6 +11,8 @@ from pipeline.simulation.over_map.fly import TABLE, fly
 from pipeline.simulation.over_map.settings import CameraRanges, MapFlightSettings
 from pipeline.sources.table import Table
 
+LEARN, CHOOSE, CHECK, EXPECT = "learn", "choose", "check", "expect"
+"Folders of the flights."
 VIEWS = 4
 "Photos of each place to learn from."
 PLACES_PER_MINUTE, LEAST_PLACES, MOST_PLACES = 20, 48, 400
@@ -34,10 +36,10 @@ def plan_flights(
     pairs = replace(base, overhead_m=settings.tile_m, size=LEARN_PX)
     places = min(MOST_PLACES, max(LEAST_PLACES, round(settings.minutes * PLACES_PER_MINUTE)))
     flights = {
-        "learn": replace(pairs, part="learn", photos=places * VIEWS, views=VIEWS),
-        "choose": replace(pairs, photos=2 * TESTED_PLACES, views=2),
-        "check": base,
-        "expect": base,
+        LEARN: replace(pairs, part="learn", photos=places * VIEWS, views=VIEWS),
+        CHOOSE: replace(pairs, photos=2 * TESTED_PLACES, views=2),
+        CHECK: base,
+        EXPECT: base,
     }
     return [
         replace(flight, out=region.path("flights", name), seed=10 * settings.seed + number)

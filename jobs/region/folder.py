@@ -25,6 +25,10 @@ class Region:
         return self.path("tiles")
 
     @cached_property
+    def table(self) -> str:
+        return self.path("table")
+
+    @cached_property
     def index(self) -> str:
         return self.path("index")
 
@@ -52,7 +56,9 @@ def claim(region: Region, settings: AdaptSettings) -> None:
     """
     if not storage.is_file(settings.mosaic):
         raise InputError(f"no map at {settings.mosaic}, expected a GeoTIFF; check --mosaic")
-    about = settings_record(settings, ("out",)) | {"mosaic_bytes": storage.size(settings.mosaic)}
+    about = settings_record(settings, ("out", "extend")) | {
+        "mosaic_bytes": storage.size(settings.mosaic)
+    }
     path = region.path("region.json")
     if not storage.exists(path):
         if storage.is_folder(region.out) and storage.walk(region.out):
@@ -82,6 +88,6 @@ def print_command(name: str, **flags: object) -> None:
     """Print the command that runs a stage alone."""
     words = []
     for flag, value in flags.items():
-        values = value if isinstance(value, (list, tuple)) else [value]
+        values = [] if value is True else value if isinstance(value, (list, tuple)) else [value]
         words += [f"--{flag.replace('_', '-')}", *map(str, values)]
     console.print(f"pvda {name} {' '.join(words)}", style="dim", markup=False, soft_wrap=True)

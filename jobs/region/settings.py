@@ -30,6 +30,9 @@ class AdaptSettings(CameraRanges):
     checks: int = 80
     """Simulated photos of held-out places that the confidence is fitted on, and as many again that
     tell what to expect."""
+    extend: bool = False
+    """Add the map to the region in `out`: its tiles join the gallery, the confidence is fitted anew
+    among them, the encoder stays, and the page tells what to expect of all its maps."""
     seed: int = 0
     "Another seed flies elsewhere, on other days."
 

@@ -2,18 +2,28 @@
 what is refused."""
 
 import json
+import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from jobs.encoding.localizer import with_localizer
+from jobs.region import extend
 from jobs.region.adapt import PAGE, adapt
+from jobs.region.expect import located_outcomes
+from jobs.region.extend import extend_region
+from jobs.region.folder import Region
 from jobs.region.settings import AdaptSettings
 from jobs.stages.settings import LocateSettings
 from model.weights.builtin import BUILTIN
 from pipeline.core.errors import InputError
+from pipeline.index.searcher import Index
+from pipeline.shards.manifest import read_manifest
+from pipeline.simulation.over_map.settings import TownMapSettings
+from pipeline.simulation.over_map.town_map import MAP, make_town_map
 
 
 def test_adapt_makes_a_localizer_and_says_what_to_expect(adapted_region: AdaptSettings) -> None:
@@ -56,3 +66,29 @@ def test_adapt_without_a_map_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds files of something else"):
         adapt(given)
     assert not (tmp_path / "region" / "region.json").exists()
+
+
+def test_extend_adds_a_map_once(
+    adapted_region: AdaptSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That the confidence is fitted anew where the gallery has grown is in test_calibrate."""
+    town = make_town_map(TownMapSettings(out=str(tmp_path / "town"), side=200.0, seed=5))
+    out = Path(shutil.copytree(adapted_region.out, tmp_path / "region"))
+    more = replace(adapted_region, mosaic=str(town / MAP), surface=None, out=str(out), extend=True)
+    fitted = list[Region]()
+    monkeypatch.setattr(extend, "fit_confidence", fitted.append)
+    some = partial(located_outcomes, most=1)
+    monkeypatch.setattr(extend, "located_outcomes", lambda region, tables, _: some(region, tables))
+    first = len(Index(str(out / "index")))
+    found = extend_region(more)
+    assert [one.photos for one in found[:2]] == [2, 2]  # one over each map, each way
+    index = Index(str(out / "index"))
+    rows = sum(shard.samples for shard in read_manifest(str(out / "tiles")).shards)
+    assert len(index) == rows > first
+    assert len(fitted) == 1
+    assert "What to expect of map.tif and map.tif" in (out / PAGE).read_text()
+    kept = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
+    assert extend_region(more)[0].photos == 2
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    with pytest.raises(InputError, match=r"no finished region at .*expected one to extend"):
+        extend_region(replace(more, out=str(tmp_path / "none")))

@@ -1,0 +1,97 @@
+"""Another map for a region that stands: its tiles join the gallery, and the encoder stays.
+
+In: a finished region and a map. Out: the same region over both. Finished parts are kept; a killed
+extension is resumed by the same command.
+"""
+
+import hashlib
+from dataclasses import replace
+from typing import Any
+
+from jobs.region.adapt import (
+    FIGURES,
+    OVERLAP,
+    camera_ranges,
+    embed_tiles,
+    expectation_table,
+    fit_confidence,
+    locate_command,
+    write_page,
+)
+from jobs.region.expect import located_outcomes, real_photos
+from jobs.region.flights import EXPECT, plan_flights, take_flight
+from jobs.region.folder import Region, print_command, with_absolute_paths
+from jobs.region.settings import AdaptSettings
+from jobs.stages.demo import step
+from pipeline.core import cluster, storage
+from pipeline.core.errors import InputError
+from pipeline.core.lock import locks_output
+from pipeline.core.progress import results
+from pipeline.index.update import extend_index
+from pipeline.region.expectation import Expectation, expectations, read_expectations
+from pipeline.shards.pack import pack
+from pipeline.shards.settings import PackingSettings
+from pipeline.simulation.over_map.fly import TABLE
+from pipeline.sources.geotiff import GeoTiff
+
+
+@locks_output(lambda settings: settings.out)
+def extend_region(settings: AdaptSettings) -> list[Expectation]:
+    """Add the map to the region, or what is missing of it; what to expect of all its maps.
+
+    Raises InputError for a map that cannot be used, or a folder without a finished region.
+    """
+    settings = with_absolute_paths(settings)
+    region = Region(out=settings.out)
+    figures = _figures(region)
+    if not storage.is_file(settings.mosaic):
+        raise InputError(f"no map at {settings.mosaic}, expected a GeoTIFF; check --mosaic")
+    if settings.mosaic in figures["maps"]:
+        found = read_expectations(figures["expectations"])
+        results.print(expectation_table(found))
+        results.print(f"{region.out} holds {settings.mosaic}; nothing to do", soft_wrap=True)
+        return found
+    seconds: dict[str, float] = {}
+    with step(seconds, "1 tiles", "the map's tiles, beside those that are there"):
+        print_command("make_shards", source="geotiff", root=settings.mosaic, out=region.tiles,
+                 tile_m=settings.tile_m, overlap=OVERLAP, extend=True)  # fmt: skip
+        cluster.connect()
+        source = GeoTiff(tile_m=(settings.tile_m,), overlap=OVERLAP)
+        pack(source, PackingSettings(root=settings.mosaic, out=region.tiles, extend=True))
+    with step(seconds, "2 flight", "simulated photos over it, to expect by"):
+        *_, expect = plan_flights(region, settings, camera_ranges(settings))
+        # Over the whole of it, for none of it was learned.
+        path = region.path("flights", _flight_name(settings))
+        take_flight(replace(expect, part="all", out=path))
+    with step(seconds, "3 index", "the new tiles embedded and added"):
+        embed_tiles(region)
+        print_command("build_index", table=region.table, out=region.index, extend=True)
+        extend_index(region.table, region.index)
+    with step(seconds, "4 confidence", "fitted among all tiles"):
+        fit_confidence(region)
+    with step(seconds, "5 what to expect", "photos of all maps, located"):
+        flights = [*figures["flights"], _flight_name(settings)]
+        tables = [region.path("flights", one, TABLE) for one in flights]
+        outcomes = located_outcomes(region, tables, settings.checks)
+        real = real_photos(region, settings.photos)
+        found = expectations(outcomes)
+    maps = [*figures["maps"], settings.mosaic]
+    write_page(region, settings, seconds, found, outcomes, real, maps, flights)
+    results.print(expectation_table([*found, *([real] if real else [])]))
+    results.print(f"now: {locate_command(region)}", soft_wrap=True)
+    return found
+
+
+def _figures(region: Region) -> dict[str, Any]:
+    path = region.path("expect", FIGURES)
+    figures: dict[str, Any] = storage.read_json(path) if storage.exists(path) else {}
+    if "maps" not in figures:
+        raise InputError(
+            f"no finished region at {region.out}, expected one to extend; adapt its first map "
+            "without --extend"
+        )
+    return figures
+
+
+def _flight_name(settings: AdaptSettings) -> str:
+    return f"{EXPECT}-{hashlib.sha256(settings.mosaic.encode()).hexdigest()[:8]}"
