@@ -7,7 +7,7 @@ features. Windows lie on a grid of half their own size, so that neighbouring pho
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +17,7 @@ from pipeline.camera.local_plane import LocalPlane, tile_side_m
 from pipeline.camera.map_window import MapWindow, Tile, compose_window
 from pipeline.core.arrays import Doubles, Ints, Pixels, Strings
 from pipeline.images.decode import DecodeError, decode
+from pipeline.images.inspect import inspect
 from pipeline.images.thumbnails import ImageLoader
 from pipeline.matching.refine import MatchableWindow, prepare_window
 
@@ -147,18 +148,19 @@ class MapWindows:
         keys = self._keys_within(plane, half_m, side_m)
         footprints = self._footprints(keys)
         images = self._fetch(footprints)
-        decoded = {key: decode_or_none(data) for key, data in images.items()}
         tiles = [
-            Tile(pixels_HW3=pixels, footprint=footprints[key])
+            Tile(
+                read=partial(decode_or_none, images[key]),
+                footprint=footprints[key],
+                metres_per_pixel=tile_side_m(footprints[key]) / math.sqrt(pixels),
+            )
             for key in keys
-            if key in footprints and (pixels := decoded.get(key)) is not None
+            if key in footprints and key in images and (pixels := _pixels(images[key]))
         ]
         if not tiles:
             return None
-        # The finest first: a window shows each ground by the first tile that has it.
-        tiles.sort(key=_resolution_m)
-        resolution_m = max(_resolution_m(tiles[0]), 2 * half_m / most_px)
-        return compose_window(plane, tiles, half_m, resolution_m)
+        finest_m = min(tile.metres_per_pixel for tile in tiles)
+        return compose_window(plane, tiles, half_m, max(finest_m, 2 * half_m / most_px))
 
     def _keys_within(self, plane: LocalPlane, half_m: float, side_m: float | None) -> list[str]:
         """Tiles of a level that a window may show, nearest first."""
@@ -173,10 +175,13 @@ def _on_the_grid(half_m: float) -> float:
     return float(1.25 ** math.ceil(math.log(max(half_m, 1.0), 1.25) - 1e-6))
 
 
-def _resolution_m(tile: Tile) -> float:
-    """Metres per pixel of a tile."""
-    height, width = tile.pixels_HW3.shape[:2]
-    return tile_side_m(tile.footprint) / math.sqrt(width * height)
+def _pixels(data: bytes) -> int:
+    """The number of a tile's pixels, by its head; 0 of a damaged one."""
+    try:
+        width, height = inspect(data)
+    except DecodeError:
+        return 0
+    return width * height
 
 
 def decode_or_none(data: bytes) -> Pixels | None:

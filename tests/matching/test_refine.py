@@ -113,9 +113,17 @@ def test_compose_window_puts_tiles_where_they_lie() -> None:
     def tile(west: float, colour: int) -> Tile:
         corners = np.array([[west, 20], [west + 20, 20], [west + 20, 0], [west, 0]], np.float64)
         pixels_HW3 = np.full((40, 40, 3), colour, np.uint8)
-        return Tile(pixels_HW3=pixels_HW3, footprint=plane.to_degrees(corners))
 
-    window = compose_window(plane, [tile(-20, 50), tile(0, 200)], 20, 0.5)
+        def read() -> Pixels:
+            tiles_read.append(west)
+            return pixels_HW3
+
+        return Tile(read=read, footprint=plane.to_degrees(corners), metres_per_pixel=0.5)
+
+    tiles_read: list[float] = []
+    # The tile between the others adds nothing.
+    window = compose_window(plane, [tile(-20, 50), tile(-10, 90), tile(0, 200)], 20, 0.5)
+    assert tiles_read == [-20, 0]
     assert window.pixels_HW3.shape == (80, 80, 3)
     assert window.pixels_HW3[20, 20, 0] == 50
     assert window.pixels_HW3[20, 60, 0] == 200

@@ -216,8 +216,9 @@ def _window_around(
     [tag] = placement.georeference.geotags([part])
     if tag is None or tag.footprint is None:
         raise InputError(f"{path} has ground without a position, expected one; cut the map")
-    tile = Tile(pixels_HW3=pixels_HW3, footprint=tag.footprint)
-    window = compose_window(plane, [tile], half_m, min(placement.pixel_m))
+    pixel_m = min(placement.pixel_m)
+    tile = Tile(read=lambda: pixels_HW3, footprint=tag.footprint, metres_per_pixel=pixel_m)
+    window = compose_window(plane, [tile], half_m, pixel_m)
     if colours.gaps:  # black is a gap there
         window.shown_HW[~window.pixels_HW3.any(axis=2)] = 0
     return window
