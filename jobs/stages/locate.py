@@ -13,6 +13,7 @@ from jobs.encoding.encoder import read_checkpoint_bytes
 from jobs.encoding.localizer import with_localizer
 from jobs.encoding.photo_encoder import PhotoEncoder
 from jobs.encoding.queries import Query, ViewMaker, encode_photos, merge_by_folder, one_view
+from jobs.stages.flight import locate_flight, search_queries, with_times
 from jobs.stages.matching import open_map, overhead_maker, refine_answers, view_maker
 from jobs.stages.settings import LocateSettings
 from pipeline.core import storage
@@ -25,18 +26,12 @@ from pipeline.images.thumbnails import no_images
 from pipeline.index.searcher import Index
 from pipeline.locate.answer_table import answer_table
 from pipeline.locate.calibration import Calibration, find_calibration, read_calibration
-from pipeline.locate.flight import TRACK_THRESHOLD, apply_track, motion_for_gallery
+from pipeline.locate.flight import TRACK_THRESHOLD
 from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
 from pipeline.locate.geojson import LocatedPhoto, to_csv, to_geojson
-from pipeline.locate.locate import (
-    CONSENSUS_CANDIDATES,
-    Answer,
-    answers_from_hits,
-    search_views,
-)
+from pipeline.locate.locate import CONSENSUS_CANDIDATES, Answer
 from pipeline.locate.page import LatLon, PageContext, render_page
-from pipeline.locate.photo_files import find_photos, parse_time, read_times
-from pipeline.locate.track import TRACK_CANDIDATES, TrackStart
+from pipeline.locate.photo_files import find_photos, parse_time
 from pipeline.matching.map_windows import MapWindows
 from pipeline.shards.shard_set import open_shards
 from pipeline.shards.tile_reader import TileReader
@@ -77,13 +72,13 @@ def locate_photos(
     if settings.together:
         queries = merge_by_folder(queries)
     decoded = [query for query in queries if query.views_VD is not None]
-    if settings.track:
+    if settings.track and calibration is not None:
         decoded = with_times(decoded, settings)
-    answers = answer_queries(decoded, index, gallery, calibration, settings)
-    if windows:
-        answers = refine_answers(
-            decoded, answers, windows, settings, calibration, of_flight=settings.track
-        )
+        answers = locate_flight(decoded, index, gallery, calibration, windows, settings)
+    else:
+        answers = answer_queries(decoded, index, gallery, calibration, settings)
+        if windows:
+            answers = refine_answers(decoded, answers, windows, settings, calibration)
     by_name = {
         query.name: _located(query, answer, settings.top)
         for query, answer in zip(decoded, answers, strict=True)
@@ -117,29 +112,11 @@ def answer_queries(
     calibration: Calibration | None,
     settings: LocateSettings,
 ) -> list[Answer]:
-    """One answer per query; with --track given the whole flight."""
-    decoded = [(one.views_VD, one.level) for one in queries if one.views_VD is not None]
-    views, levels = [views_VD for views_VD, _ in decoded], [level for _, level in decoded]
+    """One answer per query, by tiles, each by itself."""
     near = settings.near
-    if not settings.track or calibration is None:
-        # Matching tries more candidates than are listed.
-        k, where = max(settings.top, CONSENSUS_CANDIDATES), Filter(near=near) if near else None
-        hits = search_views(index, views, k, where, levels)
-        found = answers_from_hits(hits, k, calibration, gallery.spacing_m, gallery.finest_side_m)
-        return _framed(queries, found)
-    k = max(settings.top, TRACK_CANDIDATES)
-    hits = search_views(index, views, k, None, levels)
-    single = _framed(queries, answers_from_hits(hits, k, calibration))
-    start = TrackStart(lat=near.lat, lon=near.lon, radius_m=near.radius_m) if near else None
-    motion = motion_for_gallery(gallery, settings.max_speed, settings.elsewhere)
-    times_s = [parse_time(query.taken_at or "0") for query in queries]
-    return apply_track(single, times_s, calibration, motion, start)
-
-
-def _framed(queries: Sequence[Query], answers: Sequence[Answer]) -> list[Answer]:
-    """The answers with how their photos were framed."""
-    pairs = zip(queries, answers, strict=True)
-    return [replace(answer, framing=query.framing) for query, answer in pairs]
+    # Matching tries more candidates than are listed.
+    k, where = max(settings.top, CONSENSUS_CANDIDATES), Filter(near=near) if near else None
+    return search_queries(queries, index, gallery, calibration, k, where)
 
 
 def load_calibration(settings: LocateSettings, index: Index) -> Calibration | None:
@@ -168,30 +145,6 @@ def load_calibration(settings: LocateSettings, index: Index) -> Calibration | No
             style="yellow",
         )
     return calibration
-
-
-def with_times(queries: Sequence[Query], settings: LocateSettings) -> list[Query]:
-    """The queries with their times: from the table, else by the interval, else from the cameras'
-    tags.
-
-    Raises InputError where the time of one is not known.
-    """
-    names = [query.name for query in queries]
-    if settings.times:
-        times = read_times(settings.times, names)
-    elif settings.interval:
-        times = {name: str(at * settings.interval) for at, name in enumerate(sorted(names))}
-    else:
-        times = {query.name: query.taken_at for query in queries if query.taken_at is not None}
-    unknown = [name for name in names if name not in times]
-    if unknown:
-        raise InputError(
-            f"{len(unknown)} of {len(names)} photos have no time in their tags, {unknown[0]} among "
-            "them; expected times for --track; give --times TABLE or --interval SECONDS"
-        )
-    return [
-        replace(query, tags=replace(query.tags, taken_at=times[query.name])) for query in queries
-    ]
 
 
 def _located(query: Query, answer: Answer | None, top: int) -> LocatedPhoto:

@@ -4,7 +4,7 @@ In: queries with their answers, and the shards that the index was made of. Out: 
 metres where matching holds.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from jobs.encoding.photo_encoder import decode_photo
 from jobs.encoding.queries import Query, ViewMaker, read_photo
@@ -22,7 +22,7 @@ from pipeline.locate.locate import Answer
 from pipeline.locate.refined import refine_answer, with_refinement
 from pipeline.matching.map_windows import MapWindows
 from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
-from pipeline.matching.refine import MatchablePhoto, prepare_photo
+from pipeline.matching.refine import MatchablePhoto, Refinement, prepare_photo
 from pipeline.service.photo_map import PhotoMap
 from pipeline.shards.manifest import MANIFEST
 from pipeline.shards.shard_set import open_shards
@@ -30,6 +30,8 @@ from pipeline.shards.tile_reader import TileReader
 
 AHEAD = 4
 "Photos that are read while another is matched."
+Matcher = Callable[[Answer, MatchablePhoto, MapWindows], Refinement | None]
+"Matches a photo with the map where its answer says."
 
 
 def open_map(shards: str, gallery: GalleryMap) -> MapWindows | None:
@@ -92,24 +94,38 @@ def matchable_photo(photo_HW3: Pixels, tags: CameraTags, pose: PoseSettings) -> 
     return prepare_photo(photo_HW3, pose_of_photo(tags, (width, height), pose))
 
 
+def match_photos(
+    queries: Sequence[Query],
+    answers: Sequence[Answer],
+    windows: MapWindows,
+    pose: PoseSettings,
+    match: Matcher = refine_answer,
+) -> list[Refinement | None]:
+    """Single photos matched with the map, in their order: around their answers and candidates, or
+    where `match` looks; None where no view holds."""
+    found: list[Refinement | None] = []
+    with progress(len(queries), "matching", "photos") as meter:
+        contents = prefetch_map(read_photo, [query.photos[0] for query in queries], AHEAD, AHEAD)
+        for query, answer, data in zip(queries, answers, contents, strict=True):
+            if isinstance(data, Rejection):  # it was removed since it was embedded
+                found.append(None)
+            else:
+                photo = matchable_photo(decode_photo(data), query.tags, pose)
+                found.append(match(answer, photo, windows))
+            meter.advance()
+    return found
+
+
 def refine_answers(
     queries: Sequence[Query],
     answers: Sequence[Answer],
     windows: MapWindows,
     pose: PoseSettings,
     calibration: Calibration | None,
-    of_flight: bool,
 ) -> list[Answer]:
-    """The answers of single photos, in their order, refined where that holds; `of_flight`: they
-    know of the whole flight."""
-    refined: list[Answer] = []
-    with progress(len(queries), "matching", "photos") as meter:
-        contents = prefetch_map(read_photo, [query.photos[0] for query in queries], AHEAD, AHEAD)
-        for query, answer, data in zip(queries, answers, contents, strict=True):
-            found = None
-            if not isinstance(data, Rejection):  # else it was removed since it was embedded
-                photo = matchable_photo(decode_photo(data), query.tags, pose)
-                found = refine_answer(answer, photo, windows)
-            refined.append(with_refinement(answer, found, calibration, of_flight))
-            meter.advance()
-    return refined
+    """The answers of single photos, in their order, refined where that holds."""
+    found = match_photos(queries, answers, windows, pose)
+    return [
+        with_refinement(answer, refinement, calibration)
+        for answer, refinement in zip(answers, found, strict=True)
+    ]

@@ -13,8 +13,7 @@ from pipeline.core.geo import Circle
 from pipeline.core.records import Split, View
 from pipeline.features.settings import EmbeddingSettings
 from pipeline.index.settings import IndexSettings
-from pipeline.locate.settings import CalibrationCriteria
-from pipeline.locate.track import Motion
+from pipeline.locate.settings import CalibrationCriteria, FlightSettings
 from pipeline.matching.photo_pose import PoseSettings
 from pipeline.service.settings import ServiceSettings
 from pipeline.shards.settings import PackingSettings
@@ -81,7 +80,7 @@ CIRCLE_FLAG: Any = tyro.constructors.PrimitiveConstructorSpec(
 
 
 @dataclass(frozen=True, kw_only=True)
-class LocateSettings(PoseSettings):
+class LocateSettings(FlightSettings, PoseSettings):
     """Photos to locate, the index to search, and the files to write."""
 
     photos: tyro.conf.Positional[tuple[str, ...]]
@@ -99,18 +98,6 @@ class LocateSettings(PoseSettings):
     near: Annotated[Circle | None, CIRCLE_FLAG] = None
     """Search only gallery images in this circle. With --track: where the flight began, at the time
     of its first photo."""
-    track: bool = False
-    """The photos are of one flight: each is located given all of them, and the GeoJSON begins with
-    the flight's line."""
-    max_speed: float = 25.0
-    "Of the flight, metres per second over the ground; 25 is beyond most multicopters."
-    elsewhere: float = 0.1
-    "Of the flight, the share of photos expected to show no location of the gallery."
-    times: str | None = None
-    """CSV table with the columns photo and time (seconds or ISO 8601); by default the times in the
-    camera's tags."""
-    interval: float | None = None
-    "Seconds between photos in the order of their names, where neither tables nor tags have times."
     verify: bool = False
     """Check every byte of the index first, and of the parts of the feature table where it searches
     their vectors."""
@@ -129,16 +116,14 @@ class LocateSettings(PoseSettings):
     --no-match answers with tiles."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        FlightSettings.__post_init__(self)
+        PoseSettings.__post_init__(self)
         require(self.top >= 1, "top", self.top, "at least 1")
         if self.together and self.track:
             raise InputError(
                 "both --together and --track were given, expected one: a track is of single "
                 "photos; leave one out"
             )
-        positive = self.interval is None or self.interval > 0
-        require(positive, "interval", self.interval, "seconds above 0")
-        Motion(max_speed=self.max_speed, elsewhere=self.elsewhere)  # validates both
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,11 +26,7 @@ class LocalPlane:
     @property
     def metres_per_degree(self) -> Doubles:
         """Of latitude and of longitude (2,), by WGS84's radii of curvature here."""
-        sine = np.sin(np.radians(self.lat))
-        bend = 1 - ECCENTRICITY_2 * sine * sine
-        meridian_m = EQUATOR_M * (1 - ECCENTRICITY_2) / bend**1.5
-        parallel_m = EQUATOR_M / np.sqrt(bend) * np.cos(np.radians(self.lat))
-        return np.asarray(np.radians([meridian_m, parallel_m]))
+        return np.asarray(metres_per_degree_at(np.array([self.lat]))[0])
 
     def to_metres(self, positions_N2: Doubles) -> Doubles:
         """(east, north) in metres (N, 2) of latitudes and longitudes (N, 2); longitudes wrap."""
@@ -43,6 +39,15 @@ class LocalPlane:
         east_N, north_N = (metres_N2 / self.metres_per_degree[::-1]).T
         lon_N = (self.lon + east_N + 180) % 360 - 180
         return np.stack([self.lat + north_N, lon_N], axis=1)
+
+
+def metres_per_degree_at(lat_N: Doubles) -> Doubles:
+    """Metres per degree of latitude and of longitude (N, 2) at latitudes (N,)."""
+    sine_N, cosine_N = np.sin(np.radians(lat_N)), np.cos(np.radians(lat_N))
+    bend_N = 1 - ECCENTRICITY_2 * sine_N**2
+    meridian_N = EQUATOR_M * (1 - ECCENTRICITY_2) / bend_N**1.5
+    parallel_N = EQUATOR_M / np.sqrt(bend_N) * cosine_N
+    return np.asarray(np.radians(np.stack([meridian_N, parallel_N], axis=1)))
 
 
 def tile_side_m(footprint: npt.ArrayLike) -> float:

@@ -89,3 +89,14 @@ def ellipse_of(covariance_22: Doubles) -> Ellipse:
     east, north = axes_22[:, 1]
     direction = float(np.degrees(np.arctan2(east, north)) % 180)
     return Ellipse(major_m=float(major), minor_m=float(minor), direction_deg=direction)
+
+
+def covariance_of(ellipse: Ellipse) -> Doubles:
+    """The covariance (2, 2) of (east, north) in square metres of which this is the 95 % ellipse."""
+    direction = math.radians(ellipse.direction_deg)
+    along_2 = np.array([math.sin(direction), math.cos(direction)])
+    across_2 = np.array([math.cos(direction), -math.sin(direction)])
+    major, minor = ellipse.major_m / WITHIN_95, ellipse.minor_m / WITHIN_95
+    return np.asarray(
+        major**2 * np.outer(along_2, along_2) + minor**2 * np.outer(across_2, across_2)
+    )

@@ -17,7 +17,8 @@ from pipeline.core.arrays import Doubles
 from pipeline.core.errors import InputError
 from pipeline.core.json_files import from_json
 from pipeline.locate.consensus import Consensus
-from pipeline.matching.gate import GATE_FEATURES, Gate
+from pipeline.matching.gate import GATE_FEATURES, Gate, gate_features
+from pipeline.matching.refine import Refinement
 
 SCHEMA_VERSION = 2
 CALIBRATION_FILE = "calibration.json"
@@ -58,6 +59,19 @@ class MatchingCalibration:
     "Expected calibration error."
     bins: tuple[ReliabilityBin, ...]
     "Bins of the reliability diagram."
+
+    def place_probability(self, refinement: Refinement) -> float:
+        """Probability that a refinement shows the right place, within the calibration's tolerance.
+        Fitted on `photos`, it is never surer than a photo more and a wrong one would make it
+        (Laplace's rule of succession): a track has to be able to contradict it."""
+        least = 1 / (self.photos + 2)
+        [place] = self.gate.place_model.probabilities(gate_features(refinement)[None]).tolist()
+        return float(min(max(place, least), 1 - least))
+
+    def share_within(self, refinement: Refinement) -> float:
+        """Probability that a refinement is within the gate's distance, if it shows the right
+        place."""
+        return min(1.0, self.gate.probability(refinement) / self.place_probability(refinement))
 
 
 @dataclass(frozen=True, kw_only=True)

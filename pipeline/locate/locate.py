@@ -72,8 +72,8 @@ class Answer:
     "Probability that the location is right, 0 to 1; null without a calibration."
     within_m: float | None = None
     """The position counts as right within so many metres of the ground that the photo's middle
-    shows; null without a probability, and for a flight's photos, whose probability is that of the
-    location."""
+    shows; null without a probability, and for a flight's photos at tiles, whose probability is that
+    of the location."""
     known: bool
     "False (unknown) where the probability is below the threshold, or nothing was found."
     candidates: tuple[Hit, ...]

@@ -24,6 +24,17 @@ def refine_answer(answer: Answer, photo: MatchablePhoto, windows: MapWindows) ->
     return refine(photo, near)
 
 
+def refine_at(answer: Answer, photo: MatchablePhoto, windows: MapWindows) -> Refinement | None:
+    """The photo matched with the map around an answer's position alone, in a window as large as for
+    the tile of its location; None where no view holds, or the answer has no position."""
+    if answer.position is None:
+        return None
+    at = answer.position.lat, answer.position.lon
+    keys = [hit.key for hit in answer.candidates if (hit.lat, hit.lon) == at]
+    key = next(iter(keys), answer.candidates[0].key)
+    return refine(photo, windows.around([(*at, key)], 1, photo.reach_m))
+
+
 def _positions(answer: Answer) -> Iterator[tuple[float, float, str]]:
     """The answer's position, then its candidates', each with the key of the tile that tells the
     window's size."""

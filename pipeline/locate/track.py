@@ -1,23 +1,25 @@
 """A flight's photos in time order -> its track: uncertain photos are decided by their neighbours.
 
-In: for each photo its candidates with the probability of each, and of none, from the photo alone.
-Out: the most probable path that a UAV can fly through the candidates, and for each photo the
-probability of its candidates given all photos. A photo may show none of its candidates: the path
-then skips it, and the motion limit holds between the photos before and after. Exact: the Viterbi
-and the forward-backward recursions weigh all paths. NumPy only, no I/O. Shapes: K candidates of one
-photo, N candidates of all photos in time order, M of the photos before one, 2 = latitude and
-longitude in degrees, 3 = metres from the earth's centre.
+In: for each photo its candidates with the probability of each, and of none, from the photo alone;
+their errors and odometry, where known. Out: the most probable path that a UAV can fly through the
+candidates, and the probability of each given all photos (`smooth_track`) or those up to its own
+(`filter_track`). A photo may show none of its candidates: the path then skips it, and the motion
+limit holds between the photos before and after. Exact: the Viterbi and the forward-backward
+recursions weigh all paths. NumPy only, no I/O. Shapes: K candidates of one photo, N of all photos
+in time order, M of the photos before one, 2 = latitude and longitude in degrees.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from pipeline.core.arrays import Doubles, Ints, Mask
+from pipeline.core.arrays import Doubles, Ints
 from pipeline.core.errors import require
-from pipeline.core.geo import EARTH_RADIUS_M, on_sphere
+from pipeline.locate.movement import Ends, Places, moves_between
+from pipeline.locate.odometry import Travelled
 
 TRACK_CANDIDATES = 30
 """Candidates of a photo that the track may pass through. More than decide on a single answer: the
@@ -25,6 +27,7 @@ flight tells them apart, and the track cannot choose a location that the search 
 
 Combine = Callable[[Doubles], Doubles]
 "Reduces log-weights (M, K) over their rows: by the maximum (Viterbi) or by log-sum-exp (forward)."
+_most: Combine = partial(np.max, axis=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +37,7 @@ class Motion:
     max_speed: float = 25.0
     "Metres per second over the ground; 25 is beyond most multicopters, fixed wings fly faster."
     slack_m: float = 0.0
-    """Metres added to every distance: how far a photo may lie from the position of its gallery
-    image, at both ends."""
+    "Metres added to every reach, beside the errors of the candidates at its ends."
     gallery_positions: float = 1.0
     "Positions in the gallery; the photo's own probabilities assume any of them."
     spacing_m: float = math.inf
@@ -59,6 +61,22 @@ class Motion:
         ratio = self.gallery_positions / np.maximum(within, 1.0)
         return np.asarray(np.log(np.maximum(ratio, 1.0)))
 
+    def gains(self, some: Ends, others: Ends) -> Doubles:
+        """Gain (M, K) of the moves between candidates. Where odometry measured the displacement:
+        log of how much likelier it is for these candidates than for places anywhere in the gallery;
+        else by the speed limit, -inf out of reach."""
+        moves = moves_between(some, others, self.max_speed, self.slack_m)
+        by_speed_MK = np.where(moves.within_MK, self.gain(moves.reach_MK), -np.inf)
+        if not moves.measured_MK.any():
+            return by_speed_MK
+        if math.isfinite(self.spacing_m):
+            area_m2 = max(self.gallery_positions, 1.0) * self.spacing_m**2
+            measured_MK = math.log(area_m2) + moves.log_density_MK
+        else:  # no area is known: as at the speed limit, where a single position is within reach
+            most = math.log(max(self.gallery_positions, 1.0))
+            measured_MK = most + moves.log_density_MK - moves.peak_MK
+        return np.where(moves.measured_MK, measured_MK, by_speed_MK)
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrackPhoto:
@@ -72,6 +90,14 @@ class TrackPhoto:
     "Log-probability of each candidate, from the photo alone."
     log_p_none: float
     "Log-probability of none of them."
+    ground: Places | None = None
+    "The candidates' positions with their errors; None: they have no errors of their own."
+    camera: Places | None = None
+    "Where the camera is if a candidate is right, with errors; None, and NaN: unknown."
+    ahead_m: float = 0.0
+    "Metres from below the camera to the ground in the photo's middle, where only these are known."
+    travelled: Travelled | None = None
+    "The camera's way up to this photo, by odometry."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,18 +133,47 @@ def smooth_track(
     if not photos:
         return []
     trellis = _Trellis.of(photos, start, motion)
-    best_N, predecessor_N = trellis.forward(lambda x_MK: x_MK.max(axis=0), trace=True)
+    best_N, predecessor_N = trellis.forward(_most, trace=True)
     chosen = trellis.backtrace(best_N, predecessor_N)
     before_N, _ = trellis.forward(_logsumexp)
     after_N = trellis.backward()
     total = _logsumexp(np.concatenate([[0.0], before_N])[:, None])[0]
     p_N = np.exp(np.minimum(before_N + after_N - total, 0))
-    smoothed = []
-    for (begin, end), number in zip(trellis.spans, chosen, strict=True):
-        p_K = p_N[begin:end]
-        probability = max(0.0, 1 - p_K.sum()) if number is None else p_K[number]
-        smoothed.append(SmoothedPhoto(chosen=number, probability=float(probability), p_K=p_K))
-    return smoothed
+    pairs = zip(trellis.spans, chosen, strict=True)
+    return [_chosen(number, p_N[begin:end]) for (begin, end), number in pairs]
+
+
+def filter_track(
+    photos: Sequence[TrackPhoto], motion: Motion, start: TrackStart | None = None
+) -> list[SmoothedPhoto]:
+    """For each photo, by the photos up to it only: what can be known in flight.
+
+    A candidate's probability is the share of the paths that end at it among all that end at this
+    photo or before, the empty one included; `chosen` is the end of the most probable of them. For
+    the last photo both are those of `smooth_track`.
+    """
+    if not photos:
+        return []
+    trellis = _Trellis.of(photos, start, motion)
+    best_N, _ = trellis.forward(_most)
+    before_N, _ = trellis.forward(_logsumexp)
+    total_N = np.logaddexp.accumulate(np.concatenate([[0.0], before_N]))
+    filtered = []
+    for begin, end in trellis.spans:
+        p_K = np.exp(np.minimum(before_N[begin:end] - total_N[end], 0))
+        at = _best_end(best_N[:end])
+        filtered.append(_chosen(at - begin if at >= begin else None, p_K))
+    return filtered
+
+
+def _chosen(number: int | None, p_K: Doubles) -> SmoothedPhoto:
+    probability = max(0.0, 1 - p_K.sum()) if number is None else p_K[number]
+    return SmoothedPhoto(chosen=number, probability=float(probability), p_K=p_K)
+
+
+def _best_end(best_N: Doubles) -> int:
+    """The candidate at which the best path ends; -1 where it skips all photos."""
+    return int(best_N.argmax()) if len(best_N) and best_N.max() > 0 else -1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,8 +182,7 @@ class _Trellis:
     the path that skips all photos; so a skipped photo costs nothing, and a candidate gains its
     probability over that of none."""
 
-    point_N3: Doubles
-    time_N: Doubles
+    ends: Ends
     gain_N: Doubles
     start_gain_N: Doubles
     "Gain of a path that begins at a candidate; -inf beyond the reach of the rough start."
@@ -139,33 +193,23 @@ class _Trellis:
     @staticmethod
     def of(photos: Sequence[TrackPhoto], start: TrackStart | None, motion: Motion) -> "_Trellis":
         counts = [len(photo.log_p_K) for photo in photos]
-        ends = np.cumsum(counts).tolist()
-        position_N2 = np.concatenate([photo.positions_K2.reshape(-1, 2) for photo in photos])
+        last = np.cumsum(counts).tolist()
+        ends = _ends_of(photos, counts)
         gain_N = np.concatenate([photo.log_p_K - photo.log_p_none for photo in photos])
-        point_N3 = on_sphere(np.nan_to_num(position_N2))
-        time_N = np.repeat([photo.time_s for photo in photos], counts)
         start_gain_N = np.zeros(len(gain_N))
         if start:
-            start_13 = on_sphere(np.array([[start.lat, start.lon]]))
-            flown_N = motion.max_speed * (time_N - photos[0].time_s)
-            reach_N = start.radius_m + motion.slack_m + flown_N
-            within_N = _within_reach(start_13, point_N3, reach_N[None])[0]
-            start_gain_N = np.where(within_N, motion.gain(reach_N), -np.inf)
+            start_gain_N = motion.gains(_start_end(start, photos[0]), ends)[0]
         return _Trellis(
-            point_N3=point_N3,
-            time_N=time_N,
-            gain_N=np.where(np.isnan(position_N2).any(axis=1), -np.inf, gain_N),
+            ends=ends,
+            gain_N=np.where(np.isnan(ends.ground_N2).any(axis=1), -np.inf, gain_N),
             start_gain_N=start_gain_N,
-            spans=tuple(zip([0, *ends[:-1]], ends, strict=True)),
+            spans=tuple(zip([0, *last[:-1]], last, strict=True)),
             motion=motion,
         )
 
     def transition(self, some: slice, others: slice) -> Doubles:
         """Gain (M, K) of flying from some candidates (M) to others (K); -inf out of reach."""
-        seconds_MK = np.abs(self.time_N[others][None] - self.time_N[some][:, None])
-        reach_MK = self.motion.max_speed * seconds_MK + self.motion.slack_m
-        within_MK = _within_reach(self.point_N3[some], self.point_N3[others], reach_MK)
-        return np.where(within_MK, self.motion.gain(reach_MK), -np.inf)
+        return self.motion.gains(self.ends.part(some), self.ends.part(others))
 
     def forward(self, combine: Combine, trace: bool = False) -> tuple[Doubles, Ints]:
         """Log-weight of the paths that end in each candidate, and for `trace` the candidate before
@@ -205,7 +249,7 @@ class _Trellis:
     def backtrace(self, best_N: Doubles, predecessor_N: Ints) -> list[int | None]:
         """For each photo the number of its candidate on the best path."""
         chosen: list[int | None] = [None] * len(self.spans)
-        at = int(best_N.argmax()) if len(best_N) and best_N.max() > 0 else -1
+        at = _best_end(best_N)
         for number in range(len(self.spans) - 1, -1, -1):
             begin, end = self.spans[number]
             if begin <= at < end:
@@ -214,13 +258,31 @@ class _Trellis:
         return chosen
 
 
-def _within_reach(some_M3: Doubles, others_K3: Doubles, reach_MK: Doubles) -> Mask:
-    """Whether great circles between points are at most that long; by their chords, which a matrix
-    product gives."""
-    squared_MK = 2 * (EARTH_RADIUS_M**2 - some_M3 @ others_K3.T)
-    half_angle_MK = np.minimum(reach_MK / (2 * EARTH_RADIUS_M), np.pi / 2)
-    chord_MK = 2 * EARTH_RADIUS_M * np.sin(half_angle_MK)
-    return np.asarray(squared_MK <= chord_MK**2 + 1.0)  # 1 square metre: the product's rounding
+def _ends_of(photos: Sequence[TrackPhoto], counts: Sequence[int]) -> Ends:
+    """The candidates of all photos in one row."""
+    return Ends.of(
+        time_N=np.repeat([photo.time_s for photo in photos], counts),
+        ground=Places.joined([one.ground or Places.exact(one.positions_K2) for one in photos]),
+        camera=Places.joined([one.camera or Places.unknown(len(one.log_p_K)) for one in photos]),
+        ahead_N=np.repeat([photo.ahead_m for photo in photos], counts),
+        travelled=[one.travelled for one, n in zip(photos, counts, strict=True) for _ in range(n)],
+    )
+
+
+def _start_end(start: TrackStart, first: TrackPhoto) -> Ends:
+    """The rough start as a candidate: all of its circle is as likely."""
+    circle = Places(
+        positions_N2=np.array([[start.lat, start.lon]]),
+        slack_N=np.array([start.radius_m]),
+        covariance_N22=(start.radius_m / 2) ** 2 * np.eye(2)[None],  # of a disc, either part
+    )
+    return Ends.of(
+        time_N=np.array([first.time_s]),
+        ground=circle,
+        camera=circle,
+        ahead_N=np.zeros(1),
+        travelled=[first.travelled],
+    )
 
 
 def _combine_all(combine: Combine, weight_M: Doubles) -> float:

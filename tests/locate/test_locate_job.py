@@ -228,10 +228,28 @@ def test_locate_track_without_times_or_calibration_is_refused(world: dict[str, s
     assert len(locate_photos(settings(world, track=True, interval=5.0))) == 4
 
 
+def test_locate_track_online_by_odometry(world: dict[str, str]) -> None:
+    """Steps of 111 m north, as flown; the table is refused where a number is none."""
+    calibrated(world)
+    table = Path(world["photos"]).with_name("way.csv")
+    rows = [f"{number}.jpg,0,{111 * (number > 0)},3" for number in range(4)]
+    table.write_text("photo,east_m,north_m,error_m\n" + "\n".join(rows))
+    given = settings(world, track=True, interval=5.0, online=True, odometry=str(table))
+    located = locate_photos(given)
+    assert [one.answer and one.answer.location for one in located] == [
+        "0000", "0001", "0002", "0003",
+    ]  # fmt: skip
+    table.write_text("photo,east_m,north_m,error_m\n0.jpg,0,1,x\n")
+    with pytest.raises(InputError, match=r"has 0, 1, x for 0\.jpg; expected metres"):
+        locate_photos(given)
+
+
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
         ({"top": 0}, "--top is 0"),
+        ({"online": True}, "found --online without --track"),
+        ({"odometry": "way.csv"}, "found --odometry without --track"),
         ({"together": True, "track": True}, "both --together and --track"),
         ({"interval": -1.0}, "--interval is -1"),
         ({"max_speed": 0.0}, "--max-speed is 0"),
