@@ -83,6 +83,7 @@ def test_refined_probability_is_that_of_a_near_position() -> None:
     assert found.probability == pytest.approx(1 / (1 + np.exp(-2)))
     [near] = apply_track([answer(10)], [0], CALIBRATION, MOTION, facts=[refined(0)])
     assert near.probability is not None
+    assert found.probability is not None
     assert found.probability < near.probability <= 1  # its tile agrees
     assert (near.location, near.agreeing) == ("t10", 1)
 
