@@ -1,9 +1,11 @@
-"""Build time, memory, size, recall and speed of indexes, as a ratio to exact search in one run.
+"""Recall, queries/s, p99 and bytes a row of indexes, as a ratio to exact search in one run; with
+the time and memory to build each.
 
-Prints one line per index. The stage builds each in a separate process, whose memory is sampled;
-then the index and exact search in memory answer the same queries, alternating. `--table` keeps the
-synthetic vectors for the next call, or takes the embeddings of a trained network
-(`benchmarks/embeddings.py`).
+Prints one line per index: `planned` is the planner's, `former` that of the rule by rows and memory
+before plans were tried, any other word a FAISS factory string. The stage builds each in a separate
+process, whose memory is sampled; then the index and exact search in memory answer the same queries,
+alternating. `--table` keeps the synthetic vectors for the next call, or takes the embeddings of a
+network (`benchmarks/embeddings.py`).
 """
 
 import argparse
@@ -26,9 +28,11 @@ from pipeline.core.records import Split
 from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.features.table import open_table
 from pipeline.index.build import build_index
-from pipeline.index.recall import RECALL_QUERIES, exact_search
+from pipeline.index.recall import RECALL_QUERIES, exact_search, measure_speed
 from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings
+from pipeline.index.train import SPECTRUM_ROWS, effective_dimension, sample_rows
+from pipeline.index.workspace import rows_by_part
 
 PART_ROWS = 16_384
 IMAGES_PER_PLACE = 20
@@ -37,18 +41,20 @@ KINDS = 500
 BLOCK_ROWS = 8_192
 FLAT_ROWS = 131_072
 "Rows of the exact search in memory; its time is scaled to all rows, which it is linear in."
-PLANNED = "planned"
+PLANNED, FORMER = "planned", "former"
+FORMER_EXACT_ROWS, FORMER_GRAPH_ROWS = 100_000, 500_000
 HEADINGS = (
     "index",
+    "recall@10",
+    "queries/s",
+    "single p50, p99 ms",
+    "bytes a row",
+    "over exact search",
+    "breadth, candidates, ratio",
     "built in",
     "memory while building",
     "with mapped files",
-    "bytes a vector",
     "memory to search",
-    "recall@10",
-    "breadth, candidates",
-    "queries/s",
-    "over exact search",
 )
 
 
@@ -154,36 +160,56 @@ class Queries:
     flat_ND: Floats
     """The gallery's first rows, for the exact search that is timed."""
     rounds: int
+    cpu: bool
+    """Whether times are CPU seconds of one thread."""
 
 
 def search(path: str, given: Queries, scale: float, answer: Connection) -> None:
-    """Send recall@10, queries per second, their ratio to exact search, and the memory to search.
+    """Send recall@10, queries per second, their ratio to exact search, the memory to search, and
+    p50 and p99 of single queries.
 
     `scale` is the number of rows of the index over those of the exact search.
     """
     before = memory_of("RssAnon")
-    index = Index(path)
+    clock = time.process_time if given.cpu else time.perf_counter
+    index = Index(path, threads=1 if given.cpu else None)
     index.search(given.queries_QD[:4])
     memory = memory_of("RssAnon") - before
     flat = faiss.IndexFlatIP(given.flat_ND.shape[1])
     flat.add(given.flat_ND)
     ours, exact = [], []
     for _ in range(given.rounds):
-        start = time.perf_counter()
+        start = clock()
         found = index.search_rows(given.queries_QD, 10)[1]
-        ours.append(time.perf_counter() - start)
-        start = time.perf_counter()
+        ours.append(clock() - start)
+        start = clock()
         flat.search(given.queries_QD, 10)
-        exact.append((time.perf_counter() - start) * scale)
+        exact.append((clock() - start) * scale)
     pairs = zip(given.exact_QK.tolist(), found.tolist(), strict=True)
     recall = np.mean([len({*a} & {*b}) / 10 for a, b in pairs])
     ratio = np.median([one / other for one, other in zip(exact, ours, strict=True)])
     rate = len(given.queries_QD) / float(np.median(ours))
-    answer.send((float(recall), rate, float(ratio), memory))
+    speed = measure_speed(index.search_rows, given.queries_QD, 1, 1.0, clock)
+    answer.send((float(recall), rate, float(ratio), memory, (speed["p50_ms"], speed["p99_ms"])))
+
+
+def former_plan(rows: int, dimension: int, effective: int) -> str:
+    """The factory that the former rule took, where the memory was no limit; +table: refined."""
+    lists = 2 ** round(np.log2(2 * np.sqrt(rows)))
+    if rows <= FORMER_EXACT_ROWS:
+        return "Flat"
+    if effective <= dimension // 2:
+        return f"PCA{effective},IVF{lists},SQ8+table"
+    if rows <= FORMER_GRAPH_ROWS:
+        return "HNSW32,SQ8"
+    return f"IVF{lists},PQ{dimension // 8}x4fs+table"
 
 
 def report(table: str, out: str, factory: str, args: argparse.Namespace, given: Queries) -> None:
     """Build one index, search it, and print its line."""
+    said = {PLANNED: "the planner", FORMER: "the former rule"}.get(factory, "")
+    if factory == FORMER:
+        factory = args.former
     name, refined = factory.removesuffix("+table"), factory.endswith("+table")
     settings = IndexSettings(
         table=table,
@@ -198,21 +224,25 @@ def report(table: str, out: str, factory: str, args: argparse.Namespace, given: 
     metadata, anonymous, resident = in_a_process(build, settings)
     seconds = time.perf_counter() - start
     scale = metadata.rows / len(given.flat_ND)
-    recall, rate, ratio, memory = in_a_process(search, out, given, scale)
+    recall, rate, ratio, memory, (p50, p99) = in_a_process(search, out, given, scale)
     label = metadata.factory
     label += " + table" * (metadata.refine == "table") + " on disk" * metadata.on_disk
+    params = metadata.search_params
     cells = [
-        label + " (the planner)" * (name == PLANNED),
+        label + f" ({said})" * bool(said),
+        f"{recall:.4f}",
+        f"{rate:,.0f}",
+        f"{p50:.2f}, {p99:.2f}",
+        f"{metadata.bytes_per_vector:,.0f}",
+        f"{ratio:.1f} x",
+        f"{params.nprobe_or_ef}, {params.rerank_factor}, {params.list_ratio}",
         f"{seconds:.0f} s",
         f"{anonymous / 1e9:.2f} GB",
         f"{resident / 1e9:.2f} GB",
-        f"{metadata.bytes_per_vector:,.0f}",
         f"{memory / 1e9:.2f} GB",
-        f"{recall:.4f}",
-        f"{metadata.search_params.nprobe_or_ef}, {metadata.search_params.rerank_factor}",
-        f"{rate:,.0f}",
-        f"{ratio:.1f} x",
     ]
+    for rejected, why in metadata.measured["rejected"].items():
+        print(f"rejected {rejected}: {why}")
     print(f"| {' | '.join(cells)} |", flush=True)
 
 
@@ -224,8 +254,9 @@ def main() -> None:
     add("--memory-budget", default="4GB")
     add("--target-recall", type=float, default=0.95)
     add("--rounds", type=int, default=7, help="alternating rounds of search")
+    add("--cpu", action="store_true", help="CPU seconds of one thread: on a machine that is shared")
     add("--table", help="feature table: used if it exists, written otherwise")
-    factories = [PLANNED, "IVF1024,SQ8", "IVF1024,RaBitQ+table"]
+    factories = [PLANNED, FORMER, "IVF1024,SQ8", "IVF1024,RaBitQ+table"]
     add(
         "--factories",
         nargs="*",
@@ -243,17 +274,21 @@ def main() -> None:
         gallery, queries_QD = table.select(Split.GALLERY), table.select(Split.QUERY).embeddings()
         faiss.omp_set_num_threads(os.cpu_count() or 1)
         exact_QK = exact_search(queries_QD, gallery, 10)
+        counts = rows_by_part(gallery)
+        _, sample_SD = sample_rows(gallery, counts, SPECTRUM_ROWS)
+        args.former = former_plan(gallery.rows, table.dimension, effective_dimension(sample_SD))
         blocks = islice(gallery.blocks(BLOCK_ROWS), FLAT_ROWS // BLOCK_ROWS)
         given = Queries(
             queries_QD=queries_QD,
             exact_QK=exact_QK,
             flat_ND=np.concatenate(list(blocks)),
             rounds=args.rounds,
+            cpu=args.cpu,
         )
         print(
             f"{gallery.rows:,} x {table.dimension} in {table.dtype}, budget {args.memory_budget}, "
             f"{len(queries_QD)} queries, exact search timed on {len(given.flat_ND):,} rows, "
-            f"{os.cpu_count()} cores"
+            f"{os.cpu_count()} cores{', CPU seconds of one thread' * args.cpu}"
         )
         print(f"| {' | '.join(HEADINGS)} |\n|{'---|' * len(HEADINGS)}", flush=True)
         for number, factory in enumerate(args.factories):

@@ -60,8 +60,12 @@ CASES: dict[str, tuple[str, str]] = {
         r"\| embedding, built-in, float32, folded.* \| 1\.0000",
     ),
     "index": (
-        "--rows 2000 --dimension 32 --rounds 1 --factories planned",
-        r"Flat \(the planner\) .* [\d.]+ x \|",
+        "--rows 2000 --dimension 32 --rounds 1 --factories planned former",
+        r"Flat \(the planner\) .* [\d.]+ x \|(.|\n)*Flat \(the former rule\) ",
+    ),
+    "filters": (
+        "--rows 2000 --dimension 32 --selectivities 0.001 0.5 1 --factories IVF16,SQ8",
+        r"\| 0.5 \| 1,000 \| IVF16,SQ8 \| [\d.]+ \|.* [\d.]+ x \|",
     ),
     "ingredients": (
         "--shards {trained}/shards --held places={trained}/shards --out {out} --epochs 1 "

@@ -30,6 +30,9 @@ class SearchParams:
     "nprobe of inverted lists, efSearch of a graph; without effect on exact search."
     rerank_factor: int = 1
     "Candidates per wanted row whose scores the table's vectors compute anew; 1: none."
+    list_ratio: float = 0.0
+    """Lists whose centre scores below this share of the query's best centre are skipped; 0:
+    none."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,6 +4,9 @@ Shapes: Q queries, K wanted rows, C candidates, N rows of the part, D dimensions
 P pairs of query and candidate.
 """
 
+import math
+from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -13,7 +16,7 @@ from pipeline.core.arrays import Floats, Ints, Mask
 from pipeline.core.errors import InputError
 from pipeline.core.filters import Filter
 from pipeline.features.row_reader import RowReader
-from pipeline.index.faiss_io import faiss_parameters, local_copy, read_faiss
+from pipeline.index.faiss_io import local_copy, read_faiss, search_faiss
 from pipeline.index.ids import RowIds
 from pipeline.index.metadata import REBUILD_HINT, PartMetadata, SearchParams, check_files
 
@@ -78,14 +81,11 @@ class IndexPart:
             rows_QC = np.broadcast_to(row_C, (len(queries_QD), count))
             return top_k(self._exact_scores(queries_QD, row_C), rows_QC, k)
         wanted = min(count, max(k, k * params.rerank_factor))
-        breadth = params.nprobe_or_ef
-        if allowed_N is not None:  # the fewer rows match, the more lists hold as many of them
-            breadth = int(np.ceil(breadth * self.metadata.rows / count))
-        scores_QC, rows_QC = self.index.search(
-            queries_QD, wanted, params=faiss_parameters(self.index, breadth, allowed_N)
-        )
+        if allowed_N is not None:
+            params = filtered_params(params, count / self.metadata.rows)
+        scores_QC, rows_QC = search_faiss(self.index, queries_QD, wanted, k, params, allowed_N)
         if params.rerank_factor > 1 and self._reader is not None:
-            scores_QC = self._reranked_scores(queries_QD, rows_QC)
+            scores_QC = rescored(queries_QD, rows_QC, self.vectors)
         return top_k(scores_QC, rows_QC, k)
 
     def vectors(self, row_R: Ints) -> Floats:
@@ -110,19 +110,27 @@ class IndexPart:
             scores_QC[:, block] = queries_QD @ self.vectors(row_C[block]).T
         return scores_QC
 
-    def _reranked_scores(self, queries_QD: Floats, rows_QC: Ints) -> Floats:
-        """Exact scores (Q, C) of each query's own candidates."""
-        scores_QC = np.full(rows_QC.shape, -np.inf, np.float32)
-        query_P, column_P = np.nonzero(rows_QC != NO_ROW)
-        row_P = rows_QC[query_P, column_P]
-        order_P = np.argsort(row_P, kind="stable")
-        for begin in range(0, len(order_P), RERANK_BLOCK):
-            pairs = order_P[begin : begin + RERANK_BLOCK]
-            query = query_P[pairs]
-            scores_QC[query, column_P[pairs]] = np.einsum(
-                "rd,rd->r", self.vectors(row_P[pairs]), queries_QD[query]
-            )
-        return scores_QC
+
+def rescored(queries_QD: Floats, rows_QC: Ints, vectors: Callable[[Ints], Floats]) -> Floats:
+    """Exact scores (Q, C) of each query's own candidates. `vectors`: those of rows that ascend."""
+    scores_QC = np.full(rows_QC.shape, -np.inf, np.float32)
+    query_P, column_P = np.nonzero(rows_QC != NO_ROW)
+    row_P = rows_QC[query_P, column_P]
+    order_P = np.argsort(row_P, kind="stable")
+    for begin in range(0, len(order_P), RERANK_BLOCK):
+        pairs = order_P[begin : begin + RERANK_BLOCK]
+        query = query_P[pairs]
+        scores_QC[query, column_P[pairs]] = np.einsum(
+            "rd,rd->r", vectors(row_P[pairs]), queries_QD[query]
+        )
+    return scores_QC
+
+
+def filtered_params(params: SearchParams, share: float) -> SearchParams:
+    """Search parameters where a filter leaves a share of the rows: the fewer match, the more lists
+    hold as many of them.
+    """
+    return replace(params, nprobe_or_ef=math.ceil(params.nprobe_or_ef / share), list_ratio=0.0)
 
 
 def _empty_result(queries: int, k: int) -> tuple[Floats, Ints]:

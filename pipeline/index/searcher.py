@@ -87,6 +87,11 @@ class Index:
         with tempfile.TemporaryDirectory() as scratch:
             self._parts = list(open_parts(path, self.metadata, scratch, parts, verify))
 
+    @property
+    def parts(self) -> list[IndexPart]:
+        """The opened parts, in the order of their rows."""
+        return self._parts
+
     def __len__(self) -> int:
         """Rows that a search can return."""
         removed = sum(

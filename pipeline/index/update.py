@@ -19,6 +19,7 @@ from pipeline.core.lock import locks_output
 from pipeline.core.progress import console
 from pipeline.core.records import Split, View
 from pipeline.features.table import FeatureTable, open_table
+from pipeline.index.balance import list_lengths, lost_balance
 from pipeline.index.faiss_io import FAISS, local_copy
 from pipeline.index.finish import finish_index
 from pipeline.index.ids import RowIds
@@ -70,7 +71,20 @@ def extend_index(table: str, out: str, workers: int = 0) -> IndexMetadata:
     in_order = selected.with_parts([*indexed, *added])  # the order of the index's rows
     others = whole_table.select(Split.QUERY) if split == Split.GALLERY else None
     queries = sample_queries(in_order, rows_by_part(in_order), others)
-    return finish_index(out, metadata, queries, workspace, start)
+    earlier = metadata.measured.get("recall_at_10")
+    metadata = finish_index(out, metadata, queries, workspace, start)
+    if earlier is not None:
+        console.print(
+            f"{out}: recall@10 was {earlier:.3f} before the extension and is "
+            f"{metadata.measured['recall_at_10']:.3f} now, measured again"
+        )
+    opened = Index(out).parts
+    lengths_L, before_L = list_lengths(opened), list_lengths(opened[: -len(parts)])
+    if lengths_L is None or before_L is None:
+        return metadata
+    if sentence := lost_balance(before_L, lengths_L):
+        console.print(f"{out}: {sentence}", style="yellow")
+    return metadata
 
 
 @locks_output(lambda out, locations: out)

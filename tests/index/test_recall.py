@@ -43,6 +43,8 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Index]:
 def test_recall_excludes_the_querys_own_row() -> None:
     found = np.array([[5, 7, 9], [1, 2, 3], [4, 0, 6]])
     assert without_own_row(found, np.array([7, -1, 4])).tolist() == [[5, 9], [1, 2], [0, 6]]
+    short = np.array([[5, -1, -1], [7, -1, -1]])
+    assert without_own_row(short, np.array([-1, 7])).tolist() == [[5, -1], [-1, -1]]
 
 
 def test_exact_search_equals_brute_force_for_any_blocks(

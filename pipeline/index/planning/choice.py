@@ -16,6 +16,7 @@ class TrialPoint:
 
     nprobe_or_ef: int
     rerank_factor: int
+    list_ratio: float = 0.0
     recall: float
     "Recall@10 as expected at all rows."
     sample_recall: float
@@ -103,6 +104,7 @@ def figures(pair: Chosen) -> dict[str, Any]:
         "plan": plan_label(trial.plan),
         "nprobe_or_ef": point.nprobe_or_ef,
         "rerank_factor": point.rerank_factor,
+        "list_ratio": point.list_ratio,
         "recall_at_10": round(point.recall, 4),
         "sample_recall_at_10": round(point.sample_recall, 4),
         "queries_per_second": round(point.queries_per_second, 1),

@@ -53,6 +53,7 @@ FAMILIES = (
         refine="table",
         reduces=True,
     ),
+    IndexFamily(form="IVF{lists},SQ8", kind="lists of 8-bit codes", bits=8, ceiling=0.985),
     IndexFamily(
         form="HNSW32,SQ8",
         kind="a graph over 8-bit codes",
@@ -63,6 +64,14 @@ FAMILIES = (
         merging=2,
     ),
     IndexFamily(
+        form="IVF{lists},RaBitQ",
+        kind="lists of one-bit codes",
+        bits=1,
+        extra_bytes=16,
+        ceiling=0.97,
+        refine="table",
+    ),
+    IndexFamily(
         form="IVF{lists},PQ{pieces}x4fs",
         kind="lists of 4-bit product codes",
         bits=4 / SUBQUANTISER_DIM,
@@ -70,8 +79,17 @@ FAMILIES = (
         refine="table",
         merging=2,
     ),
-    IndexFamily(form="IVF{lists},SQ8", kind="lists of 8-bit codes", bits=8, ceiling=0.985),
     IndexFamily(form="IVF{lists},SQfp16", kind="lists of 16-bit numbers", bits=16, ceiling=0.999),
+    IndexFamily(
+        form="HNSW32,SQ8",
+        kind="a graph over 8-bit codes",
+        bits=8,
+        extra_bytes=GRAPH_BYTES,
+        ceiling=0.99,
+        refine="table",
+        graph=True,
+        merging=2,
+    ),
     IndexFamily(
         form="IVF{lists},RaBitQ",
         kind="lists of one-bit codes",

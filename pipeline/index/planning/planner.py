@@ -31,7 +31,7 @@ from pipeline.index.planning.plan import (
     plan_factory,
     plan_index,
 )
-from pipeline.index.planning.trial import trial_rows, try_plan
+from pipeline.index.planning.trial import take_sample, trial_rows, try_plan
 from pipeline.index.settings import IndexSettings, parse_bytes
 from pipeline.index.train import SPECTRUM_ROWS, effective_dimension, sample_rows
 
@@ -142,11 +142,11 @@ class Planner:
         them.
         """
         trials = []
-        _, sample_SD = sample_rows(self._table, self._rows_of_part, trial_rows(self.gallery))
+        sample = take_sample(self._table, self._rows_of_part, trial_rows(self.gallery))
         for plan in plans:
             label = plan_label(plan)
             if label not in self._trials:
-                self._trials[label] = try_plan(plan, self.gallery, sample_SD)
+                self._trials[label] = try_plan(plan, self.gallery, sample)
             trials.append(self._trials[label])
             if not self._all and reaches(trials[-1], self.gallery):
                 break

@@ -10,25 +10,29 @@ Shapes: S rows of the sample, Q queries, K wanted rows, D dimensions.
 import math
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints, Mask
-from pipeline.index.faiss_io import FAISS, faiss_parameters
+from pipeline.features.row_reader import RowReader, supports_row_reads
+from pipeline.features.table import FeatureTable
+from pipeline.index.faiss_io import FAISS, faiss_parameters, search_faiss
 from pipeline.index.metadata import SearchParams
-from pipeline.index.part import FILTERED_EXACT_ROWS, NO_ROW, top_k
+from pipeline.index.part import FILTERED_EXACT_ROWS, NO_ROW, filtered_params, rescored, top_k
 from pipeline.index.planning.choice import PlanTrial, TrialPoint
 from pipeline.index.planning.plan import ROWS_PER_LIST, TRAINING_SHARE, GallerySpec, IndexPlan
 from pipeline.index.recall import (
     NEIGHBOURS,
     RecallQueries,
+    cheaper_params,
     measure_recall,
     measure_speed,
     search_param_grid,
 )
-from pipeline.index.train import new_index, train_index
+from pipeline.index.train import new_index, sample_rows, train_index
 
 TRIAL_SHARE = 1 / 16
 "Of the rows: a trial takes a sixteenth of the building, about."
@@ -50,40 +54,76 @@ def trial_rows(gallery: GallerySpec) -> int:
     return min(gallery.rows, memory, MAX_TRIAL_ROWS, wanted)
 
 
-def try_plan(plan: IndexPlan, gallery: GallerySpec, sample_SD: Floats) -> PlanTrial:
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """Rows of the gallery that plans are tried on."""
+
+    vectors_SD: Floats
+    read: Callable[[Ints], Floats]
+    """The vectors (R, D) of rows of the sample, which ascend, as a search reads them: from the
+    table."""
+
+
+def take_sample(table: FeatureTable, rows_of_part: dict[str, int], rows: int) -> Sample:
+    """A sample of about `rows` rows of a table."""
+    row_S, vectors_SD = sample_rows(table, rows_of_part, rows)
+    if not supports_row_reads(table.path):
+        return Sample(vectors_SD=vectors_SD, read=lambda row_R: vectors_SD[row_R])
+    reader, names = RowReader(table.path, table.dimension), list(rows_of_part)
+    first_P = np.cumsum([0, *rows_of_part.values()])
+
+    def read(row_R: Ints) -> Floats:
+        part_R = np.searchsorted(first_P, row_S[row_R], side="right") - 1
+        blocks = []
+        for part in np.unique(part_R).tolist():
+            rows_in_part = row_S[row_R][part_R == part] - first_P[part]
+            blocks.append(reader.read(names[part], table.shards[names[part]], rows_in_part))
+        vectors_RD: Floats = np.concatenate(blocks, dtype=np.float32)
+        return vectors_RD
+
+    return Sample(vectors_SD=vectors_SD, read=read)
+
+
+def try_plan(plan: IndexPlan, gallery: GallerySpec, sample: Sample) -> PlanTrial:
     """Build a plan over a sample and search it: from the fastest search to the first that is
     expected to reach the recall, and by the most thorough one where none is.
     """
-    held_out_S = np.zeros(len(sample_SD), np.bool_)
-    queries = min(TRIAL_QUERIES, len(sample_SD) // 2)
-    held_out_S[np.linspace(0, len(sample_SD) - 1, queries).astype(np.int64)] = True
-    queries_QD, rows_SD = sample_SD[held_out_S], sample_SD[~held_out_S]
-    quarter = _SampleIndex(plan, gallery, rows_SD[: math.ceil(len(rows_SD) / QUARTER)])
-    lost_of_quarter = quarter.lost_at_most_thorough(queries_QD)
-    whole = _SampleIndex(plan, gallery, rows_SD)
-    lost = whole.lost_at_most_thorough(queries_QD)
+    count = len(sample.vectors_SD)
+    queries = min(TRIAL_QUERIES, count // 2)
+    query_Q = np.unique(np.linspace(0, count - 1, queries).astype(np.int64))
+    kept_S = np.setdiff1d(np.arange(count), query_Q)
+    queries_QD = sample.vectors_SD[query_Q]
+    some_S = kept_S[: math.ceil(len(kept_S) / QUARTER)]
+    lost_of_quarter = _SampleIndex(plan, gallery, sample, some_S).lost_at_most(queries_QD)
+    whole = _SampleIndex(plan, gallery, sample, kept_S)
+    lost = whole.lost_at_most(queries_QD)
     noise = 1 / (2 * NEIGHBOURS * queries)
     power = math.log((lost + noise) / (lost_of_quarter + noise)) / math.log(QUARTER)
-    growth = (gallery.rows / len(rows_SD)) ** min(MOST_GROWTH, max(0.0, power))
+    growth = (gallery.rows / len(kept_S)) ** min(MOST_GROWTH, max(0.0, power))
     points: list[TrialPoint] = []
     for params in whole.grid():
         points.append(whole.point(params, queries_QD, growth))
         if points[-1].recall >= gallery.target_recall:
+            least = 1 - (1 - gallery.target_recall) / growth
+            points.append(whole.point(whole.cheaper(params, queries_QD, least), queries_QD, growth))
             break
     return PlanTrial(
         plan=plan,
         points=tuple(points),
-        bytes_per_row=len(FAISS.serialize_index(whole.index)) / len(rows_SD),
+        bytes_per_row=len(FAISS.serialize_index(whole.index)) / len(kept_S),
         build_seconds=whole.build_seconds,
-        sample_rows=len(rows_SD),
+        sample_rows=len(kept_S),
     )
 
 
 class _SampleIndex:
     """A plan, built over a sample in memory."""
 
-    def __init__(self, plan: IndexPlan, gallery: GallerySpec, rows_SD: Floats) -> None:
+    def __init__(self, plan: IndexPlan, gallery: GallerySpec, sample: Sample, kept_S: Ints) -> None:
+        """`kept_S`: rows of the sample, which ascend."""
+        rows_SD = sample.vectors_SD[kept_S]
         self._plan, self._gallery, self._rows_SD = plan, gallery, rows_SD
+        self._read, self._kept_S = sample.read, kept_S
         rows, share = len(rows_SD), len(rows_SD) / gallery.rows
         lists = _lists(plan.factory)
         fewer = _fewer_lists(lists, share, rows)
@@ -126,20 +166,26 @@ class _SampleIndex:
         """As `Index.search_rows`, over the sample."""
         assert params is not None
         wanted = min(len(self._rows_SD), k * params.rerank_factor)
-        breadth = params.nprobe_or_ef
         if self._allowed_S is not None:
-            breadth = math.ceil(breadth * len(self._rows_SD) / max(1, self._allowed_S.sum()))
-        scores_QC, rows_QC = self.index.search(
-            queries_QD, wanted, params=faiss_parameters(self.index, breadth, self._allowed_S)
+            share = max(1, int(np.count_nonzero(self._allowed_S))) / len(self._rows_SD)
+            params = filtered_params(params, share)
+        scores_QC, rows_QC = search_faiss(
+            self.index, queries_QD, wanted, k, params, self._allowed_S
         )
         if params.rerank_factor > 1:
-            scores_QC = np.einsum("qcd,qd->qc", self._rows_SD[rows_QC], queries_QD)
+            scores_QC = rescored(queries_QD, rows_QC, lambda row_R: self._read(self._kept_S[row_R]))
         return top_k(scores_QC, rows_QC, k)
 
-    def lost_at_most_thorough(self, queries_QD: Floats) -> float:
+    def lost_at_most(self, queries_QD: Floats) -> float:
         """Share of exact search's ten nearest that the most thorough search does not find."""
         *_, hardest = self.grid()
         return 1 - measure_recall(self, self._queries(queries_QD), hardest)[1]
+
+    def cheaper(self, params: SearchParams, queries_QD: Floats, target: float) -> SearchParams:
+        """Parameters of less work that reach the target as well."""
+        queries = self._queries(queries_QD)
+        tuned = params, *measure_recall(self, queries, params)
+        return cheaper_params(self, queries, tuned, target)[0]
 
     def point(self, params: SearchParams, queries_QD: Floats, growth: float) -> TrialPoint:
         """One setting, measured. `growth`: of the lost recall, up to all rows."""
@@ -153,6 +199,7 @@ class _SampleIndex:
         return TrialPoint(
             nprobe_or_ef=params.nprobe_or_ef,
             rerank_factor=params.rerank_factor,
+            list_ratio=params.list_ratio,
             recall=max(0.0, 1 - (1 - recall) * growth),
             sample_recall=recall,
             queries_per_second=speed["queries_per_second"] / self._slower,
