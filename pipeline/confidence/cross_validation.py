@@ -47,3 +47,27 @@ def youden_threshold(p_N: Doubles, yes_N: Doubles, weight_N: Doubles) -> float:
         return UNDECIDED
     gain_N = np.cumsum(right_N) / right_N.sum() - np.cumsum(wrong_N) / wrong_N.sum()
     return float(p_N[order_N][int(np.argmax(gain_N))])
+
+
+def wrong_share_threshold(
+    p_N: Doubles, yes_N: Doubles, weight_N: Doubles, most_wrong: float
+) -> float:
+    """The probability to answer at so that of the answers given at most `most_wrong` is wrong, and
+    as many right ones as possible are given: midway, in log-odds, between the last example that is
+    answered and the first that is not. UNDECIDED where a kind is missing."""
+    order_N = np.argsort(-p_N, kind="stable")
+    given_N, wrong_N = weight_N[order_N], (weight_N * (1 - yes_N))[order_N]
+    if not wrong_N.any() or wrong_N.sum() == given_N.sum():
+        return UNDECIDED
+    allowed_N = np.cumsum(wrong_N) <= most_wrong * np.cumsum(given_N)
+    # Equal probabilities are answered together.
+    last_N = np.append(np.diff(p_N[order_N]) != 0, True)
+    cuts = np.flatnonzero(allowed_N & last_N)
+    if len(cuts) == 0:  # the surest of all are wrong too often
+        return 1.0
+    cut = int(cuts[-1])
+    if cut == len(p_N) - 1:  # all are answered
+        return float(p_N.min())
+    around = p_N[order_N][cut : cut + 2].clip(1e-9, 1 - 1e-9)
+    log_odds = float(np.log(around / (1 - around)).mean())
+    return float(1 / (1 + np.exp(-log_odds)))

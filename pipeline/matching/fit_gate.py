@@ -9,7 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.camera.local_plane import LocalPlane
-from pipeline.confidence.cross_validation import cross_validated_probabilities, youden_threshold
+from pipeline.confidence.cross_validation import (
+    cross_validated_probabilities,
+    wrong_share_threshold,
+)
 from pipeline.confidence.logistic import fit_logistic
 from pipeline.core.arrays import Doubles, Mask, Strings
 from pipeline.matching.gate import CHANCE_INLIERS, Gate, gate_features
@@ -17,6 +20,10 @@ from pipeline.matching.refine import Refinement
 
 HELD = 0.95
 "Share of the used refinements whose true place the ellipse is to hold."
+MOST_WRONG = 0.02
+"""Share of the used refinements that may show another place. Not Youden's threshold, which weighs
+kept shares of either kind: wrong refinements are few, and to drop one of eight it drops one right
+one in ten."""
 LEAST_RIGHT = 10
 "Right refinements that a gate is fitted on; the ellipse's floor needs as many."
 FLOOR_STEPS = 40
@@ -65,7 +72,7 @@ def fit_gate(examples: GateExamples, within_m: float, place_m: float) -> FittedG
     weight_N, locations_N = examples.weight_N, examples.locations_N
     yes_N = place_N.astype(np.float64)
     place_p_N = cross_validated_probabilities(x_NF, yes_N, weight_N, locations_N)
-    threshold = youden_threshold(place_p_N, yes_N, weight_N)
+    threshold = wrong_share_threshold(place_p_N, yes_N, weight_N, MOST_WRONG)
     inliers_N = np.array([one.inliers for one in examples.refinements])
     admitted_N = (place_p_N >= threshold) & (inliers_N > CHANCE_INLIERS)
     used = (x_NF[admitted_N], right_N[admitted_N].astype(np.float64), weight_N[admitted_N])
