@@ -11,7 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.confidence.cross_validation import cross_validated_probabilities, youden_threshold
+from pipeline.confidence.cross_validation import (
+    UNDECIDED,
+    cross_validated_probabilities,
+    youden_threshold,
+)
 from pipeline.confidence.logistic import fit_logistic
 from pipeline.confidence.reliability import expected_calibration_error, reliability_bins
 from pipeline.core.arrays import Doubles, Mask
@@ -74,7 +78,8 @@ def fit_matching(
         rest = (x_NF[tiles_N], right_N[tiles_N], weight_N[tiles_N])
         p_N[tiles_N] = cross_validated_probabilities(*rest, locations_N[tiles_N])
         tile_model = fit_logistic(*rest)
-        tile_threshold = youden_threshold(p_N[tiles_N], *rest[1:])
+        # These photos found no place of their own on the map: rather unknown than wrong.
+        tile_threshold = max(youden_threshold(p_N[tiles_N], *rest[1:]), UNDECIDED)
     bins = reliability_bins(p_N, right_N, weight_N)
     known_N: Mask = ~tiles_N | (p_N >= tile_threshold)
     inside_N = np.array([inside for _, inside in both])
