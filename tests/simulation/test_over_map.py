@@ -9,16 +9,19 @@ import rasterio
 from PIL import Image
 from rasterio.transform import Affine
 
+from pipeline.camera.local_plane import LocalPlane
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.images.camera_tags import read_tags
 from pipeline.images.image_blocks import find_metadata
+from pipeline.locate.odometry import parse_odometry, travelled
 from pipeline.shards.pack import pack
 from pipeline.shards.settings import PackingSettings
 from pipeline.shards.shard_set import open_shards
-from pipeline.simulation.over_map.fly import fly
+from pipeline.simulation.over_map.fly import ODOMETRY, TABLE, TIMES, fly
 from pipeline.simulation.over_map.photo import BLOCK_M, is_in_part, photos_over_map
 from pipeline.simulation.over_map.settings import MapFlightSettings
+from pipeline.simulation.over_map.survey import camera_of_row
 from pipeline.sources.table import Table
 
 SIDE = 700
@@ -63,6 +66,36 @@ def test_fly_writes_photos_with_tags_and_the_truth(tmp_path: Path) -> None:
     assert before == {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
     with pytest.raises(InputError, match="other settings"):
         fly(settings(tmp_path, seed=1))
+
+
+def test_fly_survey_is_a_flight_with_times_and_odometry(tmp_path: Path) -> None:
+    """Photos 15 m apart, one camera; the odometry leads from one true camera to the next."""
+    write_map(tmp_path / "map.tif")
+    one = settings(
+        tmp_path, plan="survey", photos=16, every_m=15.0, line_m=30.0, speed=6.0, odometry_error=0.0
+    )
+    out = fly(one)
+    rows, times, steps = (
+        list(csv.DictReader((out / name).read_text().splitlines()))
+        for name in (TABLE, TIMES, ODOMETRY)
+    )
+    assert [row["time"] for row in times[:3]] == ["0.000", "2.500", "5.000"]
+    assert len({(row["altitude_m"], row["pitch_deg"]) for row in rows}) == 1
+    headings = np.array([float(row["heading_deg"]) for row in rows])
+    assert set(np.round((headings + 1) / 90).tolist()) == {1, 2, 3}  # forth, across, back
+    ways = travelled(
+        parse_odometry((out / ODOMETRY).read_text(), ""), [r["path"] for r in rows], ""
+    )
+    cameras = np.array([camera_of_row(row) for row in rows])
+    plane = LocalPlane(lat=float(cameras[0, 0]), lon=float(cameras[0, 1]))
+    summed = [(way.east_m - ways[0].east_m, way.north_m - ways[0].north_m) for way in ways]
+    assert np.allclose(summed, plane.to_metres(cameras), atol=0.2)
+    assert np.linalg.norm(summed[1]) == pytest.approx(15, abs=0.2)
+    assert float(steps[1]["error_m"]) == 0.01
+    with pytest.raises(InputError, match=r"has no room for photo 900 of a survey"):
+        photos_over_map(one, 900, 1)
+    with pytest.raises(InputError, match="--plan is 'survey', expected places"):
+        settings(tmp_path, plan="survey", views=2)
 
 
 def test_photo_over_a_surface_model_has_relief(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@
     overhead/<place>.jpg   with --overhead-m: each place's piece of the map
     photos.csv             path, location, lat, lon, altitude_m, heading_deg, pitch_deg: the truth,
                            as `make_shards --source table` reads it; with --overhead-m view, split
+    times.csv, odometry.csv    of a survey, as `locate --track` reads them
     flight.json            the settings; written last
 
 Each place is one task, and a rerun resumes with the missing ones.
@@ -22,10 +23,12 @@ from pipeline.core.progress import console, progress
 from pipeline.core.records import Split, View
 from pipeline.simulation.layout import write_table
 from pipeline.simulation.over_map.photo import MapPlace, photos_over_map
-from pipeline.simulation.over_map.settings import MapFlightSettings
+from pipeline.simulation.over_map.settings import SURVEY_FIELDS, MapFlightSettings
+from pipeline.simulation.over_map.survey import odometry_rows
 from pipeline.simulation.resume import begin, is_complete, local_root, settings_record
 
 TABLE, COMPLETE = "photos.csv", "flight.json"
+TIMES, ODOMETRY = "times.csv", "odometry.csv"
 
 
 @locks_output(lambda settings: settings.out)
@@ -35,7 +38,8 @@ def fly(settings: MapFlightSettings) -> Path:
     Raises InputError for a map that cannot be flown over, or a folder of another flight.
     """
     root = local_root(settings.out)
-    about = settings_record(settings, ("out", "workers"))
+    unused = SURVEY_FIELDS if settings.plan == "places" else ()
+    about = settings_record(settings, ("out", "workers", *unused))
     if is_complete(root, about, COMPLETE, "a flight with other settings,", "jobs/fly.py"):
         console.print(f"{root} is complete already; nothing to do")
         return root
@@ -46,7 +50,10 @@ def fly(settings: MapFlightSettings) -> Path:
         for _ in _visit_places(settings, root, missing):
             meter.advance()
     parts = [json_files.read_checksummed(str(_part(root, place))) for place in places]
-    write_table(root / TABLE, [row for part in parts for row in part["rows"]])
+    rows = [row for part in parts for row in part["rows"]]
+    write_table(root / TABLE, rows)
+    if settings.plan == "survey":
+        _write_survey(settings, root, [row for row in rows if row["path"].startswith("photos/")])
     json_files.write_checksummed(str(root / COMPLETE), about)
     storage.remove_folder(str(root / ".parts"))
     console.print(f"{root}: {settings.photos} photos over {settings.mosaic}", markup=False)
@@ -99,6 +106,15 @@ def _row(
     test = Split.QUERY if pose else Split.GALLERY
     split = test if settings.part == "held-out" else Split.TRAIN
     return row | {"view": View.DRONE if pose else View.SATELLITE, "split": split}
+
+
+def _write_survey(settings: MapFlightSettings, root: Path, rows: list[dict[str, str]]) -> None:
+    """The times of a flight's photos, and its odometry."""
+    seconds = settings.every_m / settings.speed
+    names = [row["path"].rpartition("/")[2] for row in rows]
+    times = [{"photo": name, "time": f"{at * seconds:.3f}"} for at, name in enumerate(names)]
+    write_table(root / TIMES, times)
+    write_table(root / ODOMETRY, odometry_rows(rows, settings.odometry_error, settings.seed))
 
 
 def _part(root: Path, place: int) -> Path:

@@ -6,6 +6,7 @@ season, haze and sensor; with a surface model it has relief and parallax, withou
 Sun and shadows stay as in the map.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -25,6 +26,7 @@ from pipeline.simulation.appearance import sample_day
 from pipeline.simulation.flight import LOWEST_RAY_DEG
 from pipeline.simulation.over_map.photo_tags import with_camera_tags
 from pipeline.simulation.over_map.settings import MapFlightSettings, Part
+from pipeline.simulation.over_map.survey import survey_point
 from pipeline.simulation.render import render_perspective
 from pipeline.simulation.scene import REACH_IN_RADII, prepare_scene
 from pipeline.simulation.texture import photographed_world
@@ -88,8 +90,11 @@ def photos_over_map(settings: MapFlightSettings, place: int, count: int) -> MapP
         ) from None
     tries = 0
     for _ in range(MOST_DRAWS):
-        poses = [draw_pose(settings, rng) for _ in range(count)]
-        middle = _draw_point(settings, placement, rng)
+        if settings.plan == "survey":
+            poses, middle = _on_survey(settings, placement, place)
+        else:
+            poses = [draw_pose(settings, rng) for _ in range(count)]
+            middle = _draw_point(settings, placement, rng)
         reaches_m = [_reach_m(pose) for pose in poses]
         if _edge_m(settings.mosaic, placement, middle) < 0.95 * max(reaches_m):
             continue  # known without reading
@@ -121,6 +126,35 @@ def photos_over_map(settings: MapFlightSettings, place: int, count: int) -> MapP
             piece.pixels_HW3, quality=OVERHEAD_QUALITY, colorspace="RGB"
         )
     return MapPlace(lat=widest.plane.lat, lon=widest.plane.lon, photos=photos, overhead=overhead)
+
+
+def _on_survey(
+    settings: MapFlightSettings, placement: Placement, number: int
+) -> tuple[list[Pose], tuple[float, float]]:
+    """The pose of a survey's photo, and the map's pixel in its middle. Its camera is that of the
+    whole flight.
+
+    Raises InputError where the map is too small.
+    """
+    drawn = draw_pose(settings, np.random.default_rng(settings.seed))
+    look = {"altitude_m": drawn.altitude_m, "pitch_deg": drawn.pitch_deg, "fov_deg": drawn.fov_deg}
+    ahead_m, dataset = math.hypot(drawn.x_m, drawn.y_m), open_mosaic(settings.mosaic)
+    reach_m = _reach_m(Pose.looking_at_zero(heading_deg=0.0, **look))
+    across_m, down_m = placement.pixel_m
+    x_m, y_m, direction_deg = survey_point(
+        number, settings.every_m, settings.line_m,
+        (dataset.width * across_m, dataset.height * down_m), ahead_m + reach_m,
+    )  # fmt: skip
+    right, up = math.sin(math.radians(direction_deg)), math.cos(math.radians(direction_deg))
+    here = x_m / across_m, y_m / down_m
+    middle = here[0] + ahead_m * right / across_m, here[1] - ahead_m * up / down_m
+    # The map's upper side need not be north.
+    further = middle[0] + 9 * right / across_m, middle[1] - 9 * up / down_m
+    degrees_22 = placement.georeference.degrees(np.array([middle, further]))
+    plane = LocalPlane(lat=float(degrees_22[0, 0]), lon=float(degrees_22[0, 1]))
+    [[east, north]] = plane.to_metres(degrees_22[1:]).tolist()
+    heading_deg = math.degrees(math.atan2(east, north)) % 360
+    return [Pose.looking_at_zero(heading_deg=heading_deg, **look)], middle
 
 
 def _take(

@@ -3,7 +3,7 @@
 Imports nothing heavy, so that the command line is parsed at once.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated, Literal
 
 import tyro
@@ -37,7 +37,35 @@ class CameraRanges:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MapFlightSettings(CameraRanges):
+class SurveySettings:
+    """Whether photos are of one flight, and its plan."""
+
+    plan: Literal["places", "survey"] = "places"
+    """Photos of random places; or of one flight along parallel lines, with the camera fixed to a
+    UAV that looks ahead: times.csv and odometry.csv are written too, as jobs/locate.py reads
+    them."""
+    every_m: float = 40.0
+    "Of a survey, metres between photos."
+    line_m: float = 60.0
+    "Of a survey, metres between lines."
+    speed: float = 10.0
+    "Of a survey, metres per second."
+    odometry_error: float = 0.05
+    """Standard deviation of the odometry's displacement, east and north each, as a share of the
+    distance between two photos."""
+
+    def __post_init__(self) -> None:
+        for name in ("every_m", "line_m", "speed"):
+            require(getattr(self, name) > 0, name, getattr(self, name), "a number above 0")
+        error = self.odometry_error
+        require(error >= 0, "odometry_error", error, "0 or more")
+
+
+SURVEY_FIELDS = tuple(one.name for one in fields(SurveySettings))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapFlightSettings(SurveySettings, CameraRanges):
     """The map, and the photos that are taken over it."""
 
     mosaic: str
@@ -45,7 +73,7 @@ class MapFlightSettings(CameraRanges):
     out: str
     "Folder of the photos and their table; a local or mounted path."
     photos: int = 200
-    "Number of photos, at random places of the map."
+    "Number of photos."
     views: int = 1
     "Photos of each place, each with a pose and a day of its own."
     overhead_m: float | None = None
@@ -72,7 +100,11 @@ class MapFlightSettings(CameraRanges):
     after the other in this process."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        SurveySettings.__post_init__(self)
+        CameraRanges.__post_init__(self)
+        alone = self.plan == "places" or (self.views == 1 and self.part == "all")
+        require(alone, "plan", self.plan, "places with --views or --part: a survey has one photo "
+                "of each place, of all of the map")  # fmt: skip
         require(self.photos >= 1, "photos", self.photos, "1 or more")
         require(self.views >= 1, "views", self.views, "1 or more")
         side = self.overhead_m
