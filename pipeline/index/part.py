@@ -6,7 +6,6 @@ P pairs of query and candidate.
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -80,9 +79,9 @@ class IndexPart:
             row_C = np.flatnonzero(allowed_N)
             rows_QC = np.broadcast_to(row_C, (len(queries_QD), count))
             return top_k(self._exact_scores(queries_QD, row_C), rows_QC, k)
-        wanted = min(count, max(k, k * params.rerank_factor))
         if allowed_N is not None:
             params = filtered_params(params, count / self.metadata.rows)
+        wanted = min(count, max(k, k * params.rerank_factor))
         scores_QC, rows_QC = search_faiss(self.index, queries_QD, wanted, k, params, allowed_N)
         if params.rerank_factor > 1 and self._reader is not None:
             scores_QC = rescored(queries_QD, rows_QC, self.vectors)
@@ -128,9 +127,14 @@ def rescored(queries_QD: Floats, rows_QC: Ints, vectors: Callable[[Ints], Floats
 
 def filtered_params(params: SearchParams, share: float) -> SearchParams:
     """Search parameters where a filter leaves a share of the rows: the fewer match, the more lists
-    hold as many of them.
+    hold as many of them, and the farther these are and the nearer to each other, so that coarse
+    codes order them worse: with as many candidates as without a filter, .965 became .940.
     """
-    return replace(params, nprobe_or_ef=math.ceil(params.nprobe_or_ef / share), list_ratio=0.0)
+    factor = params.rerank_factor
+    return SearchParams(
+        nprobe_or_ef=math.ceil(params.nprobe_or_ef / share),
+        rerank_factor=math.ceil(factor / math.sqrt(share)) if factor > 1 else 1,
+    )
 
 
 def _empty_result(queries: int, k: int) -> tuple[Floats, Ints]:

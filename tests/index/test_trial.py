@@ -15,15 +15,15 @@ from pipeline.index.settings import IndexSettings
 from tests.index.index_tables import clustered, write_table_part
 
 ROWS, DIMENSION = 1_800, 32
-FIRST = "IVF32,SQ8"
+FIRST = "HNSW32,SQ8"
 "The plan that the planner tries first for such a gallery."
 
 
 @pytest.fixture(scope="module")
 def tight(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Clusters so tight that the steps of 8-bit codes are as long as the ways between neighbours:
-    lists of such codes, the planner's first choice, find .55 however hard they are searched, and a
-    graph .41.
+    a graph over such codes, the planner's first choice, finds .41 however hard it searches, and
+    lists .55.
     """
     folder = tmp_path_factory.mktemp("tight")
     for number in range(3):

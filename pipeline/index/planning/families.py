@@ -53,7 +53,6 @@ FAMILIES = (
         refine="table",
         reduces=True,
     ),
-    IndexFamily(form="IVF{lists},SQ8", kind="lists of 8-bit codes", bits=8, ceiling=0.985),
     IndexFamily(
         form="HNSW32,SQ8",
         kind="a graph over 8-bit codes",
@@ -63,6 +62,7 @@ FAMILIES = (
         graph=True,
         merging=2,
     ),
+    IndexFamily(form="IVF{lists},SQ8", kind="lists of 8-bit codes", bits=8, ceiling=0.985),
     IndexFamily(
         form="IVF{lists},RaBitQ",
         kind="lists of one-bit codes",

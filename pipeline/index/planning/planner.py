@@ -138,10 +138,10 @@ class Planner:
         )
 
     def _try(self, plans: Sequence[IndexPlan]) -> list[PlanTrial]:
-        """Trials of the plans: of all where limits are given, else up to the first that keeps
-        them.
+        """Trials of the plans: of all where limits are given, else up to the first that is expected
+        to reach the recall.
         """
-        trials = []
+        trials: list[PlanTrial] = []
         sample = take_sample(self._table, self._rows_of_part, trial_rows(self.gallery))
         for plan in plans:
             label = plan_label(plan)

@@ -165,10 +165,10 @@ class _SampleIndex:
     ) -> tuple[Floats, Ints]:
         """As `Index.search_rows`, over the sample."""
         assert params is not None
-        wanted = min(len(self._rows_SD), k * params.rerank_factor)
         if self._allowed_S is not None:
             share = max(1, int(np.count_nonzero(self._allowed_S))) / len(self._rows_SD)
             params = filtered_params(params, share)
+        wanted = min(len(self._rows_SD), k * params.rerank_factor)
         scores_QC, rows_QC = search_faiss(
             self.index, queries_QD, wanted, k, params, self._allowed_S
         )
