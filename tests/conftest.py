@@ -47,7 +47,7 @@ RAY_FIXTURES = {"ray_session", "ray_cluster"}
 SLOW_FIXTURES = RAY_FIXTURES | {"prepared", "browser"}
 """Tests that use one of them start Ray, jobs or Chromium: `make test-fast` leaves them out. So it
 does with tests/fuzz, and with tests and files that are marked."""
-STARTS = re.compile(r"\b(ray_session|ray_cluster|ray_address|prepared)\b")
+STARTS = re.compile(r"\b(ray_session|ray_cluster|ray_address|prepared|adapted_region)\b")
 "In a file of tests: it needs the session's Ray, or the process that starts jobs."
 RAY_UNITS = ("tests/jobs/", "tests/")
 """Beginnings of such files' names: of several test processes (pytest -n), one runs a unit to its
