@@ -74,11 +74,7 @@ def adapt(settings: AdaptSettings) -> list[Expectation]:
     seconds: dict[str, float] = {}
     cameras = camera_ranges(settings)
     with step(seconds, "1 tiles", "the map as a gallery"):
-        print_command("make_shards", source="geotiff", root=settings.mosaic, out=region.tiles,
-                 tile_m=settings.tile_m, overlap=OVERLAP)  # fmt: skip
-        cluster.connect()
-        source = GeoTiff(tile_m=(settings.tile_m,), overlap=OVERLAP)
-        pack(source, PackingSettings(root=settings.mosaic, out=region.tiles))
+        pack_tiles(region, settings)
     with step(seconds, "2 flights", "simulated photos: to learn from, to check with, to expect by"):
         flights = [take_flight(one) for one in plan_flights(region, settings, cameras)]
     with step(seconds, "3 encoder", "the built-in one, fine-tuned on this map"):
@@ -114,6 +110,17 @@ def camera_ranges(settings: AdaptSettings) -> CameraRanges:
         markup=False,
     )
     return found
+
+
+def pack_tiles(region: Region, settings: AdaptSettings) -> None:
+    """The map's tiles; beside those that are there, where another map is added."""
+    more = {"extend": True} if settings.extend else {}
+    print_command("make_shards", source="geotiff", root=settings.mosaic, out=region.tiles,
+             tile_m=settings.tile_m, overlap=OVERLAP, **more)  # fmt: skip
+    cluster.connect()
+    source = GeoTiff(tile_m=(settings.tile_m,), overlap=OVERLAP)
+    packing = PackingSettings(root=settings.mosaic, out=region.tiles, extend=settings.extend)
+    pack(source, packing)
 
 
 def embed_tiles(region: Region) -> None:

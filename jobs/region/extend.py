@@ -10,12 +10,12 @@ from typing import Any
 
 from jobs.region.adapt import (
     FIGURES,
-    OVERLAP,
     camera_ranges,
     embed_tiles,
     expectation_table,
     fit_confidence,
     locate_command,
+    pack_tiles,
     write_page,
 )
 from jobs.region.expect import located_outcomes, real_photos
@@ -23,16 +23,13 @@ from jobs.region.flights import EXPECT, plan_flights, take_flight
 from jobs.region.folder import Region, print_command, with_absolute_paths
 from jobs.region.settings import AdaptSettings
 from jobs.stages.demo import step
-from pipeline.core import cluster, storage
+from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.lock import locks_output
 from pipeline.core.progress import results
 from pipeline.index.update import extend_index
 from pipeline.region.expectation import Expectation, expectations, read_expectations
-from pipeline.shards.pack import pack
-from pipeline.shards.settings import PackingSettings
 from pipeline.simulation.over_map.fly import TABLE
-from pipeline.sources.geotiff import GeoTiff
 
 
 @locks_output(lambda settings: settings.out)
@@ -41,7 +38,7 @@ def extend_region(settings: AdaptSettings) -> list[Expectation]:
 
     Raises InputError for a map that cannot be used, or a folder without a finished region.
     """
-    settings = with_absolute_paths(settings)
+    settings = replace(with_absolute_paths(settings), extend=True)
     region = Region(out=settings.out)
     figures = _figures(region)
     if not storage.is_file(settings.mosaic):
@@ -53,11 +50,7 @@ def extend_region(settings: AdaptSettings) -> list[Expectation]:
         return found
     seconds: dict[str, float] = {}
     with step(seconds, "1 tiles", "the map's tiles, beside those that are there"):
-        print_command("make_shards", source="geotiff", root=settings.mosaic, out=region.tiles,
-                 tile_m=settings.tile_m, overlap=OVERLAP, extend=True)  # fmt: skip
-        cluster.connect()
-        source = GeoTiff(tile_m=(settings.tile_m,), overlap=OVERLAP)
-        pack(source, PackingSettings(root=settings.mosaic, out=region.tiles, extend=True))
+        pack_tiles(region, settings)
     with step(seconds, "2 flight", "simulated photos over it, to expect by"):
         *_, expect = plan_flights(region, settings, camera_ranges(settings))
         # Over the whole of it, for none of it was learned.

@@ -4,7 +4,7 @@ The order is that of `benchmarks/index.py` (docs/results.md); which one is taken
 trial on the gallery's own vectors (`trial.py`), since it depends on how the neighbours lie.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 SUBQUANTISER_DIM = 8
@@ -44,33 +44,31 @@ class IndexFamily:
         return self.bits * dimension / 8 + self.extra_bytes
 
 
+LISTS_OF_BYTES = IndexFamily(
+    form="IVF{lists},SQ8", kind="lists of 8-bit codes", bits=8, ceiling=0.985
+)
+LISTS_OF_BITS = IndexFamily(
+    form="IVF{lists},RaBitQ",
+    kind="lists of one-bit codes",
+    bits=1,
+    extra_bytes=16,
+    ceiling=0.97,
+    refine="table",
+)
+GRAPH = IndexFamily(
+    form="HNSW32,SQ8",
+    kind="a graph over 8-bit codes",
+    bits=8,
+    extra_bytes=GRAPH_BYTES,
+    ceiling=0.985,
+    graph=True,
+    merging=2,
+)
 FAMILIES = (
-    IndexFamily(
-        form="IVF{lists},SQ8",
-        kind="lists of 8-bit codes",
-        bits=8,
-        ceiling=0.985,
-        refine="table",
-        reduces=True,
-    ),
-    IndexFamily(
-        form="HNSW32,SQ8",
-        kind="a graph over 8-bit codes",
-        bits=8,
-        extra_bytes=GRAPH_BYTES,
-        ceiling=0.985,
-        graph=True,
-        merging=2,
-    ),
-    IndexFamily(form="IVF{lists},SQ8", kind="lists of 8-bit codes", bits=8, ceiling=0.985),
-    IndexFamily(
-        form="IVF{lists},RaBitQ",
-        kind="lists of one-bit codes",
-        bits=1,
-        extra_bytes=16,
-        ceiling=0.97,
-        refine="table",
-    ),
+    replace(LISTS_OF_BYTES, refine="table", reduces=True),
+    GRAPH,
+    LISTS_OF_BYTES,
+    LISTS_OF_BITS,
     IndexFamily(
         form="IVF{lists},PQ{pieces}x4fs",
         kind="lists of 4-bit product codes",
@@ -80,25 +78,8 @@ FAMILIES = (
         merging=2,
     ),
     IndexFamily(form="IVF{lists},SQfp16", kind="lists of 16-bit numbers", bits=16, ceiling=0.999),
-    IndexFamily(
-        form="HNSW32,SQ8",
-        kind="a graph over 8-bit codes",
-        bits=8,
-        extra_bytes=GRAPH_BYTES,
-        ceiling=0.99,
-        refine="table",
-        graph=True,
-        merging=2,
-    ),
-    IndexFamily(
-        form="IVF{lists},RaBitQ",
-        kind="lists of one-bit codes",
-        bits=1,
-        extra_bytes=16,
-        ceiling=0.97,
-        refine="table",
-        on_disk=True,
-    ),
+    replace(GRAPH, ceiling=0.99, refine="table"),
+    replace(LISTS_OF_BITS, on_disk=True),
     IndexFamily(
         form="IVF{lists},RaBitQ4",
         kind="lists of four-bit codes",
@@ -106,9 +87,7 @@ FAMILIES = (
         extra_bytes=24,
         ceiling=0.9,
     ),
-    IndexFamily(
-        form="IVF{lists},SQ8", kind="lists of 8-bit codes", bits=8, ceiling=0.985, on_disk=True
-    ),
+    replace(LISTS_OF_BYTES, on_disk=True),
 )
 EXACT = IndexFamily(
     form="Flat", kind="exact search", bits=32, extra_bytes=0, ceiling=1.0, merging=2
