@@ -144,11 +144,14 @@ def _start_head(
         f"--dashboard-agent-grpc-port={metrics} --runtime-env-agent-port={environments} "
         f"--ray-client-server-port={client} --num-cpus={cpus} --temp-dir={scratch}"
     )
-    environment = os.environ | environment
+    folder = Path(sys.executable).parent
+    # `python` of a submitted job is the first of its node's PATH.
+    path = os.pathsep.join((str(folder), os.environ["PATH"]))
+    environment = os.environ | {"PATH": path} | environment
     environment.pop("RAY_ADDRESS", None)  # of another cluster
     with Path(scratch, LOG).open("wb") as log:
         head = subprocess.Popen(
-            [str(Path(sys.executable).with_name("ray")), *words.split()],
+            [str(folder / "ray"), *words.split()],
             env=environment,
             start_new_session=True,
             stdout=log,
