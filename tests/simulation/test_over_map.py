@@ -20,6 +20,7 @@ from pipeline.shards.settings import PackingSettings
 from pipeline.shards.shard_set import open_shards
 from pipeline.simulation.over_map.fly import ODOMETRY, TABLE, TIMES, fly
 from pipeline.simulation.over_map.photo import BLOCK_M, is_in_part, photos_over_map
+from pipeline.simulation.over_map.poses import spiral_poses
 from pipeline.simulation.over_map.settings import MapFlightSettings
 from pipeline.simulation.over_map.survey import camera_of_row
 from pipeline.sources.table import Table
@@ -96,6 +97,51 @@ def test_fly_survey_is_a_flight_with_times_and_odometry(tmp_path: Path) -> None:
         photos_over_map(one, 900, 1)
     with pytest.raises(InputError, match="--plan is 'survey', expected places"):
         settings(tmp_path, plan="survey", views=2)
+
+
+def test_fly_spiral_circles_one_place_downwards(tmp_path: Path) -> None:
+    """Three turns around one place, steep where the UAV is high; at 24 m and 20 m away the lowest
+    photo looks down by 50 degrees."""
+    write_map(tmp_path / "map.tif")
+    one = settings(
+        tmp_path, plan="spiral", photos=9, height=(24.0, 48.0), pitch=(-80.0, -50.0),
+        overhead_m=30.0, part="learn", speed=5.0, odometry_error=0.0,
+    )  # fmt: skip
+    out = fly(one)
+    rows, times, steps = (
+        list(csv.DictReader((out / name).read_text().splitlines()))
+        for name in (TABLE, TIMES, ODOMETRY)
+    )
+    assert [row["path"] for row in rows if row["view"] == "satellite"] == ["overhead/00000.jpg"]
+    assert len({(row["location"], row["lat"], row["lon"]) for row in rows}) == 1
+    photos = [row for row in rows if row["view"] == "drone"]
+    turns = np.diff([float(row["heading_deg"]) for row in photos]) % 360
+    assert np.allclose(turns, 120, atol=0.1)
+    heights = np.array([float(row["altitude_m"]) for row in photos])
+    assert np.allclose(heights, np.linspace(48, 24, 9), atol=0.01)
+    away = heights / np.tan(np.radians([-float(row["pitch_deg"]) for row in photos]))
+    assert np.allclose(away, 24 / np.tan(np.radians(50)), atol=0.05)
+    chord = 2 * away[0] * np.sin(np.radians(60))
+    assert float(times[2]["time"]) == pytest.approx(2 * chord / 5, abs=0.05)
+    assert np.hypot(float(steps[1]["east_m"]), float(steps[1]["north_m"])) == pytest.approx(
+        chord, abs=0.2
+    )
+    with pytest.raises(InputError, match="--plan is 'spiral', expected places with --views"):
+        settings(tmp_path, plan="spiral", views=2)
+
+
+def test_spiral_flies_further_out_where_it_looks_steep(tmp_path: Path) -> None:
+    """No photo is steeper than --pitch says, and one lens takes them all."""
+    one = settings(tmp_path, plan="spiral", photos=20, height=(20.0, 80.0), pitch=(-60.0, -50.0))
+    poses = spiral_poses(one, np.random.default_rng(0))
+    pitches = [pose.pitch_deg for pose in poses]
+    assert [pitches[0], pitches[-1]] == pytest.approx([-60, -50])
+    assert all(-60 - 1e-9 <= pitch <= -50 + 1e-9 for pitch in pitches)
+    assert len({pose.fov_deg for pose in poses}) == 1
+    down = spiral_poses(
+        settings(tmp_path, plan="spiral", pitch=(-90.0, -90.0)), np.random.default_rng(0)
+    )
+    assert max(abs(pose.x_m) for pose in down) < 1e-9
 
 
 def test_photo_over_a_surface_model_has_relief(tmp_path: Path) -> None:

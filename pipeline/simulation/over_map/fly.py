@@ -4,7 +4,7 @@
     overhead/<place>.jpg   with --overhead-m: each place's piece of the map
     photos.csv             path, location, lat, lon, altitude_m, heading_deg, pitch_deg: the truth,
                            as `make_shards --source table` reads it; with --overhead-m view, split
-    times.csv, odometry.csv    of a survey, as `locate --track` reads them
+    times.csv, odometry.csv    of a survey or a spiral, as `locate --track` reads them
     flight.json            the settings; written last
 
 Each place is one task, and a rerun resumes with the missing ones.
@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import ray
 
 from pipeline.camera.pose import Pose
@@ -23,8 +24,8 @@ from pipeline.core.progress import console, progress
 from pipeline.core.records import Split, View
 from pipeline.simulation.layout import write_table
 from pipeline.simulation.over_map.photo import MapPlace, photos_over_map
-from pipeline.simulation.over_map.settings import SURVEY_FIELDS, MapFlightSettings
-from pipeline.simulation.over_map.survey import odometry_rows
+from pipeline.simulation.over_map.settings import UNUSED_FIELDS, MapFlightSettings
+from pipeline.simulation.over_map.survey import camera_moves, odometry_rows, time_rows
 from pipeline.simulation.resume import begin, is_complete, local_root, settings_record
 
 TABLE, COMPLETE = "photos.csv", "flight.json"
@@ -38,8 +39,7 @@ def fly(settings: MapFlightSettings) -> Path:
     Raises InputError for a map that cannot be flown over, or a folder of another flight.
     """
     root = local_root(settings.out)
-    unused = SURVEY_FIELDS if settings.plan == "places" else ()
-    about = settings_record(settings, ("out", "workers", *unused))
+    about = settings_record(settings, ("out", "workers", *UNUSED_FIELDS[settings.plan]))
     if is_complete(root, about, COMPLETE, "a flight with other settings,", "jobs/fly.py"):
         console.print(f"{root} is complete already; nothing to do")
         return root
@@ -52,8 +52,8 @@ def fly(settings: MapFlightSettings) -> Path:
     parts = [json_files.read_checksummed(str(_part(root, place))) for place in places]
     rows = [row for part in parts for row in part["rows"]]
     write_table(root / TABLE, rows)
-    if settings.plan == "survey":
-        _write_survey(settings, root, [row for row in rows if row["path"].startswith("photos/")])
+    if settings.plan != "places":
+        _write_track(settings, root, [row for row in rows if row["path"].startswith("photos/")])
     json_files.write_checksummed(str(root / COMPLETE), about)
     storage.remove_folder(str(root / ".parts"))
     console.print(f"{root}: {settings.photos} photos over {settings.mosaic}", markup=False)
@@ -94,7 +94,7 @@ def _row(
     """The table's row of a photo, or, without a pose, of a piece of the map."""
     row = {
         "path": path,
-        "location": f"{place:05d}",
+        "location": f"{settings.location_of(place):05d}",
         "lat": f"{found.lat:.8f}",
         "lon": f"{found.lon:.8f}",
         "altitude_m": f"{pose.altitude_m:.2f}" if pose else "",
@@ -108,13 +108,16 @@ def _row(
     return row | {"view": View.DRONE if pose else View.SATELLITE, "split": split}
 
 
-def _write_survey(settings: MapFlightSettings, root: Path, rows: list[dict[str, str]]) -> None:
+def _write_track(settings: MapFlightSettings, root: Path, rows: list[dict[str, str]]) -> None:
     """The times of a flight's photos, and its odometry."""
-    seconds = settings.every_m / settings.speed
     names = [row["path"].rpartition("/")[2] for row in rows]
-    times = [{"photo": name, "time": f"{at * seconds:.3f}"} for at, name in enumerate(names)]
-    write_table(root / TIMES, times)
-    write_table(root / ODOMETRY, odometry_rows(rows, settings.odometry_error, settings.seed))
+    moves_M2 = camera_moves(rows)
+    steps_M = np.linalg.norm(moves_M2, axis=1)
+    if settings.plan == "survey":
+        steps_M[:] = settings.every_m  # along the lines, and around their corners
+    write_table(root / TIMES, time_rows(names, steps_M, settings.speed))
+    odometry = odometry_rows(names, moves_M2, settings.odometry_error, settings.seed)
+    write_table(root / ODOMETRY, odometry)
 
 
 def _part(root: Path, place: int) -> Path:

@@ -6,7 +6,6 @@ season, haze and sensor; with a surface model it has relief and parallax, withou
 Sun and shadows stay as in the map.
 """
 
-import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -17,16 +16,14 @@ from rasterio.enums import Resampling
 from rasterio.transform import Affine
 from rasterio.warp import reproject
 
-from pipeline.camera.ground import apply_homography, corners, photo_to_ground
 from pipeline.camera.local_plane import LocalPlane
 from pipeline.camera.map_window import MapWindow, Tile, compose_window
 from pipeline.camera.pose import Pose
 from pipeline.core.errors import InputError
 from pipeline.simulation.appearance import sample_day
-from pipeline.simulation.flight import LOWEST_RAY_DEG
 from pipeline.simulation.over_map.photo_tags import with_camera_tags
+from pipeline.simulation.over_map.poses import draw_poses, reach_m, spiral_poses, survey_pose
 from pipeline.simulation.over_map.settings import MapFlightSettings, Part
-from pipeline.simulation.over_map.survey import survey_point
 from pipeline.simulation.render import render_perspective
 from pipeline.simulation.scene import REACH_IN_RADII, prepare_scene
 from pipeline.simulation.texture import photographed_world
@@ -48,8 +45,6 @@ place keeps away from its border."""
 OVERHEAD_QUALITY = 92
 MOST_WITHOUT_HEIGHT = 0.1
 "Likewise, the share that a surface model may lack, at the map's edge and in its gaps."
-MARGIN_M = 12.0
-"Ground beyond the photo's corners."
 BLUR_PX = (0.4, 1.1)
 "Range of the lens' blur, standard deviation in pixels."
 
@@ -80,7 +75,9 @@ def photos_over_map(settings: MapFlightSettings, place: int, count: int) -> MapP
 
     Raises InputError where the map has no place for them, or cannot be used.
     """
+    spiral = settings.plan == "spiral"
     rng = np.random.default_rng([settings.seed, place])
+    for_place = np.random.default_rng(settings.seed) if spiral else rng
     try:
         placement = place_mosaic(settings.mosaic, None, False)
     except MosaicRejected as rejected:
@@ -91,11 +88,15 @@ def photos_over_map(settings: MapFlightSettings, place: int, count: int) -> MapP
     tries = 0
     for _ in range(MOST_DRAWS):
         if settings.plan == "survey":
-            poses, middle = _on_survey(settings, placement, place)
+            poses, middle = survey_pose(settings, placement, place)
         else:
-            poses = [draw_pose(settings, rng) for _ in range(count)]
-            middle = _draw_point(settings, placement, rng)
-        reaches_m = [_reach_m(pose) for pose in poses]
+            poses = (
+                spiral_poses(settings, for_place)
+                if spiral
+                else draw_poses(settings, for_place, count)
+            )
+            middle = _draw_point(settings, placement, for_place)
+        reaches_m = [reach_m(pose) for pose in poses]
         if _edge_m(settings.mosaic, placement, middle) < 0.95 * max(reaches_m):
             continue  # known without reading
         widest = _window_around(settings.mosaic, placement, middle, max(reaches_m))
@@ -114,47 +115,18 @@ def photos_over_map(settings: MapFlightSettings, place: int, count: int) -> MapP
             "larger map"
         )
     photos = []
-    for pose, reach_m in zip(poses, reaches_m, strict=True):
+    for pose in poses[place : place + 1] if spiral else poses:
         window = widest
-        if reach_m < max(reaches_m):
-            window = _window_around(settings.mosaic, placement, middle, reach_m)
+        if reach_m(pose) < max(reaches_m):
+            window = _window_around(settings.mosaic, placement, middle, reach_m(pose))
         photos.append(_take(settings, window, pose, rng))
     overhead = None
-    if settings.overhead_m is not None:
+    if settings.overhead_m is not None and settings.location_of(place) == place:
         piece = _window_around(settings.mosaic, placement, middle, settings.overhead_m / 2)
         overhead = simplejpeg.encode_jpeg(
             piece.pixels_HW3, quality=OVERHEAD_QUALITY, colorspace="RGB"
         )
     return MapPlace(lat=widest.plane.lat, lon=widest.plane.lon, photos=photos, overhead=overhead)
-
-
-def _on_survey(
-    settings: MapFlightSettings, placement: Placement, number: int
-) -> tuple[list[Pose], tuple[float, float]]:
-    """The pose of a survey's photo, and the map's pixel in its middle. Its camera is that of the
-    whole flight.
-
-    Raises InputError where the map is too small.
-    """
-    drawn = draw_pose(settings, np.random.default_rng(settings.seed))
-    look = {"altitude_m": drawn.altitude_m, "pitch_deg": drawn.pitch_deg, "fov_deg": drawn.fov_deg}
-    ahead_m, dataset = math.hypot(drawn.x_m, drawn.y_m), open_mosaic(settings.mosaic)
-    reach_m = _reach_m(Pose.looking_at_zero(heading_deg=0.0, **look))
-    across_m, down_m = placement.pixel_m
-    x_m, y_m, direction_deg = survey_point(
-        number, settings.every_m, settings.line_m,
-        (dataset.width * across_m, dataset.height * down_m), ahead_m + reach_m,
-    )  # fmt: skip
-    right, up = math.sin(math.radians(direction_deg)), math.cos(math.radians(direction_deg))
-    here = x_m / across_m, y_m / down_m
-    middle = here[0] + ahead_m * right / across_m, here[1] - ahead_m * up / down_m
-    # The map's upper side need not be north.
-    further = middle[0] + 9 * right / across_m, middle[1] - 9 * up / down_m
-    degrees_22 = placement.georeference.degrees(np.array([middle, further]))
-    plane = LocalPlane(lat=float(degrees_22[0, 0]), lon=float(degrees_22[0, 1]))
-    [[east, north]] = plane.to_metres(degrees_22[1:]).tolist()
-    heading_deg = math.degrees(math.atan2(east, north)) % 360
-    return [Pose.looking_at_zero(heading_deg=heading_deg, **look)], middle
 
 
 def _take(
@@ -173,26 +145,6 @@ def _take(
     jpeg: bytes = simplejpeg.encode_jpeg(frame_SS3, quality=JPEG_QUALITY, colorspace="RGB")
     told = _told(pose, settings, rng)
     return MapPhoto(jpeg=with_camera_tags(jpeg, told, settings.size), pose=pose)
-
-
-def draw_pose(settings: MapFlightSettings, rng: np.random.Generator) -> Pose:
-    """A pose that looks at (0, 0), uniformly within the settings' ranges; the view is narrowed
-    where its lowest ray would be flatter than LOWEST_RAY_DEG."""
-    pitch = float(rng.uniform(*settings.pitch))
-    widest = 2 * (-pitch - LOWEST_RAY_DEG)
-    fov = min(float(rng.uniform(*settings.fov)), widest)
-    height = float(rng.uniform(*settings.height))
-    heading = float(rng.uniform(0, 360))
-    return Pose.looking_at_zero(
-        altitude_m=height, heading_deg=heading, pitch_deg=pitch, fov_deg=fov
-    )
-
-
-def _reach_m(pose: Pose) -> float:
-    """Half the side of the square of ground that a photo shows, around (0, 0)."""
-    size = (100, 100)
-    shown_42 = apply_homography(photo_to_ground(pose, size), corners(size))
-    return float(np.abs(shown_42).max()) + MARGIN_M
 
 
 def _draw_point(

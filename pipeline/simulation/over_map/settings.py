@@ -36,20 +36,26 @@ class CameraRanges:
         require(5 <= low <= high <= 120, "fov", self.fov, "two angles from 5 to 120 degrees")
 
 
+Plan = Literal["places", "survey", "spiral"]
+
+
 @dataclass(frozen=True, kw_only=True)
-class SurveySettings:
+class PlanSettings:
     """Whether photos are of one flight, and its plan."""
 
-    plan: Literal["places", "survey"] = "places"
-    """Photos of random places; or of one flight along parallel lines, with the camera fixed to a
-    UAV that looks ahead: times.csv and odometry.csv are written too, as jobs/locate.py reads
-    them."""
+    plan: Plan = "places"
+    """Photos of random places. Or of one flight, for which times.csv and odometry.csv are written
+    too, as jobs/locate.py reads them: a survey of parallel lines, with the camera fixed to a UAV
+    that looks ahead; or a spiral of three turns around one place that the seed draws, as
+    University-1652 has them: from the upper end of --height to the lower one at an even distance,
+    from which the lowest photo has the flatter end of --pitch; further out where the steeper end
+    asks for it."""
     every_m: float = 40.0
-    "Of a survey, metres between photos."
+    "Of a survey, metres between photos; those of a spiral share its three turns evenly."
     line_m: float = 60.0
     "Of a survey, metres between lines."
     speed: float = 10.0
-    "Of a survey, metres per second."
+    "Of a survey or a spiral, metres per second."
     odometry_error: float = 0.05
     """Standard deviation of the odometry's displacement, east and north each, as a share of the
     distance between two photos."""
@@ -60,12 +66,22 @@ class SurveySettings:
         error = self.odometry_error
         require(error >= 0, "odometry_error", error, "0 or more")
 
+    def location_of(self, number: int) -> int:
+        """The number of the place that photo `number` of a flight shows, or the photos of place
+        `number`: that of a spiral is one."""
+        return 0 if self.plan == "spiral" else number
 
-SURVEY_FIELDS = tuple(one.name for one in fields(SurveySettings))
+
+UNUSED_FIELDS: dict[Plan, tuple[str, ...]] = {
+    "places": tuple(one.name for one in fields(PlanSettings)),
+    "survey": (),
+    "spiral": ("every_m", "line_m"),
+}
+"Settings that change nothing, by the plan."
 
 
 @dataclass(frozen=True, kw_only=True)
-class MapFlightSettings(SurveySettings, CameraRanges):
+class MapFlightSettings(PlanSettings, CameraRanges):
     """The map, and the photos that are taken over it."""
 
     mosaic: str
@@ -100,11 +116,12 @@ class MapFlightSettings(SurveySettings, CameraRanges):
     after the other in this process."""
 
     def __post_init__(self) -> None:
-        SurveySettings.__post_init__(self)
+        PlanSettings.__post_init__(self)
         CameraRanges.__post_init__(self)
-        alone = self.plan == "places" or (self.views == 1 and self.part == "all")
-        require(alone, "plan", self.plan, "places with --views or --part: a survey has one photo "
-                "of each place, of all of the map")  # fmt: skip
+        require(self.plan == "places" or self.views == 1, "plan", self.plan,
+                "places with --views; a flight takes one photo at a time")  # fmt: skip
+        require(self.plan != "survey" or self.part == "all", "plan", self.plan,
+                "places or spiral with --part; a survey is of all of the map")  # fmt: skip
         require(self.photos >= 1, "photos", self.photos, "1 or more")
         require(self.views >= 1, "views", self.views, "1 or more")
         side = self.overhead_m

@@ -1,12 +1,14 @@
-"""A survey flight over a map: where its photos are taken, when, and what odometry measures of it.
+"""A flight over a map: where a survey takes its photos, and, of a survey or a spiral, when they are
+taken and what odometry measures.
 
-In: a map's size and a camera's reach. Out: points on parallel lines in the order of time, and the
-table of displacements with errors. NumPy only, no I/O.
+In: a map's size and a camera's reach, or rows of photos.csv. Out: points on parallel lines in the
+order of time, times, and the table of displacements with errors. NumPy only, no I/O.
 Shapes: N photos, 2 = (east, north) in metres.
 """
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -55,22 +57,37 @@ def camera_of_row(row: Mapping[str, str]) -> tuple[float, float]:
     return lat, lon
 
 
+def camera_moves(rows: Sequence[Mapping[str, str]]) -> Doubles:
+    """From each camera of the rows to the next, east and north in metres: (N - 1, 2)."""
+    cameras_N2 = np.array([camera_of_row(row) for row in rows])
+    moves = [
+        LocalPlane(lat=float(here[0]), lon=float(here[1])).to_metres(there[None])[0]
+        for here, there in pairwise(cameras_N2)
+    ]
+    return np.array(moves, np.float64).reshape(-1, 2)
+
+
+def time_rows(names: Sequence[str], steps_m: Doubles, speed: float) -> list[dict[str, str]]:
+    """The times of N photos, seconds from the first, with `steps_m` (N - 1) flown between them at
+    `speed` metres per second."""
+    seconds_N = np.concatenate([[0.0], np.cumsum(steps_m) / speed])
+    return [{"photo": name, "time": f"{at:.3f}"} for name, at in zip(names, seconds_N, strict=True)]
+
+
 def odometry_rows(
-    rows: Sequence[Mapping[str, str]], error: float, seed: int
+    names: Sequence[str], moves_M2: Doubles, error: float, seed: int
 ) -> list[dict[str, str]]:
-    """Displacements of the camera between the photos of photos.csv, in its order: each part with a
-    normal error of `error` of the distance. The first row is empty."""
+    """Displacements (N - 1, 2) of the camera between N photos, each part with a normal error of
+    `error` of the distance. The first row is empty."""
     rng = np.random.default_rng(seed)
-    cameras = [camera_of_row(row) for row in rows]
-    found = [dict.fromkeys(("photo", "east_m", "north_m", "error_m"), "") for _ in rows]
-    for at, row in enumerate(rows):
-        found[at]["photo"] = row["path"].rpartition("/")[2]
-        if at == 0:
-            continue
-        plane = LocalPlane(lat=cameras[at - 1][0], lon=cameras[at - 1][1])
-        moved_2: Doubles = plane.to_metres(np.array([cameras[at]]))[0]
+    found = [{"photo": names[0], "east_m": "", "north_m": "", "error_m": ""}]
+    for name, moved_2 in zip(names[1:], moves_M2, strict=True):
         error_m = max(error * float(np.linalg.norm(moved_2)), LEAST_ERROR_M)
         east, north = (moved_2 + error_m * rng.normal(size=2)).tolist()
-        found[at] |= {"east_m": f"{east:.3f}", "north_m": f"{north:.3f}"}
-        found[at] |= {"error_m": f"{error_m:.3f}"}
+        found.append(
+            {
+                "photo": name, "east_m": f"{east:.3f}", "north_m": f"{north:.3f}",
+                "error_m": f"{error_m:.3f}",
+            }
+        )  # fmt: skip
     return found
