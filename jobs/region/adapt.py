@@ -106,7 +106,7 @@ def camera_ranges(settings: AdaptSettings) -> CameraRanges:
     console.print(
         f"{settings.photos}: {found.height[0]:.0f} to {found.height[1]:.0f} m high, pitch "
         f"{found.pitch[0]:.0f} to {found.pitch[1]:.0f}, field of view "
-        f"{found.fov[0]:.0f} to {found.fov[1]:.0f} degrees",
+        f"{found.fov_range[0]:.0f} to {found.fov_range[1]:.0f} degrees",
         markup=False,
     )
     return found

@@ -31,7 +31,7 @@ def plan_flights(
     base = MapFlightSettings(
         mosaic=settings.mosaic, surface=settings.surface, out="", part="held-out",
         photos=settings.checks, height=cameras.height, pitch=cameras.pitch,
-        fov=cameras.fov,
+        fov=cameras.fov, camera=cameras.camera,
     )  # fmt: skip
     pairs = replace(base, overhead_m=settings.tile_m, size=LEARN_PX)
     places = min(MOST_PLACES, max(LEAST_PLACES, round(settings.minutes * PLACES_PER_MINUTE)))

@@ -21,8 +21,9 @@ class AdaptSettings(CameraRanges):
     surface: Annotated[str | None, SURFACE_FLAG] = None
     "A surface model (GeoTIFF, metres): relief and parallax. None: the ground is taken for flat."
     photos: str | None = None
-    """Folder of photos of the UAV, none of which is learned from: their tags set --height, --pitch
-    and --fov of the simulated ones, and where they have GPS, the page shows the real error."""
+    """Folder of photos of the UAV, none of which is learned from: their tags, where they have them,
+    set --height, --pitch and --fov of the simulated ones, and where they have GPS, the page shows
+    the real error."""
     minutes: float = 20.0
     "Of fine-tuning the built-in encoder; 0 keeps it as it is."
     tile_m: float = 55.0

@@ -34,7 +34,7 @@ def ranges_of_photos(photos: Sequence[str], otherwise: CameraRanges) -> CameraRa
         pitch=_range(
             [pitch for pitch in pitches if STEEPEST_DEG <= pitch <= FLATTEST_DEG], otherwise.pitch
         ),
-        fov=_range([one.fov_deg for one in poses if one.fov_deg], otherwise.fov),
+        fov=_range([one.fov_deg for one in poses if one.fov_deg], otherwise.fov_range),
     )
 
 

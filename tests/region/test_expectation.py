@@ -115,7 +115,7 @@ def test_ranges_of_photos_leave_out_what_tags_do_not_tell(monkeypatch: pytest.Mo
     found = ranges_of_photos(["a", "b", "c"], otherwise)
     assert np.allclose(found.height, (51, 69))
     assert found.pitch == (-90.0, -90.0)
-    assert found.fov == (40, 60)
+    assert found.fov_range == (40, 60)
 
 
 def photo() -> bytes:

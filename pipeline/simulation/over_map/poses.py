@@ -103,4 +103,4 @@ def _draw_pose(settings: MapFlightSettings, rng: np.random.Generator) -> Pose:
 def _draw_fov(settings: MapFlightSettings, rng: np.random.Generator, pitch_deg: float) -> float:
     """A field of view within the settings' range, narrowed where its lowest ray would be flatter
     than LOWEST_RAY_DEG."""
-    return min(float(rng.uniform(*settings.fov)), 2 * (-pitch_deg - LOWEST_RAY_DEG))
+    return min(float(rng.uniform(*settings.fov_range)), 2 * (-pitch_deg - LOWEST_RAY_DEG))

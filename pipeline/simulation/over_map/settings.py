@@ -8,9 +8,12 @@ from typing import Annotated, Literal
 
 import tyro
 
+from pipeline.camera.cameras import CAMERAS
 from pipeline.core.errors import require
 
 SURFACE_FLAG = tyro.conf.arg(aliases=["--dsm"])
+DEFAULT_FOV = (45.0, 65.0)
+"Degrees: of lenses of 28 to 43 mm in 35 mm format."
 Part = Literal["all", "learn", "held-out"]
 "The places of a map that are flown over: all, those to learn from, or those kept to check with."
 
@@ -23,8 +26,12 @@ class CameraRanges:
     "Range of the camera's height above the ground, metres."
     pitch: tuple[float, float] = (-90.0, -45.0)
     "Range of the camera's angle above the horizon, degrees; -90 looks straight down."
-    fov: tuple[float, float] = (45.0, 65.0)
-    "Range of the field of view, degrees."
+    fov: tuple[float, float] | None = None
+    """Range of the field of view across a photo's width, degrees; None: that of --camera, else 45
+    to 65. A view that would reach within 22 degrees of the horizon is narrowed."""
+    camera: str | None = None
+    """A camera by its name, such as mavic-3, instead of --fov; an unknown name lists all. Simulated
+    photos are square: as wide as the camera's, and higher."""
 
     def __post_init__(self) -> None:
         low, high = self.pitch
@@ -32,8 +39,22 @@ class CameraRanges:
         require(-90 <= low <= high <= -35, "pitch", self.pitch, steep)
         low, high = self.height
         require(0 < low <= high <= 2000, "height", self.height, "two heights up to 2,000 m")
-        low, high = self.fov
-        require(5 <= low <= high <= 120, "fov", self.fov, "two angles from 5 to 120 degrees")
+        if self.fov is not None:
+            low, high = self.fov
+            require(5 <= low <= high <= 120, "fov", self.fov, "two angles from 5 to 120 degrees")
+        if self.camera is not None:
+            none = "none with --camera; leave one of them out"
+            require(self.fov is None, "fov", self.fov, none)
+            names = f"one of {', '.join(CAMERAS)}; or give its field of view by --fov"
+            require(self.camera in CAMERAS, "camera", self.camera, names)
+
+    @property
+    def fov_range(self) -> tuple[float, float]:
+        """The field of view across a photo's width, degrees: as given, else the camera's."""
+        if self.camera is None:
+            return self.fov or DEFAULT_FOV
+        fov = CAMERAS[self.camera].fov_deg
+        return fov, fov
 
 
 Plan = Literal["places", "survey", "spiral"]
