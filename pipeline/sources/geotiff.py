@@ -26,6 +26,7 @@ from pipeline.sources.base import Source
 from pipeline.sources.maps.colours import Colours, UnknownColours
 from pipeline.sources.maps.georeference import parse_crs
 from pipeline.sources.maps.mosaic import (
+    MOSAIC_SUFFIXES,
     Encoding,
     colours_for,
     encode_window,
@@ -40,7 +41,6 @@ from pipeline.sources.maps.tiles import Tile, count_tiles, parse_window, plan_le
 DEFAULT_TILE_PIXELS = 512
 LEAST_RATIO = 1.1
 "Between the sides of two levels: nearer ones show the same."
-MOSAIC_SUFFIXES = (".tif", ".tiff")
 MAX_TILES = 2_000_000
 """Of one mosaic: with their records they take a few gigabytes. A header alone may claim sides of
 four thousand million pixels."""

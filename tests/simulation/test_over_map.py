@@ -1,6 +1,7 @@
 """Flights over a map: photos with tags, true positions, and a rerun that does nothing."""
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from pipeline.simulation.over_map.poses import spiral_poses
 from pipeline.simulation.over_map.settings import MapFlightSettings
 from pipeline.simulation.over_map.survey import camera_of_row
 from pipeline.sources.table import Table
+from tests.sources.mosaics import mosaic, quarters
 
 SIDE = 700
 GROUND = Affine(0.3, 0, 500_000, 0, -0.3, 5_200_000)
@@ -200,6 +202,24 @@ def test_fly_held_out_pairs_are_a_test_set(tmp_path: Path) -> None:
         assert [(row["view"], row["split"]) for row in csv.DictReader(table)] == [
             ("drone", "query"), ("satellite", "gallery"),
         ]  # fmt: skip
+
+
+def test_fly_over_sheets_sees_the_one_map(tmp_path: Path) -> None:
+    """Four files in a folder, with their heights: the photos of the one file, bit by bit."""
+    write_map(tmp_path / "map.tif")
+    with rasterio.open(tmp_path / "map.tif") as opened:
+        values = opened.read()
+    heights = values[:1].astype(np.float32) / 50
+    mosaic(tmp_path / "dsm.tif", heights, crs="EPSG:32632", affine=GROUND)
+    quarters(tmp_path / "sheets", values, GROUND, crs="EPSG:32632")
+    quarters(tmp_path / "heights", heights, GROUND, crs="EPSG:32632")
+    one = settings(tmp_path, surface=str(tmp_path / "dsm.tif"))
+    of_sheets = replace(one, mosaic=str(tmp_path / "sheets"), surface=str(tmp_path / "heights"))
+    expected = fly(one)
+    found = fly(replace(of_sheets, out=str(tmp_path / "again")))
+    for path in (TABLE, "photos/00000.jpg", "photos/00001.jpg"):
+        assert (found / path).read_bytes() == (expected / path).read_bytes()
+    assert sorted(path.name for path in found.iterdir()) == ["flight.json", "photos", "photos.csv"]
 
 
 @pytest.mark.slow

@@ -60,6 +60,18 @@ def mosaic(
     return str(path)
 
 
+def quarters(folder: Path, values_BHW: Any, affine: Any = NORTH_UP, **options: Any) -> str:
+    """The four quarters of a map as files of a folder."""
+    _, height, width = values_BHW.shape
+    for row in (0, 1):
+        for column in (0, 1):
+            y, x = row * height // 2, column * width // 2
+            part = values_BHW[:, y : y + height // 2, x : x + width // 2]
+            moved = affine @ rasterio.Affine.translation(x, y)
+            mosaic(folder / f"{row}{column}.tif", part, affine=moved, **options)
+    return str(folder)
+
+
 def tiles(root: str, **settings: Any) -> list[ImageRecord]:
     found = list(GeoTiff(**settings).scan(root))
     assert not [one for one in found if isinstance(one, Rejection)], found

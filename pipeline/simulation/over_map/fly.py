@@ -11,6 +11,7 @@ Each place is one task, and a rerun resumes with the missing ones.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from pipeline.simulation.over_map.photo import MapPlace, photos_over_map
 from pipeline.simulation.over_map.settings import UNUSED_FIELDS, MapFlightSettings
 from pipeline.simulation.over_map.survey import camera_moves, odometry_rows, time_rows
 from pipeline.simulation.resume import begin, is_complete, local_root, settings_record
+from pipeline.sources.maps.sheets import as_one_map
 
 TABLE, COMPLETE = "photos.csv", "flight.json"
 TIMES, ODOMETRY = "times.csv", "odometry.csv"
@@ -44,10 +46,11 @@ def fly(settings: MapFlightSettings) -> Path:
         console.print(f"{root} is complete already; nothing to do")
         return root
     begin(root, about)
+    of_sheets = with_one_map(settings, str(root / ".parts"))
     places = range(-(-settings.photos // settings.views))
     missing = [place for place in places if not _part(root, place).exists()]
     with progress(len(missing), "fly", "places") as meter:
-        for _ in _visit_places(settings, root, missing):
+        for _ in _visit_places(of_sheets, root, missing):
             meter.advance()
     parts = [json_files.read_checksummed(str(_part(root, place))) for place in places]
     rows = [row for part in parts for row in part["rows"]]
@@ -58,6 +61,17 @@ def fly(settings: MapFlightSettings) -> Path:
     storage.remove_folder(str(root / ".parts"))
     console.print(f"{root}: {settings.photos} photos over {settings.mosaic}", markup=False)
     return root
+
+
+def with_one_map(settings: MapFlightSettings, folder: str) -> MapFlightSettings:
+    """The settings with map and surface model as one path each: where they are folders, VRTs that
+    are written to `folder`."""
+    surface = settings.surface
+    return replace(
+        settings,
+        mosaic=as_one_map(settings.mosaic, storage.join(folder, "map.vrt")),
+        surface=surface and as_one_map(surface, storage.join(folder, "surface.vrt")),
+    )
 
 
 def _visit_places(settings: MapFlightSettings, root: Path, places: list[int]) -> Iterator[None]:

@@ -106,7 +106,8 @@ class MapFlightSettings(PlanSettings, CameraRanges):
     """The map, and the photos that are taken over it."""
 
     mosaic: str
-    "The map: a GeoTIFF of any coordinate system and size."
+    """The map: a GeoTIFF of any coordinate system and size; or a folder of such that are the sheets
+    of one map, or GDAL's description of them (.vrt)."""
     out: str
     "Folder of the photos and their table; a local or mounted path."
     photos: int = 200
@@ -121,7 +122,7 @@ class MapFlightSettings(PlanSettings, CameraRanges):
     """The map is a chessboard of blocks of 160 m, of which one in five is held out; with `held-out`
     the middle of each photo lies well within such a block, with `learn` in no such block."""
     surface: Annotated[str | None, SURFACE_FLAG] = None
-    "A surface model (GeoTIFF, metres): relief and parallax. None: the ground is flat."
+    "A surface model (as the map, in metres): relief and parallax. None: the ground is flat."
     size: int = 512
     "Side of a photo, pixels."
     heading_error: float = 3.0

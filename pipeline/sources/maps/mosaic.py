@@ -20,17 +20,22 @@ import rasterio
 import simplejpeg
 from PIL import Image
 from rasterio.enums import Resampling
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
 from rasterio.windows import Window as RasterWindow
 
 from pipeline.core import storage
 from pipeline.core.arrays import Pixels
 from pipeline.images.decode import DecodeError
 from pipeline.images.stretch import to_8bit
+from pipeline.sources.maps.bounded_xml import UnusableXml, elements, parse_xml
 from pipeline.sources.maps.colours import Colours, UnknownColours, colours_of
 from pipeline.sources.maps.tiles import Window
 
 Encoding = Literal["jpg", "png"]
+MOSAIC_SUFFIXES = (".tif", ".tiff")
+SHEETS_SUFFIX = ".vrt"
+"""Of GDAL's description of several GeoTIFFs as one, which is opened where it is named: a folder is
+searched for TIFFs only."""
 JPEG_QUALITY = 95  # with full colour resolution: what is lost cannot be seen, a tenth of PNG's size
 MAX_OPEN_DATASETS = 8
 "Per thread: tiles are read in the order of their keys' hashes, from all mosaics in turn."
@@ -44,9 +49,9 @@ _open_lock = threading.Lock()  # the filters of warnings belong to the whole pro
 
 
 def open_mosaic(path: str) -> Any:
-    """This process's and thread's data set of a GeoTIFF; do not close it.
+    """This process's and thread's data set of a GeoTIFF, or of a VRT of some; do not close it.
 
-    Raises rasterio.errors.RasterioIOError when the file is not a TIFF.
+    Raises rasterio.errors.RasterioIOError when the file is neither.
     """
     key = (os.getpid(), path, file_version(path))
     if not hasattr(_open_datasets, "datasets"):
@@ -77,11 +82,31 @@ def _open(path: str, **options: str) -> Any:
     # Only this driver: other drivers follow URLs and paths that the file's content names, which is
     # unsafe for files of unknown origin.
     filesystem, inner = storage.resolve(path)
+    driver = "GTiff"
+    if storage.is_local(path) and inner.lower().endswith(SHEETS_SUFFIX):
+        _check_sources(inner)
+        driver = "VRT"
     with _open_lock, warnings.catch_warnings():  # a caller that needs coordinates checks for them
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         if storage.is_local(path):
-            return rasterio.open(Path(inner), driver="GTiff", **options)
+            return rasterio.open(Path(inner), driver=driver, **options)
         return rasterio.open(path, driver="GTiff", opener=filesystem, **options)
+
+
+def _check_sources(path: str) -> None:
+    """Raises RasterioIOError where a VRT names anything but TIFF files of this machine."""
+    try:
+        root = parse_xml(Path(path).read_bytes())
+    except (OSError, UnusableXml) as error:
+        raise RasterioIOError(f"{path} is no VRT ({error}), expected one") from None
+    for kind in ("SourceFilename", "SourceDataset"):
+        for element in elements(root, kind):
+            name = (element.text or "").strip()
+            remote = "://" in name or "/vsi" in name
+            if remote or not name.lower().endswith(MOSAIC_SUFFIXES):
+                raise RasterioIOError(
+                    f"{path} names {name or 'nothing'}, expected GeoTIFFs of this machine"
+                )
 
 
 def transform_by(path: str, source: str) -> rasterio.Affine | None:
