@@ -17,6 +17,7 @@ from jobs.encoding.localizer import write_localizer
 from jobs.region.expect import located_outcomes, lookalikes, real_photos
 from jobs.region.flights import CHECK, EXPECT, plan_flights, take_flight
 from jobs.region.folder import Region, claim, print_command, with_absolute_paths
+from jobs.region.maps import RegionMap, identify_map, titles_of, with_one_file_each
 from jobs.region.settings import AdaptSettings
 from jobs.region.tuning import choose_encoder
 from jobs.stages.calibrate import calibrate_index
@@ -72,11 +73,11 @@ def adapt(settings: AdaptSettings) -> list[Expectation]:
         results.print(f"{region.out} is complete; nothing to do", soft_wrap=True)
         return found
     seconds: dict[str, float] = {}
-    cameras = camera_ranges(settings)
+    cameras, of_files = camera_ranges(settings), with_one_file_each(region, settings)
     with step(seconds, "1 tiles", "the map as a gallery"):
-        pack_tiles(region, settings)
+        pack_tiles(region, of_files)
     with step(seconds, "2 flights", "simulated photos: to learn from, to check with, to expect by"):
-        flights = [take_flight(one) for one in plan_flights(region, settings, cameras)]
+        flights = [take_flight(one) for one in plan_flights(region, of_files, cameras)]
     with step(seconds, "3 encoder", "the built-in one, fine-tuned on this map"):
         choose_encoder(region, settings.minutes, *flights[:2])
     with step(seconds, "4 index", "the tiles embedded and indexed"):
@@ -90,7 +91,8 @@ def adapt(settings: AdaptSettings) -> list[Expectation]:
         real = real_photos(region, settings.photos)
         found = expectations(outcomes)
     write_localizer(region.index, "../encoder.safetensors", "../tiles")
-    write_page(region, settings, seconds, found, outcomes, real, [settings.mosaic], [EXPECT])
+    maps = [identify_map(settings.mosaic)]
+    write_page(region, settings, seconds, found, outcomes, real, maps, [EXPECT])
     results.print(expectation_table([*found, *([real] if real else [])]))
     results.print(
         f"what to expect: {region.path(PAGE)}\nnow: {locate_command(region)}", soft_wrap=True
@@ -156,12 +158,12 @@ def write_page(
     found: list[Expectation],
     outcomes: list[Outcome],
     real: Expectation | None,
-    maps: Sequence[str],
+    maps: Sequence[RegionMap],
     flights: Sequence[str],
 ) -> None:
     """Write the page, and the figures, by which the region counts as complete for these maps."""
     page = RegionPage(
-        name=" and ".join(one.rpartition("/")[2] for one in maps),
+        name=" and ".join(titles_of(maps)),
         flat=settings.surface is None,
         expectations=found,
         real=real,
@@ -178,7 +180,7 @@ def write_page(
     storage.write_bytes(region.path(PAGE), html.encode())
     rows = [*found, *([real] if real else [])]
     figures = {
-        "maps": list(maps),
+        "maps": [asdict(one) for one in maps],
         "flights": list(flights),
         "expectations": [asdict(one) for one in rows],
         "outcomes": [asdict(one) for one in outcomes],

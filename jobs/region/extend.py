@@ -4,7 +4,6 @@ In: a finished region and a map. Out: the same region over both. Finished parts 
 extension is resumed by the same command.
 """
 
-import hashlib
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +19,8 @@ from jobs.region.adapt import (
 )
 from jobs.region.expect import located_outcomes, real_photos
 from jobs.region.flights import EXPECT, plan_flights, take_flight
-from jobs.region.folder import Region, print_command, with_absolute_paths
+from jobs.region.folder import Region, check_map, print_command, with_absolute_paths
+from jobs.region.maps import RegionMap, identify_map, with_one_file_each
 from jobs.region.settings import AdaptSettings
 from jobs.stages.demo import step
 from pipeline.core import storage
@@ -41,21 +41,22 @@ def extend_region(settings: AdaptSettings) -> list[Expectation]:
     settings = replace(with_absolute_paths(settings), extend=True)
     region = Region(out=settings.out)
     figures = _figures(region)
-    if not storage.is_file(settings.mosaic):
-        raise InputError(f"no map at {settings.mosaic}, expected a GeoTIFF; check --mosaic")
-    if settings.mosaic in figures["maps"]:
+    check_map(settings)
+    known, more = [RegionMap(**one) for one in figures["maps"]], identify_map(settings.mosaic)
+    if more.sha256 in {one.sha256 for one in known}:
         found = read_expectations(figures["expectations"])
         results.print(expectation_table(found))
         results.print(f"{region.out} holds {settings.mosaic}; nothing to do", soft_wrap=True)
         return found
     seconds: dict[str, float] = {}
+    of_files = with_one_file_each(region, settings, known)
+    flight = f"{EXPECT}-{more.sha256[:8]}"
     with step(seconds, "1 tiles", "the map's tiles, beside those that are there"):
-        pack_tiles(region, settings)
+        pack_tiles(region, of_files)
     with step(seconds, "2 flight", "simulated photos over it, to expect by"):
-        *_, expect = plan_flights(region, settings, camera_ranges(settings))
+        *_, expect = plan_flights(region, of_files, camera_ranges(settings))
         # Over the whole of it, for none of it was learned.
-        path = region.path("flights", _flight_name(settings))
-        take_flight(replace(expect, part="all", out=path))
+        take_flight(replace(expect, part="all", out=region.path("flights", flight)))
     with step(seconds, "3 index", "the new tiles embedded and added"):
         embed_tiles(region)
         print_command("build_index", table=region.table, out=region.index, extend=True)
@@ -63,13 +64,12 @@ def extend_region(settings: AdaptSettings) -> list[Expectation]:
     with step(seconds, "4 confidence", "fitted among all tiles"):
         fit_confidence(region)
     with step(seconds, "5 what to expect", "photos of all maps, located"):
-        flights = [*figures["flights"], _flight_name(settings)]
+        flights = [*figures["flights"], flight]
         tables = [region.path("flights", one, TABLE) for one in flights]
         outcomes = located_outcomes(region, tables, settings.checks)
         real = real_photos(region, settings.photos)
         found = expectations(outcomes)
-    maps = [*figures["maps"], settings.mosaic]
-    write_page(region, settings, seconds, found, outcomes, real, maps, flights)
+    write_page(region, settings, seconds, found, outcomes, real, [*known, more], flights)
     results.print(expectation_table([*found, *([real] if real else [])]))
     results.print(f"now: {locate_command(region)}", soft_wrap=True)
     return found
@@ -78,13 +78,9 @@ def extend_region(settings: AdaptSettings) -> list[Expectation]:
 def _figures(region: Region) -> dict[str, Any]:
     path = region.path("expect", FIGURES)
     figures: dict[str, Any] = storage.read_json(path) if storage.exists(path) else {}
-    if "maps" not in figures:
+    if not all(isinstance(one, dict) for one in figures.get("maps", [None])):
         raise InputError(
             f"no finished region at {region.out}, expected one to extend; adapt its first map "
             "without --extend"
         )
     return figures
-
-
-def _flight_name(settings: AdaptSettings) -> str:
-    return f"{EXPECT}-{hashlib.sha256(settings.mosaic.encode()).hexdigest()[:8]}"

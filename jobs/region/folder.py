@@ -49,15 +49,24 @@ def with_absolute_paths(settings: AdaptSettings) -> AdaptSettings:
     )
 
 
+def check_map(settings: AdaptSettings) -> None:
+    """Raises InputError where there is no map."""
+    if not storage.exists(settings.mosaic):
+        raise InputError(
+            f"no map at {settings.mosaic}, expected a GeoTIFF, or a folder of its sheets; check "
+            "--mosaic"
+        )
+
+
 def claim(region: Region, settings: AdaptSettings) -> None:
     """Note the region's settings in its folder.
 
     Raises InputError where it is of other settings or another map, or where there is no map.
     """
-    if not storage.is_file(settings.mosaic):
-        raise InputError(f"no map at {settings.mosaic}, expected a GeoTIFF; check --mosaic")
+    check_map(settings)
+    sizes = storage.walk(settings.mosaic) if storage.is_folder(settings.mosaic) else {}
     about = settings_record(settings, ("out", "extend")) | {
-        "mosaic_bytes": storage.size(settings.mosaic)
+        "mosaic_bytes": sum(sizes.values()) or storage.size(settings.mosaic)
     }
     path = region.path("region.json")
     if not storage.exists(path):

@@ -15,11 +15,12 @@ class AdaptSettings(CameraRanges):
     """The map, how the UAV flies over it, and how much is spent on it."""
 
     mosaic: str
-    "The map: a GeoTIFF of any coordinate system and size."
+    """The map: a GeoTIFF of any coordinate system and size; or a folder of such that are the sheets
+    of one map, or GDAL's description of them (.vrt)."""
     out: str
     "Folder of the region: tiles, encoder, index, calibration and the page; local or mounted."
     surface: Annotated[str | None, SURFACE_FLAG] = None
-    "A surface model (GeoTIFF, metres): relief and parallax. None: the ground is taken for flat."
+    "A surface model (as the map, in metres): relief, parallax. None: the ground is taken for flat."
     photos: str | None = None
     """Folder of photos of the UAV, none of which is learned from: their tags, where they have them,
     set --height, --pitch and --fov of the simulated ones, and where they have GPS, the page shows

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 
 from jobs.encoding.localizer import with_localizer
 from jobs.region import extend
@@ -24,6 +25,7 @@ from pipeline.index.searcher import Index
 from pipeline.shards.manifest import read_manifest
 from pipeline.simulation.over_map.settings import TownMapSettings
 from pipeline.simulation.over_map.town_map import MAP, make_town_map
+from tests.sources.mosaics import quarters
 
 
 def test_adapt_makes_a_localizer_and_says_what_to_expect(adapted_region: AdaptSettings) -> None:
@@ -71,22 +73,30 @@ def test_adapt_without_a_map_is_refused(tmp_path: Path) -> None:
 def test_extend_adds_a_map_once(
     adapted_region: AdaptSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """That the confidence is fitted anew where the gallery has grown is in test_calibrate."""
+    """A map of four sheets, and a region that was moved. That the confidence is fitted anew where
+    the gallery has grown is in test_calibrate."""
     town = make_town_map(TownMapSettings(out=str(tmp_path / "town"), side=200.0, seed=5))
+    with rasterio.open(town / MAP) as opened:
+        sheets = quarters(tmp_path / "map", opened.read(), opened.transform, crs=opened.crs)
     out = Path(shutil.copytree(adapted_region.out, tmp_path / "region"))
-    more = replace(adapted_region, mosaic=str(town / MAP), surface=None, out=str(out), extend=True)
+    hidden = tmp_path / "hidden"
+    more = replace(adapted_region, mosaic=sheets, surface=None, out=str(out), extend=True)
     fitted = list[Region]()
     monkeypatch.setattr(extend, "fit_confidence", fitted.append)
     some = partial(located_outcomes, most=1)
     monkeypatch.setattr(extend, "located_outcomes", lambda region, tables, _: some(region, tables))
     first = len(Index(str(out / "index")))
-    found = extend_region(more)
+    Path(adapted_region.out).rename(hidden)  # so that nothing of it is read
+    try:
+        found = extend_region(more)
+    finally:
+        hidden.rename(adapted_region.out)
     assert [one.photos for one in found[:2]] == [2, 2]  # one over each map, each way
     index = Index(str(out / "index"))
     rows = sum(shard.samples for shard in read_manifest(str(out / "tiles")).shards)
     assert len(index) == rows > first
     assert len(fitted) == 1
-    assert "What to expect of map.tif and map.tif" in (out / PAGE).read_text()
+    assert "What to expect of map.tif and map" in (out / PAGE).read_text()
     kept = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
     assert extend_region(more)[0].photos == 2
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
