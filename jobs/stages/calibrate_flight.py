@@ -18,6 +18,7 @@ from jobs.encoding.queries import Query, encode_photos, read_photo
 from jobs.stages.matching import AHEAD, matchable_photo, view_maker
 from pipeline.core import storage
 from pipeline.core.errors import InputError
+from pipeline.core.geo import Circle
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.progress import progress
 from pipeline.core.records import GeoTag, ImageRecord, Rejection, View
@@ -138,19 +139,29 @@ def match_flight(
         for one, data in zip(searched, contents, strict=True):
             if not isinstance(data, Rejection):  # else it was removed since it was embedded
                 photo = matchable_photo(decode_photo(data), one.query.tags, one.way)
-                inside, outside = (
-                    _match(photo, hits, windows, calibration)
-                    for hits in (one.example.inside, one.example.outside)
+                example = one.example
+                inside = _match(photo, example.inside, windows, calibration)
+                outside = _match(
+                    photo, example.outside, windows, calibration, _ground_of(example, windows)
                 )
-                examples.append(
-                    MatchedExample(searched=one.example, inside=inside, outside=outside)
-                )
+                examples.append(MatchedExample(searched=example, inside=inside, outside=outside))
             meter.advance()
     return examples
 
 
+def _ground_of(example: CalibrationExample, windows: MapWindows) -> Circle | None:
+    """Where windows show the ground of a photo."""
+    if example.lat is None or example.lon is None:
+        return None
+    return Circle(lat=example.lat, lon=example.lon, radius_m=windows.apart_m(None))
+
+
 def _match(
-    photo: MatchablePhoto, hits: Sequence[Hit], windows: MapWindows, calibration: Calibration
+    photo: MatchablePhoto,
+    hits: Sequence[Hit],
+    windows: MapWindows,
+    calibration: Calibration,
+    away_from: Circle | None = None,
 ) -> Refinement | None:
     [answer] = answers_from_hits([hits], CONSENSUS_CANDIDATES, calibration)
-    return refine_answer(answer, photo, windows)
+    return refine_answer(answer, photo, windows, away_from)

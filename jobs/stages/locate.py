@@ -102,7 +102,8 @@ def _open_map(settings: LocateSettings, gallery: GalleryMap) -> MapWindows | Non
     """The map's pixels, if photos are to be matched: several as one query have no pixels."""
     if settings.shards is None or settings.together or not settings.match:
         return None
-    return open_map(settings.shards, gallery)
+    whole_map = settings.whole_map and (settings.near is None or settings.track)
+    return open_map(settings.shards, gallery, settings.index, whole_map)
 
 
 def answer_queries(

@@ -5,6 +5,7 @@ metres where matching holds.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from jobs.encoding.photo_encoder import decode_photo
 from jobs.encoding.queries import Query, ViewMaker, read_photo
@@ -12,6 +13,7 @@ from pipeline.camera.framing import PhotoViews, views_of_photo
 from pipeline.camera.overhead import overhead_view
 from pipeline.core import storage
 from pipeline.core.arrays import Pixels
+from pipeline.core.integrity import sha256_of
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.progress import console, progress
 from pipeline.core.records import Rejection
@@ -20,6 +22,8 @@ from pipeline.locate.calibration import Calibration
 from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.locate import Answer
 from pipeline.locate.refined import refine_answer, with_refinement
+from pipeline.matching.kept_features import MAP_FEATURES_FILE, FeatureFile
+from pipeline.matching.map_features import MapSearch
 from pipeline.matching.map_windows import MapWindows
 from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
 from pipeline.matching.refine import MatchablePhoto, Refinement, prepare_photo
@@ -34,11 +38,17 @@ Matcher = Callable[[Answer, MatchablePhoto, MapWindows], Refinement | None]
 "Matches a photo with the map where its answer says."
 
 
-def open_map(shards: str, gallery: GalleryMap) -> MapWindows | None:
-    """The windows of a map; None, with a message, where its tiles do not know their corners: these
-    are in the record tables of jobs/make_shards.py, which shards of others lack."""
+def open_map(
+    shards: str, gallery: GalleryMap, index: str, whole_map: bool = True
+) -> MapWindows | None:
+    """The windows of a map, and with `whole_map` a search for places by all of its features, which
+    are kept beside the index. None, with a message, where its tiles do not know their corners:
+    these are in the record tables of jobs/make_shards.py, which shards of others lack."""
     reader = _open_tiles(shards)
     windows = None if reader is None else _windows_of(reader, gallery)
+    if windows is not None and whole_map:
+        features = _feature_file(shards, gallery, index)
+        windows.search = MapSearch(partial(features.read_or_make, windows))
     if windows is None:
         console.print(
             f"the images of {shards} do not say which ground their corners show: photos are not "
@@ -47,12 +57,24 @@ def open_map(shards: str, gallery: GalleryMap) -> MapWindows | None:
     return windows
 
 
-def open_photo_map(shards: str, match: bool, gallery: GalleryMap) -> PhotoMap | None:
-    """The pixels of a map for the service; None for shards of others."""
+def open_photo_map(shards: str, match: bool, index: str, gallery: GalleryMap) -> PhotoMap | None:
+    """The pixels of a map for the service; None for shards of others. Places are searched by
+    features of the whole map where they are kept beside the index: no request waits for them."""
     reader = _open_tiles(shards)
     if reader is None:
         return None
-    return PhotoMap(gallery, reader.fetch, _windows_of(reader, gallery), match)
+    windows = _windows_of(reader, gallery)
+    if windows is not None and match:
+        windows.search = MapSearch(_feature_file(shards, gallery, index).read)
+    return PhotoMap(gallery, reader.fetch, windows, match)
+
+
+def _feature_file(shards: str, gallery: GalleryMap, index: str) -> FeatureFile:
+    manifest = storage.read_bytes(storage.join(shards, MANIFEST))
+    return FeatureFile(
+        path=storage.join(index, MAP_FEATURES_FILE),
+        belongs_to=f"{sha256_of(manifest)} {gallery.rows}",
+    )
 
 
 def _open_tiles(shards: str) -> TileReader | None:

@@ -42,7 +42,7 @@ def load_predictor(
     InputError."""
     torch.set_num_threads(threads)  # FAISS takes OMP_NUM_THREADS, which Ray sets to the cores
     cv2.setNumThreads(threads)
-    open_map = no_map if shards is None else partial(open_photo_map, shards, match)
+    open_map = no_map if shards is None else partial(open_photo_map, shards, match, index)
 
     def encoder_for(metadata: IndexMetadata) -> PhotoEncoder:
         try:

@@ -114,6 +114,10 @@ class LocateSettings(FlightSettings, PoseSettings):
     """Match each photo with the map's pixels around its candidates: its place within metres instead
     of a tile's middle. Takes --shards whose tiles know their corners, such as those of a GeoTIFF;
     --no-match answers with tiles."""
+    whole_map: bool = True
+    """Search for a photo that no candidate's map matches by the features of the whole map too, up
+    to some 12 square kilometres: made once, half a minute a square kilometre, and kept beside the
+    index. Not within --near."""
 
     def __post_init__(self) -> None:
         FlightSettings.__post_init__(self)

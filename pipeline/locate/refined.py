@@ -7,6 +7,7 @@ answer at the place that matching finds, where that holds; else as it was.
 from collections.abc import Iterator
 from dataclasses import replace
 
+from pipeline.core.geo import Circle
 from pipeline.locate.calibration import Calibration, confidence_features
 from pipeline.locate.locate import Answer, Position, consensus_of, consensus_scores
 from pipeline.matching.gate import holds
@@ -15,13 +16,30 @@ from pipeline.matching.refine import MatchablePhoto, Refinement, refine
 
 MOST_WINDOWS = 3
 "Windows that a photo is matched with: around the answer, then around other candidates."
+VOTED_WINDOWS = 2
+"Where none of them holds: around places that features of the whole map vote for."
 
 
-def refine_answer(answer: Answer, photo: MatchablePhoto, windows: MapWindows) -> Refinement | None:
-    """The photo matched with the map around an answer and around its other candidates; None where
-    no view holds that a camera can have."""
+def refine_answer(
+    answer: Answer,
+    photo: MatchablePhoto,
+    windows: MapWindows,
+    away_from: Circle | None = None,
+) -> Refinement | None:
+    """The photo matched with the map around an answer and around its other candidates; where that
+    does not hold by the rule for all maps, around the places that the features of the whole map
+    vote for, if these are searched (not within `away_from`). None where no view holds that a camera
+    can have."""
     near = windows.around(_positions(answer), MOST_WINDOWS, photo.reach_m)
-    return refine(photo, near)
+    found = refine(photo, near)
+    if windows.search is None or not answer.candidates or (found is not None and holds(found)):
+        return found
+    key = answer.candidates[0].key
+    voted = windows.search.places(photo, VOTED_WINDOWS, away_from)
+    places = [(lat, lon, key) for lat, lon in voted]
+    other = refine(photo, windows.around(places, VOTED_WINDOWS, photo.reach_m))
+    both = [one for one in (found, other) if one is not None]
+    return max(both, key=lambda one: one.inliers, default=None)
 
 
 def refine_at(answer: Answer, photo: MatchablePhoto, windows: MapWindows) -> Refinement | None:

@@ -16,10 +16,11 @@ from pipeline.camera.framing import tile_levels
 from pipeline.camera.local_plane import LocalPlane, tile_side_m
 from pipeline.camera.map_window import MapWindow, Tile, compose_window
 from pipeline.core.arrays import Doubles, Ints, Pixels, Strings
+from pipeline.core.geo import Circle
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.inspect import inspect
 from pipeline.images.thumbnails import ImageLoader
-from pipeline.matching.refine import MatchableWindow, prepare_window
+from pipeline.matching.refine import MatchablePhoto, MatchableWindow, prepare_window
 
 
 class TilePositions(Protocol):
@@ -34,11 +35,24 @@ class TilePositions(Protocol):
         """Latitudes and longitudes (N, 2), NaN where unknown."""
 
     @property
+    def rows(self) -> int:
+        """Of the whole gallery, of which these may be a sample."""
+
+    @property
     def level_sides_m(self) -> list[float]:
         """The sides of the tiles of its levels, metres, rising; empty where they are not known."""
 
     def nearest(self, lat: float, lon: float, count: int, side_m: float | None = None) -> Ints:
         """Numbers of the tiles nearest to a position, nearest first; of the level of this side."""
+
+
+class PlaceSearch(Protocol):
+    """A search for places of a map besides retrieval's: `map_features.MapSearch`."""
+
+    def places(
+        self, photo: MatchablePhoto, most: int, away_from: Circle | None = None
+    ) -> list[tuple[float, float]]:
+        """The likeliest places (lat, lon), at most `most`, none within `away_from`."""
 
 
 Footprints = Callable[[Iterable[str]], Mapping[str, list[list[float]]]]
@@ -49,6 +63,8 @@ MOST_SIDE_PX = 1200
 "Of a window: more pixels than a photo of 640 can use."
 WINDOWS_IN_MEMORY = 48
 "Some 8 MB each."
+GRID_STEPS = 4
+"Of the grid that windows lie on, from one side of a window to the other."
 MOST_TILES = 400
 "Of a window."
 SIDES_SAMPLE = 200
@@ -62,6 +78,8 @@ class MapWindows:
 
     def __init__(self, gallery: TilePositions, fetch: ImageLoader, footprints: Footprints) -> None:
         self._gallery, self._fetch, self._footprints = gallery, fetch, footprints
+        self.search: PlaceSearch | None = None
+        "By the features of the whole map, if they are to be searched."
         self._kept: OrderedDict[Place, MatchableWindow | None] = OrderedDict()
 
     def around(
@@ -117,7 +135,7 @@ class MapWindows:
         return half_m, row, round(lon / self._step_lon(half_m, row))
 
     def _step_lat(self, half_m: float) -> float:
-        return half_m / 2 / 111_000
+        return 2 * half_m / GRID_STEPS / 111_000
 
     def _step_lon(self, half_m: float, row: int) -> float:
         lat = row * self._step_lat(half_m)
@@ -135,10 +153,30 @@ class MapWindows:
     def _make(self, place: Place) -> MatchableWindow | None:
         half_m, row, column = place
         lat, lon = row * self._step_lat(half_m), column * self._step_lon(half_m, row)
-        window = self.compose(lat, lon, half_m, MOST_SIDE_PX)
+        window = self.compose(lat, lon, half_m)
         return None if window is None else prepare_window(window)
 
-    def compose(self, lat: float, lon: float, half_m: float, most_px: int) -> MapWindow | None:
+    def cover(self, most: int) -> tuple[list[tuple[float, float]], float]:
+        """The middles (lat, lon) of windows of the finest level that together show the map, side by
+        side, and half their side in metres; no middles where more than `most` are needed, or the
+        gallery is a sample of a larger one."""
+        half_m = _on_the_grid(TILES_ACROSS / 2 * min(self.tile_sides_m(), default=0.0))
+        if not self.tile_sides_m() or self._gallery.rows > len(self._gallery.keys):
+            return [], half_m
+        known_N = ~np.isnan(self._gallery.positions_N2).any(axis=1)
+        step_lat = GRID_STEPS * self._step_lat(half_m)
+        middles: set[tuple[float, float]] = set()
+        for lat, lon in self._gallery.positions_N2[known_N].tolist():
+            row = round(lat / step_lat)
+            step_lon = GRID_STEPS * self._step_lon(half_m, GRID_STEPS * row)
+            middles.add((row * step_lat, round(lon / step_lon) * step_lon))
+            if len(middles) > most:
+                return [], half_m
+        return sorted(middles), half_m
+
+    def compose(
+        self, lat: float, lon: float, half_m: float, most_px: int = MOST_SIDE_PX
+    ) -> MapWindow | None:
         """The map within `half_m` metres of a position, of the tiles of one level: the one of which
         TILES_ACROSS come nearest to filling it; at most `most_px` pixels wide. None where no tile
         shows it."""

@@ -178,6 +178,11 @@ class MatchableWindow:
     window: MapWindow
     features: LocalFeatures
 
+    def positions(self) -> Doubles:
+        """Latitudes and longitudes (N, 2) of its features."""
+        ground_N2 = apply_homography(self.window.to_ground_33, self.features.points_N2)
+        return self.window.plane.to_degrees(ground_N2)
+
 
 def prepare_window(window: MapWindow) -> MatchableWindow:
     """The features of a window."""

@@ -19,8 +19,8 @@ from pipeline.locate.page_map import MAP_SIDE_PX, MapFrame, match_paths, photo_b
 from pipeline.matching.refine import MatchedPoint, Refinement
 from pipeline.service.request import NOTHING_KNOWN
 from tests.locate.test_page import CHROMIUM, METRE
-from tests.matching.test_refine import made_map, photo_of, window_of
-from tests.service.test_photo_map import MadeMap
+from tests.matching.made_maps import made_map, photo_of, window_of
+from tests.service.test_photo_map import ServedMap
 
 MOST_BYTES = 200_000
 "Of a photo on the page: of noise, which WebP packs worst."
@@ -33,15 +33,15 @@ def as_jpeg(pixels: np.ndarray) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def located() -> tuple[MadeMap, LocatedPhoto]:
-    made = MadeMap()
+def located() -> tuple[ServedMap, LocatedPhoto]:
+    made = ServedMap()
     photo_map = made.photo_map()
     framed = photo_map.frame(photo_of(window_of(made_map(0))), CameraTags(), NOTHING_KNOWN)
     answer = photo_map.refine(made.tile_answer(), framed).answer
     return made, LocatedPhoto(name="a.jpg", photos=("a.jpg",), answer=answer)
 
 
-def page_of(made: MadeMap, *shown: LocatedPhoto, photo: bytes | None = None) -> str:
+def page_of(made: ServedMap, *shown: LocatedPhoto, photo: bytes | None = None) -> str:
     context = PageContext(
         title="Where?", gallery=made.gallery, calibration=None, fingerprint="f" * 64,
         footprints=made.footprints,
@@ -68,7 +68,7 @@ def test_lay_on_puts_corners_where_they_are_said_to_lie() -> None:
     assert laid_HW4[20, 70, 3] == laid_HW4[60, 40, 3] == 0
 
 
-def test_match_paths_by_hand(located: tuple[MadeMap, LocatedPhoto]) -> None:
+def test_match_paths_by_hand(located: tuple[ServedMap, LocatedPhoto]) -> None:
     point = MatchedPoint(x=0.25, y=0.5, lat=50 * METRE, lon=8.0)
     refinement = replace(refinement_of(located[1]), points=(point,))
     frame = MapFrame(lat=0.0, lon=8.0, half_m=100)
@@ -79,7 +79,7 @@ def test_match_paths_by_hand(located: tuple[MadeMap, LocatedPhoto]) -> None:
     assert ends == "M80.0 160.0h0M496.0 80.0h0"
 
 
-def test_page_lays_matched_photo_over_the_map(located: tuple[MadeMap, LocatedPhoto]) -> None:
+def test_page_lays_matched_photo_over_the_map(located: tuple[ServedMap, LocatedPhoto]) -> None:
     """The laid photo looks like the map at its place."""
     made, one = located
     text = page_of(made, one)
@@ -109,7 +109,7 @@ def test_page_lays_matched_photo_over_the_map(located: tuple[MadeMap, LocatedPho
     assert alike > 0.8
 
 
-def test_page_of_matched_photos_stays_light(located: tuple[MadeMap, LocatedPhoto]) -> None:
+def test_page_of_matched_photos_stays_light(located: tuple[ServedMap, LocatedPhoto]) -> None:
     made, one = located
     noise = np.random.default_rng(0).integers(0, 256, (900, 1200, 3), dtype=np.uint8)
     once = len(page_of(made, one, photo=as_jpeg(noise)))
@@ -118,7 +118,7 @@ def test_page_of_matched_photos_stays_light(located: tuple[MadeMap, LocatedPhoto
 
 
 def test_page_of_unreadable_photo_shows_the_map_alone(
-    located: tuple[MadeMap, LocatedPhoto],
+    located: tuple[ServedMap, LocatedPhoto],
 ) -> None:
     text = page_of(*located, photo=b"no image")
     assert "laid-1" not in text
@@ -131,7 +131,7 @@ def test_page_of_unreadable_photo_shows_the_map_alone(
 )
 @pytest.mark.parametrize(("width", "scheme"), [(390, "dark"), (1280, "light")])
 def test_page_switches_photos_and_matches(
-    located: tuple[MadeMap, LocatedPhoto], tmp_path: Path, width: int, scheme: str
+    located: tuple[ServedMap, LocatedPhoto], tmp_path: Path, width: int, scheme: str
 ) -> None:
     sync_api = pytest.importorskip(
         "playwright.sync_api", reason="needs Playwright: install the project with [dev]"

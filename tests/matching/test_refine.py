@@ -1,58 +1,17 @@
 """A photo of a made map is found where it was taken; one of another map is not."""
 
-import cv2
 import numpy as np
 import pytest
 
-from pipeline.camera.ground import ground_to_photo, looked_at
 from pipeline.camera.local_plane import LocalPlane
-from pipeline.camera.map_window import MapWindow, Tile, compose_window
-from pipeline.camera.pose import PartialPose, Pose
+from pipeline.camera.map_window import Tile, compose_window
+from pipeline.camera.pose import PartialPose
 from pipeline.core.arrays import Pixels
 from pipeline.core.geo import haversine_m
 from pipeline.matching.gate import holds
 from pipeline.matching.ground_fit import is_camera_view
-from pipeline.matching.refine import Refinement, prepare_photo, prepare_window, refine
-
-SIDE, METRES_PER_PIXEL, SIZE = 500, 0.3, (320, 240)
-POSE = Pose(
-    x_m=-20.0, y_m=-35.0, altitude_m=60.0, heading_deg=30.0, pitch_deg=-60.0, fov_deg=55.0
-)  # fmt: skip
-
-
-def made_map(seed: int) -> Pixels:
-    """Rectangles of random colours: corners in plenty."""
-    rng = np.random.default_rng(seed)
-    image_HW3 = np.full((SIDE, SIDE, 3), 120, np.uint8)
-    for _ in range(700):
-        x, y, width, height = (
-            int(value) for value in rng.integers((0, 0, 6, 6), (SIDE, SIDE, 40, 40))
-        )
-        colour = tuple(int(value) for value in rng.integers(0, 256, 3))
-        cv2.rectangle(image_HW3, (x, y), (x + width, y + height), colour, -1)
-    return np.asarray(cv2.GaussianBlur(image_HW3, (0, 0), 0.8), np.uint8)
-
-
-def window_of(image_HW3: Pixels) -> MapWindow:
-    shown_HW = np.full(image_HW3.shape[:2], 255, np.uint8)
-    return MapWindow(
-        pixels_HW3=image_HW3, shown_HW=shown_HW, metres_per_pixel=METRES_PER_PIXEL,
-        plane=LocalPlane(lat=47.0, lon=8.0),
-    )  # fmt: skip
-
-
-def photo_of(window: MapWindow) -> Pixels:
-    to_photo_33 = ground_to_photo(POSE, SIZE) @ window.to_ground_33
-    half_33 = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-    photo_HW3 = cv2.warpPerspective(
-        window.pixels_HW3, np.linalg.inv(half_33) @ to_photo_33 @ half_33, SIZE
-    )
-    return np.asarray(np.clip(0.8 * photo_HW3 + 20, 0, 255), np.uint8)
-
-
-def error_m(found: Refinement) -> float:
-    [[lat, lon]] = LocalPlane(lat=47.0, lon=8.0).to_degrees(np.array([looked_at(POSE)]))
-    return float(haversine_m(np.array([found.lat, found.lon]), np.array([lat, lon])))
+from pipeline.matching.refine import prepare_photo, prepare_window, refine
+from tests.matching.made_maps import SIZE, error_m, made_map, photo_of, window_of
 
 
 @pytest.mark.parametrize(

@@ -20,11 +20,11 @@ from pipeline.matching.photo_pose import PoseSettings
 from pipeline.service.app import Service
 from pipeline.service.photo_map import PictureRequest
 from pipeline.service.settings import ServiceSettings
-from tests.matching.test_refine import made_map, photo_of, window_of
+from tests.matching.made_maps import made_map, photo_of, window_of
 from tests.report.test_browser import ARGUMENTS, CHROMIUM, sync_api
 from tests.service.http_client import TOKEN, FakeEngine
 from tests.service.photos import photo
-from tests.service.test_photo_map import MadeMap
+from tests.service.test_photo_map import ServedMap
 
 pytestmark = pytest.mark.skipif(
     CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"
@@ -188,7 +188,7 @@ class MatchingEngine(FakeEngine):
     """Matches every photo with a made map."""
 
     def __init__(self) -> None:
-        made = MadeMap()
+        made = ServedMap()
         self.photo_map = made.photo_map()
         framed = self.photo_map.frame(map_photo(), CameraTags(), PoseSettings(fov=55))
         super().__init__(self.photo_map.refine(made.tile_answer(), framed))

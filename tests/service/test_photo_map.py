@@ -1,26 +1,23 @@
 """A photo matched with the map's pixels in the service: the answer, and what fails."""
 
 import io
-from collections.abc import Iterable
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.camera.local_plane import LocalPlane
 from pipeline.core.records import View
 from pipeline.images.camera_tags import CameraTags
 from pipeline.index.searcher import Hit
-from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.locate import Answer, Position
-from pipeline.matching.map_windows import MapWindows
 from pipeline.matching.photo_pose import PoseSettings
 from pipeline.service.photo_map import GroundPicture, Located, PhotoMap, TilePicture
 from pipeline.service.request import NOTHING_KNOWN
-from tests.matching.test_refine import (
-    METRES_PER_PIXEL,
+from tests.matching.made_maps import (
     POSE,
     SIDE,
+    TILE_PX,
+    MadeMap,
     error_m,
     made_map,
     photo_of,
@@ -30,47 +27,14 @@ from tests.service.http_client import Client, FakeEngine, post, run_with_service
 from tests.service.photos import photo
 from tests.service.test_openapi import validate
 
-TILE_PX = 125
-PLANE = LocalPlane(lat=47.0, lon=8.0)
 POSE_KNOWN = PoseSettings(fov=55.0, height=60.0, heading=30.0, pitch=-60.0)
 
 
-class MadeMap:
-    """Tiles of a made map, by key: PNG files, corners and positions."""
-
-    def __init__(self) -> None:
-        image_HW3, half_m = made_map(0), SIDE / 2 * METRES_PER_PIXEL
-        self.images: dict[str, bytes] = {}
-        self.corners: dict[str, list[list[float]]] = {}
-        middles = []
-        for row in range(0, SIDE, TILE_PX):
-            for column in range(0, SIDE, TILE_PX):
-                key = f"gallery-satellite-{row}-{column}"
-                stream = io.BytesIO()
-                tile_HW3 = image_HW3[row : row + TILE_PX, column : column + TILE_PX]
-                Image.fromarray(tile_HW3).save(stream, "PNG")
-                self.images[key] = stream.getvalue()
-                west, north = column * METRES_PER_PIXEL - half_m, half_m - row * METRES_PER_PIXEL
-                east, south = west + TILE_PX * METRES_PER_PIXEL, north - TILE_PX * METRES_PER_PIXEL
-                corners = np.array([[west, north], [east, north], [east, south], [west, south]])
-                self.corners[key] = PLANE.to_degrees(corners).tolist()
-                middles.append(PLANE.to_degrees(corners.mean(axis=0)[None])[0])
-        self.gallery = GalleryMap(
-            keys=np.array(list(self.images)),
-            locations=np.array(list(self.images)),
-            positions_N2=np.array(middles),
-            rows=len(middles),
-        )
-
-    def fetch(self, keys: Iterable[str]) -> dict[str, bytes]:
-        return {key: self.images[key] for key in keys if key in self.images}
-
-    def footprints(self, keys: Iterable[str]) -> dict[str, list[list[float]]]:
-        return {key: self.corners[key] for key in keys if key in self.corners}
+class ServedMap(MadeMap):
+    """A made map as the service has it."""
 
     def photo_map(self, match: bool = True) -> PhotoMap:
-        windows = MapWindows(self.gallery, self.fetch, self.footprints)
-        return PhotoMap(self.gallery, self.fetch, windows, match)
+        return PhotoMap(self.gallery, self.fetch, self.windows(), match)
 
     def tile_answer(self) -> Answer:
         """The answer of a tile in the middle."""
@@ -84,18 +48,18 @@ class MadeMap:
 
 
 @pytest.fixture(scope="module")
-def made() -> MadeMap:
-    return MadeMap()
+def made() -> ServedMap:
+    return ServedMap()
 
 
-def located(made: MadeMap, known: PoseSettings = NOTHING_KNOWN) -> Located:
+def located(made: ServedMap, known: PoseSettings = NOTHING_KNOWN) -> Located:
     photo_map = made.photo_map()
     framed = photo_map.frame(photo_of(window_of(made_map(0))), CameraTags(), known)
     return photo_map.refine(made.tile_answer(), framed)
 
 
 @pytest.mark.parametrize("known", [NOTHING_KNOWN, POSE_KNOWN], ids=["alone", "with its pose"])
-def test_photo_map_refines_an_answer(made: MadeMap, known: PoseSettings) -> None:
+def test_photo_map_refines_an_answer(made: ServedMap, known: PoseSettings) -> None:
     found = located(made, known)
     assert found.match_error is None
     assert found.match_seconds is not None
@@ -105,7 +69,7 @@ def test_photo_map_refines_an_answer(made: MadeMap, known: PoseSettings) -> None
     assert error_m(found.answer.refinement) < 1
 
 
-def test_photo_map_frames_by_what_the_request_knows(made: MadeMap) -> None:
+def test_photo_map_frames_by_what_the_request_knows(made: ServedMap) -> None:
     photo_HW3 = photo_of(window_of(made_map(0)))
     photo_map = made.photo_map()
     assert len(photo_map.frame(photo_HW3, CameraTags(), NOTHING_KNOWN).views.images) == 3
@@ -118,7 +82,7 @@ def test_photo_map_frames_by_what_the_request_knows(made: MadeMap) -> None:
 
 @pytest.mark.parametrize("part", ["prepare_photo", "refine_answer"])
 def test_photo_map_failure_leaves_the_tiles_answer(
-    made: MadeMap, monkeypatch: pytest.MonkeyPatch, part: str
+    made: ServedMap, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
     def fail(*arguments: object) -> None:
         raise OSError("the disk went away")
@@ -129,7 +93,7 @@ def test_photo_map_failure_leaves_the_tiles_answer(
     assert found.match_error == "OSError: the disk went away"
 
 
-def test_photo_map_pictures(made: MadeMap) -> None:
+def test_photo_map_pictures(made: ServedMap) -> None:
     photo_map = made.photo_map()
     tile = photo_map.picture(TilePicture(key="gallery-satellite-125-250"))
     assert tile is not None
@@ -147,7 +111,7 @@ def test_photo_map_pictures(made: MadeMap) -> None:
     assert np.abs(middle_HW3.astype(float) - expected_HW3).mean() < 25
 
 
-def test_refined_answer_is_valid_by_its_published_schema(made: MadeMap) -> None:
+def test_refined_answer_is_valid_by_its_published_schema(made: ServedMap) -> None:
     async def test(client: Client, engine: FakeEngine) -> None:
         body = await validate(client, await post(client, photo(), query="?height=60"))
         assert body["position"]["how"] == "refined"
