@@ -72,6 +72,11 @@ CASES: dict[str, tuple[str, str]] = {
         "--batch-size 2 --only without_turns",
         r"without_turns \| [\d.]+% \[.*\] \| [+-][\d.]+% \[",
     ),
+    "matchers": (
+        "--tiles {adapted}/region/tiles --index {adapted}/region/index "
+        "--flight {adapted}/region/flights/check/photos.csv --photos 1 --features sift",
+        r"\| sift \| yes \| [\d.]+% .* 1.00 x \|(.|\n)*\| sift \| no \| .* [\d.]+ x \|",
+    ),
     "own_map": (
         "--imagery {images} --out {out} --tiles 3 --photos 1 --height 12 16 --higher 1.5",
         r"built-in, matched, pose: [\d.]+% within 1 m, .* of 1 photos, [\d.]+ x ImageNet's tiles"
@@ -93,6 +98,12 @@ CASES: dict[str, tuple[str, str]] = {
     "streaming": (
         "--distinct 2 --few 20 --many 40",
         r"peak memory of 40 images streamed: [\d.]+ x that of 20",
+    ),
+    "tracks": (
+        "--region {adapted}/region --over {adapted}/map/another_day.tif "
+        "--surface {adapted}/map/surface.tif --out {out} --flights 1 --photos 2 "
+        "--height 60 80 --pitch -90 -75",
+        r"\| single photos by tiles \| [\d.]+% \|(.|\n)*\| tracks with odometry, up .* [\d.]+ x \|",
     ),
     "train_step": (
         "--cases smoke --steps 1 --rounds 1",

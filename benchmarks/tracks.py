@@ -1,0 +1,108 @@
+"""Photos of one flight located one by one, and given the whole flight.
+
+    python benchmarks/tracks.py --region DIR --over MAP [--surface FILE] --out DIR [--flights 4]
+
+Flies surveys over a map that shows a region's ground (for a town: on another day), each with its
+own seed, and locates their photos by the region, without the camera's tags: each by itself; by
+tiles alone, each by itself and as a track; as tracks through refined places, with odometry (its
+error a share of the distance) and without, by the whole flight and only by the photos up to each.
+"""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from region import locate_all, print_row
+
+from jobs.stages.calibrate_flight import flight_of
+from jobs.stages.settings import LocateSettings
+from pipeline.core import cluster
+from pipeline.core.records import GeoTag
+from pipeline.region.expectation import Outcome
+from pipeline.simulation.over_map.fly import ODOMETRY, TABLE, TIMES, fly
+from pipeline.simulation.over_map.settings import MapFlightSettings
+
+WAYS: Mapping[str, Mapping[str, Any]] = {
+    "single photos by tiles": {"match": False},
+    "tracks by tiles": {"match": False, "track": True},
+    "single photos": {},
+    "tracks": {"track": True},
+    "tracks, up to each photo": {"track": True, "online": True},
+    "tracks with odometry": {"track": True, "odometry": ODOMETRY},
+    "tracks with odometry, up to each photo": {
+        "track": True,
+        "odometry": ODOMETRY,
+        "online": True,
+    },
+}
+"What photos are located by -> the settings for it. The first one is the baseline."
+
+
+def take_flights(options: argparse.Namespace) -> list[Path]:
+    """Survey flights of different seeds; their folders."""
+    return [
+        fly(
+            MapFlightSettings(
+                mosaic=options.over, surface=options.surface, photos=options.photos,
+                out=str(options.out / f"flight-{number}"), plan="survey", seed=2000 + number,
+                height=tuple(options.height), pitch=tuple(options.pitch),
+                odometry_error=options.odometry_error, every_m=options.every_m,
+            )
+        )
+        for number in range(options.flights)
+    ]  # fmt: skip
+
+
+def locate_flights(
+    options: argparse.Namespace, flights: Sequence[Path], way: Mapping[str, Any]
+) -> tuple[list[Outcome], float]:
+    """The outcomes of all photos, and the seconds a photo."""
+    outcomes, seconds = list[Outcome](), 0.0
+    for flight in flights:
+        photos = flight_of(str(flight / TABLE), options.photos)
+        truth: dict[str, GeoTag] = {photo.path: photo.truth for photo in photos}
+        settings = LocateSettings(
+            photos=tuple(truth), index=str(options.region / "index"), pose=False,
+            out=str(options.out / "where.geojson"),
+        )  # fmt: skip
+        files = {"times": TIMES} if way.get("track") else {}
+        files |= {"odometry": way["odometry"]} if "odometry" in way else {}
+        named = {name: str(flight / file) for name, file in files.items()}
+        found, each = locate_all(replace(settings, **{**way, **named}), truth)
+        outcomes += found
+        seconds += each / len(flights)
+    return outcomes, seconds
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--region", type=Path, required=True, help="of jobs/adapt.py")
+    parser.add_argument("--over", required=True, help="the map that is flown over")
+    parser.add_argument("--surface", help="its surface model")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--flights", type=int, default=4)
+    parser.add_argument("--photos", type=int, default=24, help="of a flight")
+    parser.add_argument("--every-m", type=float, default=40.0, help="metres between photos")
+    parser.add_argument("--odometry-error", type=float, default=0.05)
+    parser.add_argument("--height", type=float, nargs=2, default=(60.0, 120.0), help="metres")
+    parser.add_argument("--pitch", type=float, nargs=2, default=(-90.0, -60.0), help="degrees")
+    options = parser.parse_args()
+    cluster.connect()
+    flights = take_flights(options)
+    print(f"{len(flights)} flights of {options.photos} photos")
+    print(
+        "| photos | answered | within 1 m | within 5 m | within 25 m | wrong answers | median "
+        "| promised too much | a photo | within 25 m, x the first row |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    baseline = 0.0
+    for name, way in WAYS.items():
+        found, seconds = locate_flights(options, flights, way)
+        share = print_row(name, found, seconds, baseline)
+        baseline = baseline or share
+
+
+if __name__ == "__main__":
+    main()
