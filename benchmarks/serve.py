@@ -46,7 +46,8 @@ def service(args: argparse.Namespace, *flags: str) -> Iterator[str]:
     """Start a service on a free port; yields its address as soon as it listens."""
     command = [sys.executable, str(ROOT / "jobs" / "serve.py"), "--port", "0", *flags]
     command += ["--checkpoint", args.checkpoint, "--index", args.index]
-    environment = os.environ | {"RAY_ADDRESS": "local"}
+    command += ["--threads", str(args.threads)] if args.threads else []
+    environment = {"RAY_ADDRESS": "local"} | os.environ
     with (
         tempfile.NamedTemporaryFile() as log,
         subprocess.Popen(command, env=environment, stderr=log, start_new_session=True) as process,
@@ -157,6 +158,7 @@ def main() -> None:
     add("--seconds", type=float, default=6, help="length of a measurement")
     add("--rounds", type=int, default=2, help="alternating rounds")
     add("--batch", type=int, default=8, help="photos of the larger batch")
+    add("--threads", type=int, help="cores of each service; in a Ray of both (RAY_ADDRESS), half")
     args = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ends the services too
     with (

@@ -3,9 +3,10 @@
     python benchmarks/tracks.py --region DIR --over MAP [--surface FILE] --out DIR [--flights 4]
 
 Flies surveys over a map that shows a region's ground (for a town: on another day), each with its
-own seed, and locates their photos by the region, without the camera's tags: each by itself; by
-tiles alone, each by itself and as a track; as tracks through refined places, with odometry (its
-error a share of the distance) and without, by the whole flight and only by the photos up to each.
+own seed, and locates their photos by the region, without the camera's tags (--ways): by tiles alone,
+each by itself and as a track; matched with the map, each by itself; as tracks through refined
+places, with odometry (its error a share of the distance) and without, by the whole flight and
+(online) by the photos up to each.
 """
 
 import argparse
@@ -25,19 +26,15 @@ from pipeline.simulation.over_map.fly import ODOMETRY, TABLE, TIMES, fly
 from pipeline.simulation.over_map.settings import MapFlightSettings
 
 WAYS: Mapping[str, Mapping[str, Any]] = {
-    "single photos by tiles": {"match": False},
-    "tracks by tiles": {"match": False, "track": True},
-    "single photos": {},
+    "tiles": {"match": False},
+    "tile-tracks": {"match": False, "track": True},
+    "single": {},
     "tracks": {"track": True},
-    "tracks, up to each photo": {"track": True, "online": True},
-    "tracks with odometry": {"track": True, "odometry": ODOMETRY},
-    "tracks with odometry, up to each photo": {
-        "track": True,
-        "odometry": ODOMETRY,
-        "online": True,
-    },
+    "online": {"track": True, "online": True},
+    "odometry": {"track": True, "odometry": ODOMETRY},
+    "odometry-online": {"track": True, "odometry": ODOMETRY, "online": True},
 }
-"What photos are located by -> the settings for it. The first one is the baseline."
+"Ways to locate photos, and their settings. The first one is the baseline."
 
 
 def take_flights(options: argparse.Namespace) -> list[Path]:
@@ -88,6 +85,7 @@ def main() -> None:
     parser.add_argument("--odometry-error", type=float, default=0.05)
     parser.add_argument("--height", type=float, nargs=2, default=(60.0, 120.0), help="metres")
     parser.add_argument("--pitch", type=float, nargs=2, default=(-90.0, -60.0), help="degrees")
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
     options = parser.parse_args()
     cluster.connect()
     flights = take_flights(options)
@@ -98,8 +96,8 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
     baseline = 0.0
-    for name, way in WAYS.items():
-        found, seconds = locate_flights(options, flights, way)
+    for name in options.ways:
+        found, seconds = locate_flights(options, flights, WAYS[name])
         share = print_row(name, found, seconds, baseline)
         baseline = baseline or share
 

@@ -90,7 +90,8 @@ CASES: dict[str, tuple[str, str]] = {
     ),
     "serve": (
         "--checkpoint {trained}/run/last.pt --index {trained}/index "
-        "--photos {trained}/flights/test/query_drone --clients 2 --seconds 0.2 --rounds 1",
+        "--photos {trained}/flights/test/query_drone --clients 2 --seconds 0.2 --rounds 1 "
+        "--threads 1",
         r"batching [\d.]+ x the photos/s",
     ),
     "shards": ("--images 20 --side 64 --repeats 1", r"two tasks takes [\d.]+ x tar's time"),
@@ -102,8 +103,8 @@ CASES: dict[str, tuple[str, str]] = {
     "tracks": (
         "--region {adapted}/region --over {adapted}/map/another_day.tif "
         "--surface {adapted}/map/surface.tif --out {out} --flights 1 --photos 2 "
-        "--height 60 80 --pitch -90 -75",
-        r"\| single photos by tiles \| [\d.]+% \|(.|\n)*\| tracks with odometry, up .* [\d.]+ x \|",
+        "--height 60 80 --pitch -90 -75 --ways tiles odometry-online",
+        r"\| tiles \| [\d.]+% \|(.|\n)*\| odometry-online \| .* [\d.]+ x \|",
     ),
     "train_step": (
         "--cases smoke --steps 1 --rounds 1",
