@@ -3,10 +3,10 @@
     python benchmarks/tracks.py --region DIR --over MAP [--surface FILE] --out DIR [--flights 4]
 
 Flies surveys over a map that shows a region's ground (for a town: on another day), each with its
-own seed, and locates their photos by the region, without the camera's tags (--ways): by tiles alone,
-each by itself and as a track; matched with the map, each by itself; as tracks through refined
-places, with odometry (its error a share of the distance) and without, by the whole flight and
-(online) by the photos up to each.
+own seed, and locates their photos by the region, without the camera's tags: by tiles, each by
+itself and as a track; matched with the map, each by itself; as tracks through refined places, with
+odometry (its error a share of the distance) and without, by the whole flight and (online) by the
+photos up to each.
 """
 
 import argparse
