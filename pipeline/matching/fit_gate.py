@@ -63,7 +63,7 @@ class FittedGate:
 
 def fit_gate(examples: GateExamples, within_m: float, place_m: float) -> FittedGate | None:
     """The gate of positions within `within_m`, where a refinement within `place_m` shows the right
-    place; None where fewer than LEAST_RIGHT refinements are right."""
+    place; None where fewer than LEAST_RIGHT refinements are right, or none would be used."""
     distance_N = np.linalg.norm(examples.errors_N2, axis=1)
     place_N, right_N = distance_N <= place_m, distance_N <= within_m  # NaN gives False
     if right_N.sum() < LEAST_RIGHT:
@@ -72,9 +72,15 @@ def fit_gate(examples: GateExamples, within_m: float, place_m: float) -> FittedG
     weight_N, locations_N = examples.weight_N, examples.locations_N
     yes_N = place_N.astype(np.float64)
     place_p_N = cross_validated_probabilities(x_NF, yes_N, weight_N, locations_N)
-    threshold = wrong_share_threshold(place_p_N, yes_N, weight_N, MOST_WRONG)
-    inliers_N = np.array([one.inliers for one in examples.refinements])
-    admitted_N = (place_p_N >= threshold) & (inliers_N > CHANCE_INLIERS)
+    # Those of few inliers are never used. The only wrong one is sure of itself in cross-validation,
+    # whose models are fitted without it, and no threshold would be high enough.
+    enough_N = np.array([one.inliers > CHANCE_INLIERS for one in examples.refinements])
+    threshold = wrong_share_threshold(
+        place_p_N[enough_N], yes_N[enough_N], weight_N[enough_N], MOST_WRONG
+    )
+    admitted_N = (place_p_N >= threshold) & enough_N
+    if not (admitted_N & right_N).any():
+        return None
     used = (x_NF[admitted_N], right_N[admitted_N].astype(np.float64), weight_N[admitted_N])
     p_N = np.zeros(len(x_NF))
     p_N[admitted_N] = cross_validated_probabilities(*used, locations_N[admitted_N])

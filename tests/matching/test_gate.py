@@ -1,5 +1,7 @@
 """The fitted gate: its probability follows the inliers, its ellipse the errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -58,6 +60,23 @@ def test_gate_of_right_examples_only_still_asks_for_inliers() -> None:
     assert fitted is not None
     assert fitted.admitted_N.all()
     assert not holds(make_refinement(inliers=CHANCE_INLIERS), fitted.gate)
+
+
+def test_gate_outlives_a_wrong_one_that_looks_sure() -> None:
+    """Of 41 examples one is wrong: models without it know no wrong ones. By too few inliers it is
+    never used; with more it leaves none to use."""
+    given = examples(82)
+    few = GateExamples(
+        refinements=[*given.refinements[::2], make_refinement(inliers=8, residual_m=0.0)],
+        errors_N2=np.vstack([given.errors_N2[::2], [1000.0, 0.0]]),
+        weight_N=np.ones(42),
+        locations_N=np.append(given.locations_N[::2], "p2"),
+    )
+    fitted = fit_gate(few, within_m=5.0, place_m=25.0)
+    assert fitted is not None
+    assert fitted.admitted_N.tolist() == [True] * 41 + [False]
+    sure = [*few.refinements[:-1], make_refinement(inliers=900, residual_m=0.0)]
+    assert fit_gate(replace(few, refinements=sure), within_m=5.0, place_m=25.0) is None
 
 
 def test_gate_ellipse_holds_the_errors() -> None:

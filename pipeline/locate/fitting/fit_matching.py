@@ -62,8 +62,8 @@ def fit_matching(
     if fitted is None:
         raise InputError(
             f"fewer than {LEAST_RIGHT} of {len(examples)} photos are matched within {within_m:g} m "
-            "of their true place, expected more to fit a gate on; calibrate on more photos, check "
-            "their positions, or give a larger --within"
+            "of their true place, or wrong matches look surer, expected more to fit a gate on; "
+            "calibrate on more photos, check their positions, or give a larger --within"
         )
     gate = fitted.gate
     p_N, right_N = np.zeros(len(both)), np.zeros(len(both))
