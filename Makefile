@@ -5,7 +5,7 @@ BIN := .venv/bin
 TEST_PROCESSES ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-fast check format bench chaos
+.PHONY: help install demo region test test-fast check format bench chaos
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -14,6 +14,14 @@ install: .venv/installed  ## install the project and its pinned dependencies int
 
 demo: .venv/installed  ## the complete road on simulated flights: at most six minutes on two cores
 	$(BIN)/python jobs/demo.py --out runs/demo
+
+SAMPLE := runs/region
+
+region: .venv/installed  ## a made-up town as a map, adapted to; photos of another day located on it: five minutes on two cores
+	$(BIN)/pvda town --out $(SAMPLE)/town --side 500 --resolution 0.5
+	$(BIN)/pvda fly --mosaic $(SAMPLE)/town/another_day.tif --surface $(SAMPLE)/town/surface.tif --out $(SAMPLE)/flight --photos 12
+	$(BIN)/pvda adapt --mosaic $(SAMPLE)/town/map.tif --surface $(SAMPLE)/town/surface.tif --out $(SAMPLE)/region --minutes 1 --checks 20
+	$(BIN)/pvda locate --index $(SAMPLE)/region/index --out $(SAMPLE)/where.geojson --page $(SAMPLE)/where.html $(SAMPLE)/flight/photos
 
 test: .venv/installed  ## all tests, shared by two processes
 	$(BIN)/pytest -n $(TEST_PROCESSES) --no-loadscope-reorder

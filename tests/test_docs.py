@@ -3,9 +3,12 @@
 import ast
 import importlib
 import re
+import shlex
 from pathlib import Path
 
 import pytest
+
+from jobs.command_line.cli import parse
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -49,6 +52,16 @@ def test_docs_examples_import(page: Path) -> None:
             if isinstance(node, ast.ImportFrom) and node.module:
                 module = importlib.import_module(node.module)
                 assert not [one.name for one in node.names if not hasattr(module, one.name)]
+
+
+def test_makefile_commands_parse() -> None:
+    """Those of `make region`, by the jobs' own parsers."""
+    calls = re.findall(
+        r"^\t\$\(BIN\)/pvda (\w+) (.*)", (ROOT / "Makefile").read_text(), re.MULTILINE
+    )
+    assert [job for job, _ in calls] == ["town", "fly", "adapt", "locate"]
+    for job, words in calls:
+        assert parse(importlib.import_module(f"jobs.{job}").main, shlex.split(words))
 
 
 def test_map_names_every_room_and_its_files() -> None:

@@ -1,7 +1,7 @@
 """From a map to a localizer: the stages of the other jobs on one's own map.
 
 In: AdaptSettings (`settings.py`). Out: a folder with tiles, encoder, index, calibration and the
-page that says what to expect. `adapt.py` has the order of the stages; `flights.py` plans the
-simulated photos, `tuning.py` fine-tunes and chooses the encoder, `expect.py` locates photos of
-places that were not learned.
+page that says what to expect. `adapt.py` has the order of the stages; `maps.py` tells its maps
+apart, `flights.py` plans the simulated photos, `tuning.py` fine-tunes and chooses the encoder,
+`expect.py` locates photos of places that were not learned.
 """
