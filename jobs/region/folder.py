@@ -9,6 +9,7 @@ from pipeline.core import json_files, storage
 from pipeline.core.errors import InputError
 from pipeline.core.progress import console
 from pipeline.simulation.resume import settings_record
+from pipeline.sources.maps.sheets import describe_sheets, find_sheets, read_sheet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,12 +51,14 @@ def with_absolute_paths(settings: AdaptSettings) -> AdaptSettings:
 
 
 def check_map(settings: AdaptSettings) -> None:
-    """Raises InputError where there is no map."""
+    """Raises InputError where there is no map, or a folder that does not hold the sheets of one."""
     if not storage.exists(settings.mosaic):
         raise InputError(
             f"no map at {settings.mosaic}, expected a GeoTIFF, or a folder of its sheets; check "
             "--mosaic"
         )
+    if storage.is_folder(settings.mosaic):
+        describe_sheets([read_sheet(path) for path in find_sheets(settings.mosaic)])
 
 
 def claim(region: Region, settings: AdaptSettings) -> None:
@@ -64,9 +67,10 @@ def claim(region: Region, settings: AdaptSettings) -> None:
     Raises InputError where it is of other settings or another map, or where there is no map.
     """
     check_map(settings)
-    sizes = storage.walk(settings.mosaic) if storage.is_folder(settings.mosaic) else {}
+    mosaic = settings.mosaic
+    files = find_sheets(mosaic) if storage.is_folder(mosaic) else [mosaic]
     about = settings_record(settings, ("out", "extend")) | {
-        "mosaic_bytes": sum(sizes.values()) or storage.size(settings.mosaic)
+        "mosaic_bytes": sum(map(storage.size, files))
     }
     path = region.path("region.json")
     if not storage.exists(path):

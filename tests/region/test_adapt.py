@@ -25,7 +25,7 @@ from pipeline.index.searcher import Index
 from pipeline.shards.manifest import read_manifest
 from pipeline.simulation.over_map.settings import TownMapSettings
 from pipeline.simulation.over_map.town_map import MAP, make_town_map
-from tests.sources.mosaics import quarters
+from tests.sources.mosaics import mosaic, noise, quarters
 
 
 def test_adapt_makes_a_localizer_and_says_what_to_expect(adapted_region: AdaptSettings) -> None:
@@ -62,6 +62,10 @@ def test_adapt_without_a_map_is_refused(tmp_path: Path) -> None:
     given = AdaptSettings(mosaic=str(tmp_path / "none.tif"), out=str(tmp_path / "region"))
     with pytest.raises(InputError, match="no map at"):
         adapt(given)
+    mosaic(tmp_path / "sheets" / "a.tif", noise(3, 8, 8))
+    mosaic(tmp_path / "sheets" / "b.tif", noise(1, 8, 8))
+    with pytest.raises(InputError, match="in its bands"):
+        adapt(replace(given, mosaic=str(tmp_path / "sheets")))
     (tmp_path / "none.tif").write_bytes(b"no map")
     (tmp_path / "region").mkdir()
     (tmp_path / "region" / "mine.txt").write_text("not a region's")
