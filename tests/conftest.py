@@ -179,7 +179,7 @@ def adapted_region(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) 
     town = make_town_map(TownMapSettings(out=str(root / "map"), side=400.0, resolution=0.5))
     settings = AdaptSettings(
         mosaic=str(town / MAP), surface=str(town / SURFACE), out=str(root / "region"),
-        minutes=0.01, checks=20, height=(60.0, 80.0), pitch=(-90.0, -75.0),
+        minutes=0.01, checks=20, height=(60.0, 80.0), pitch=(-90.0, -75.0), tile_m=(55.0, 110.0),
     )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(flights, "LEAST_PLACES", 24)

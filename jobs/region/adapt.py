@@ -79,7 +79,7 @@ def adapt(settings: AdaptSettings) -> list[Expectation]:
     with step(seconds, "2 flights", "simulated photos: to learn from, to check with, to expect by"):
         flights = [take_flight(one) for one in plan_flights(region, of_files, cameras)]
     with step(seconds, "3 encoder", "the built-in one, fine-tuned on this map"):
-        choose_encoder(region, settings.minutes, *flights[:2])
+        choose_encoder(region, settings, *flights[:2])
     with step(seconds, "4 index", "the tiles embedded and indexed"):
         embed_tiles(region)
         print_command("build_index", table=region.table, out=region.index)
@@ -120,7 +120,7 @@ def pack_tiles(region: Region, settings: AdaptSettings) -> None:
     print_command("make_shards", source="geotiff", root=settings.mosaic, out=region.tiles,
              tile_m=settings.tile_m, overlap=OVERLAP, **more)  # fmt: skip
     cluster.connect()
-    source = GeoTiff(tile_m=(settings.tile_m,), overlap=OVERLAP)
+    source = GeoTiff(tile_m=settings.tile_sides_m, overlap=OVERLAP)
     packing = PackingSettings(root=settings.mosaic, out=region.tiles, extend=settings.extend)
     pack(source, packing)
 
@@ -168,7 +168,7 @@ def write_page(
         expectations=found,
         real=real,
         outcomes=outcomes,
-        lookalikes=lookalikes(region, settings.tile_m),
+        lookalikes=lookalikes(region, settings.tile_sides_m),
         seconds=seconds,
         commands=[locate_command(region)],
     )

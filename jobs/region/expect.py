@@ -79,7 +79,8 @@ def outcome_of(one: LocatedPhoto, truth: GeoTag, posed: bool) -> Outcome:
     )
 
 
-def lookalikes(region: Region, tile_m: float) -> list[Lookalike]:
+def lookalikes(region: Region, tile_sides_m: Sequence[float]) -> list[Lookalike]:
+    """Pairs of tiles that resemble each other and show no common ground."""
     index = Index(region.index)
     table = open_table(region.table).select(None, View.SATELLITE)
     labels = table.labels()
@@ -87,5 +88,5 @@ def lookalikes(region: Region, tile_m: float) -> list[Lookalike]:
     positions_N2 = np.stack([labels.lats, labels.lons], axis=1)[rows]
     return find_lookalikes(
         index, [str(key) for key in labels.keys[rows]], positions_N2, table.embeddings()[rows],
-        apart_m=APART_TILES * tile_m, count=LOOKALIKES,
+        apart_m=max(APART_TILES * tile_sides_m[0], tile_sides_m[-1]), count=LOOKALIKES,
     )  # fmt: skip

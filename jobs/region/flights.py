@@ -33,7 +33,7 @@ def plan_flights(
         photos=settings.checks, height=cameras.height, pitch=cameras.pitch,
         fov=cameras.fov, camera=cameras.camera,
     )  # fmt: skip
-    pairs = replace(base, overhead_m=settings.tile_m, size=LEARN_PX)
+    pairs = replace(base, overhead_m=settings.tile_sides_m[0], size=LEARN_PX)
     places = min(MOST_PLACES, max(LEAST_PLACES, round(settings.minutes * PLACES_PER_MINUTE)))
     flights = {
         LEARN: replace(pairs, part="learn", photos=places * VIEWS, views=VIEWS),

@@ -1,11 +1,15 @@
-"""The encoder of a region: the built-in one, fine-tuned on pairs over the map where that helps."""
+"""The encoder of a region: the built-in one, fine-tuned on pairs over the map, and aligned with the
+UAV's own photos, where that helps."""
 
 import json
 import math
+from collections.abc import Callable
 
 from jobs.encoding.embed_test import embed_test
+from jobs.region.alignment import align
 from jobs.region.flights import pack_pairs
 from jobs.region.folder import Region
+from jobs.region.settings import AdaptSettings
 from jobs.stages.export_weights import export_weights
 from jobs.stages.settings import ExportWeightsSettings
 from jobs.training.checkpoints import METRICS_FILE
@@ -19,31 +23,44 @@ from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.settings import EvaluationSettings
 
 
-def choose_encoder(region: Region, minutes: float, learn: str, choose: str) -> None:
-    """Fine-tune within the minutes, and keep what ranks the held-out places better: an adapted
-    encoder is never worse there than the built-in one."""
+def choose_encoder(region: Region, settings: AdaptSettings, learn: str, choose: str) -> None:
+    """Fine-tune within the minutes, align with the UAV's own photos where there are enough, and
+    keep each step that does not rank the held-out places worse: an adapted encoder is never worse
+    there than the built-in one."""
     if storage.exists(region.encoder):
         return
     chosen = BUILTIN
-    if minutes > 0:
-        shards = pack_pairs(learn)
-        tuned = train(
-            TrainSettings(
-                recipe=finetune(_epochs(region, minutes, shards)), shards=shards, workers=0,
-                out=region.path("run"),
-            )
-        )  # fmt: skip
+    if settings.minutes > 0:
         test = pack_pairs(choose)
-        before, after = (
-            _held_out_ap(region, test, name, checkpoint)
-            for name, checkpoint in (("built-in", BUILTIN), ("tuned", tuned))
-        )
-        chosen = tuned if after >= before else BUILTIN
-        console.print(
-            f"places not learned, UAV -> map: AP {before:.1%} before, {after:.1%} after; "
-            f"{'the tuned' if chosen == tuned else 'the built-in'} encoder is kept"
-        )
+        best = _held_out_ap(region, test, "built-in", BUILTIN)
+        steps: dict[str, Callable[[str], str | None]] = {
+            "tuned": lambda _: tune(region, settings.minutes, learn),
+            "aligned": lambda start: align(region, settings, start),
+        }
+        for name, make in steps.items():
+            made = make(chosen)
+            if made is None:
+                continue
+            after = _held_out_ap(region, test, name, made)
+            kept = after >= best
+            console.print(
+                f"places not learned, UAV -> map: AP {best:.1%} before, {after:.1%} {name}; "
+                f"the {name} encoder is {'kept' if kept else 'not kept'}"
+            )
+            if kept:
+                chosen, best = made, after
     export_weights(ExportWeightsSettings(checkpoint=chosen, out=region.encoder))
+
+
+def tune(region: Region, minutes: float, learn: str) -> str:
+    """Fine-tune the built-in encoder on a flight's pairs within the minutes; the checkpoint."""
+    shards = pack_pairs(learn)
+    return train(
+        TrainSettings(
+            recipe=finetune(_epochs(region, minutes, shards)), shards=shards, workers=0,
+            out=region.path("run"),
+        )
+    )  # fmt: skip
 
 
 def _epochs(region: Region, minutes: float, shards: str) -> int:

@@ -115,6 +115,7 @@ def test_group_names_are_sectors_and_round_bins() -> None:
     assert breakdowns.group_names("variant", ["b", "a", None])[1] == ["a", "b", "unknown"]
 
 
+@pytest.mark.slow
 def test_read_column_reads_the_records_beside_the_shards(tiny_shards: str) -> None:
     assert set(breakdowns.read_column(open_shards(tiny_shards), "view").values()) == {
         "drone",

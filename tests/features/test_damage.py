@@ -83,6 +83,7 @@ def look_at_table(part: Path) -> list[Any]:
     return seen
 
 
+@pytest.mark.slow
 def test_part_damaged_is_rejected_by_every_reader(part: Path) -> None:
     assert count_detected(part, lambda: look_at_table(part), 400) > 300
 

@@ -93,6 +93,7 @@ def by_hand(queries: Listed, gallery: Listed) -> dict[str, float]:
     return {name: total / len(queries) for name, total in sums.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("protocol", ["full", "queried-only"])
 def test_protocol_measures_equal_loop_over_queries(

@@ -261,6 +261,7 @@ def test_any_bytes_give_tags_or_one_error(header: bytes, data: bytes, complete: 
     check_tags(header + data, complete)
 
 
+@pytest.mark.slow
 @settings(max_examples=300)
 @given(
     st.lists(st.tuples(st.integers(0, 1500), st.integers(0, 255)), min_size=1, max_size=8),

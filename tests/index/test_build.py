@@ -17,6 +17,8 @@ from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings, parse_bytes
 from tests.index.index_tables import answers, build, clustered, write_gallery, write_table_part
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory: pytest.TempPathFactory) -> str:

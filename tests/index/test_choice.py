@@ -65,6 +65,7 @@ def useful_recall(trials: list[PlanTrial], gallery: GallerySpec) -> float:
         return -1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOOSER)
 @given(trials=trial_lists, gallery=galleries)
 def test_looser_limit_never_lowers_recall(

@@ -91,6 +91,7 @@ class Killed(Exception):
     pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["unit-000001.faiss", "unit-000001.faiss.json", "trained.faiss", "plan.json"]
 )

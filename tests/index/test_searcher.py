@@ -92,6 +92,7 @@ def test_search_equals_brute_force(table: str, tmp_path: Path) -> None:
     assert best.lat == int(best.key.split("-")[2]) / 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factory", FACTORIES)
 @pytest.mark.parametrize("name", FILTERS)
 def test_search_filter_equals_brute_force(
@@ -112,6 +113,7 @@ def test_search_filter_equals_brute_force(
     assert np.allclose([[hit.score for hit in hits] for hits in found], scores, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factory", ["Flat", "HNSW16,SQ8", "IVF8,SQ8", "IVF8,PQ16x4fs"])
 def test_search_wide_filter_still_finds_k(
     table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, factory: str

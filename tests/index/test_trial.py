@@ -14,6 +14,8 @@ from pipeline.index.planning.trial import trial_rows, try_plan
 from pipeline.index.settings import IndexSettings
 from tests.index.index_tables import clustered, write_table_part
 
+pytestmark = pytest.mark.slow
+
 ROWS, DIMENSION = 1_800, 32
 FIRST = "HNSW32,SQ8"
 "The plan that the planner tries first for such a gallery."

@@ -13,6 +13,8 @@ from pipeline.index.faiss_io import read_faiss
 from pipeline.index.units import even_groups, merge_units, plan_units
 from tests.index.index_tables import answers, build, write_gallery
 
+pytestmark = pytest.mark.slow
+
 MERGED = ["Flat", "SQ8", "IVF8,SQ8", "IVF8,PQ8x4fs", "IVF8,RaBitQ", "PCA16,IVF8,SQ8"]
 
 

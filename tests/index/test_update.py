@@ -17,6 +17,8 @@ from pipeline.index.settings import IndexSettings
 from pipeline.index.update import extend_index, remove_locations, verify_index
 from tests.index.index_tables import clustered, write_gallery, write_table_part
 
+pytestmark = pytest.mark.slow
+
 FACTORIES = ["Flat", "IVF8,SQ8", "HNSW16,SQ8", "IVF8,PQ8x4fs"]
 
 

@@ -125,6 +125,7 @@ def test_table_records_the_encoding_and_remarks_are_printed(
     assert spec.encoding == EncodingConfig(mirror=True, resizer="pillow", precision="float32")
 
 
+@pytest.mark.slow
 def test_mirror_images_are_summed_where_training_saw_them(
     tiny_shards: str, checkpoint: bytes
 ) -> None:

@@ -20,6 +20,8 @@ from pipeline.images.decode import decode
 from pipeline.shards.shard_set import open_shards
 from tests.jobs.tiny_runs import settings
 
+pytestmark = pytest.mark.slow
+
 SMALL = TranslationConfig(side=32, channels=4)
 
 

@@ -22,6 +22,8 @@ from tests.locate.test_page import CHROMIUM, METRE
 from tests.matching.made_maps import made_map, photo_of, window_of
 from tests.service.test_photo_map import ServedMap
 
+pytestmark = pytest.mark.slow
+
 MOST_BYTES = 200_000
 "Of a photo on the page: of noise, which WebP packs worst."
 

@@ -17,6 +17,8 @@ from pipeline.matching.map_features import MapFeatures, MapSearch, find_map_feat
 from pipeline.matching.refine import MatchablePhoto, prepare_photo
 from tests.matching.made_maps import PLANE, POSE, MadeMap, error_m, made_map, photo_of, window_of
 
+pytestmark = pytest.mark.slow
+
 SIDE = 1500
 "Pixels: 450 m, six windows of a tile's size across."
 

@@ -25,6 +25,8 @@ from tests.model.test_import_methods import (
 )
 from tests.model.test_qdfl import State, authors_names, heads_attend, linear, norm, twin_tokens
 
+pytestmark = pytest.mark.slow
+
 FACEBOOK = {
     r"model\.stem\.": "downsample_layers.0.", r"model\.head\.norm\.": "norm.",
     r"model\.stages\.(\d)\.downsample\.": r"downsample_layers.\1.",

@@ -152,6 +152,7 @@ def test_usam_is_nine_times_the_difference_to_the_mean() -> None:
     assert torch.allclose(module(maps_BCHW), expected, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_token_pooling_needs_a_backbone_with_token() -> None:
     with pytest.raises(ValueError, match=r"pooling queries takes a class token.*set --backbone"):
         FeatureEncoder(replace(TINY, pooling="queries"))

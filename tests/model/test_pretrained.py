@@ -19,6 +19,7 @@ from model.weights.start import load_start
 from tests.model.small_transformers import SMALL, network_config, saved
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_folder_gives_the_outputs_of_transformers(small: str, tmp_path: Path) -> None:
     config = network_config(small)

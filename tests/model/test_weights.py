@@ -124,6 +124,7 @@ def test_load_backbone_of_each_depth(name: str, tensors: int) -> None:
     load_backbone(backbone, state, "resnet.pth")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAYOUTS)
 @pytest.mark.parametrize("other", LAYOUTS)
 def test_load_backbone_rejects_another_depth(name: str, other: str) -> None:

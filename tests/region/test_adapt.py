@@ -22,6 +22,7 @@ from jobs.stages.settings import LocateSettings
 from model.weights.builtin import BUILTIN
 from pipeline.core.errors import InputError
 from pipeline.index.searcher import Index
+from pipeline.locate.gallery_map import read_gallery_map
 from pipeline.shards.manifest import read_manifest
 from pipeline.simulation.over_map.settings import TownMapSettings
 from pipeline.simulation.over_map.town_map import MAP, make_town_map
@@ -35,6 +36,8 @@ def test_adapt_makes_a_localizer_and_says_what_to_expect(adapted_region: AdaptSe
     assert [one["photos"] for one in figures["expectations"][:2]] == [20, 20]
     errors = np.array([one["error_m"] for one in figures["outcomes"] if one["known"]])
     assert np.median(errors) < 25
+    levels = read_gallery_map(Index(str(out / "index"))).level_sides_m
+    assert levels == pytest.approx(adapted_region.tile_m, rel=0.02)
     assert (out / "index" / "calibration.json").exists()
     located = with_localizer(
         LocateSettings(photos=("a.jpg",), index=str(out / "index"), out="where.geojson")

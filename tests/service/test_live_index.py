@@ -213,6 +213,7 @@ def test_predictor_without_calibration_uses_gallery_spacing(path: Path) -> None:
     assert located.answer.position.radius_m == pytest.approx(0.009 / 2 * 111_195, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_service_answers_while_index_is_replaced(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -134,6 +134,7 @@ def recorded(facts: dict[str, Any], row: dict[str, Any]) -> ImageRecord:
     return ImageRecord(path=row["path"], geotag=tag, bytes=row["bytes"], **kind)
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(
     st.lists(
