@@ -14,6 +14,7 @@ from jobs.region.settings import AdaptSettings
 from jobs.training.driver import train
 from jobs.training.recipes.pvda_unlabelled import pvda_unlabelled
 from jobs.training.settings import TrainSettings
+from model.weights.builtin import BUILTIN
 from pipeline.core import storage
 from pipeline.core.progress import console
 from pipeline.core.records import Split, View
@@ -42,9 +43,11 @@ def align(region: Region, settings: AdaptSettings, start: str) -> str | None:
         return None
     shards = pack_views(region, settings, photos)
     out = region.path("aligned")
-    print_command("train pvda_unlabelled", shards=shards, weights=start, out=out)
+    weights = None if start == BUILTIN else start  # the recipe begins with that one
+    flags = {"weights": weights} if weights else {}
+    print_command("train pvda_unlabelled", shards=shards, out=out, **flags)
     settings_of_run = TrainSettings(
-        recipe=pvda_unlabelled(), shards=shards, weights=start, workers=0, probe_epochs=0, out=out
+        recipe=pvda_unlabelled(), shards=shards, weights=weights, workers=0, probe_epochs=0, out=out
     )
     return train(settings_of_run)
 
