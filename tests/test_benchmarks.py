@@ -27,6 +27,10 @@ CASES: dict[str, tuple[str, str]] = {
         "--out {out} --side-px 2000 --resolution 0.1 --photos 1",
         r"locate \| 200 .* \| 1.00 x(.|\n)*locate \| 2,000 .* [\d.]+ x \|",
     ),
+    "cold_table": (
+        "--rows 400 --dimension 32 --parts 4 --queries 4 --candidates 3",
+        r"\| cold, as an index reads \| [\d.]+ \| [\d.]+ \| [\d.]+ x \|",
+    ),
     "damage": (
         "--rows 512 --depth 18 --repeats 1",
         r"a checkpoint loaded: [\d.]+ x the time without checks",

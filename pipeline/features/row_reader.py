@@ -8,7 +8,9 @@ Shapes: R requested rows, D dimensions, P pages, W bytes of an embedding.
 """
 
 import mmap
+import time
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,12 +24,18 @@ from pipeline.core.errors import InputError
 from pipeline.features.parquet_pages import ColumnPages, DamagedPage, NotPlain, find_pages
 from pipeline.features.part import REPAIR_HINT, open_part, part_header
 
+COLD_ROW_S = 0.0005
+"""Seconds a row from which on it came from a disk: from memory it takes 2 us, and 65 more where its
+page is read for the first time."""
+Wanted = tuple[str, str, Ints]
+"A part, the shard that it was made of, and the numbers of rows in it."
 MAX_OPEN_PARTS = 512
 "Mapped at once: each takes a file descriptor."
 
 
 @dataclass(frozen=True, kw_only=True)
 class _MappedPart:
+    file: mmap.mmap
     bytes_N: npt.NDArray[np.uint8]
     "The whole file."
     pages: ColumnPages
@@ -53,9 +61,7 @@ class RowReader:
         pages, width = mapped.pages, self._dimension * mapped.dtype.itemsize
         rows_RW = np.empty((len(row_R), width), np.uint8)
         end_P = np.append(pages.first_P[1:], pages.values)
-        value_R = row_R * self._dimension
-        page_R = np.searchsorted(pages.first_P, value_R, side="right") - 1
-        begin_R = pages.begin_P[page_R] + (value_R - pages.first_P[page_R]) * mapped.dtype.itemsize
+        value_R, page_R, begin_R = self._find(mapped, row_R)
         in_one_R = value_R + self._dimension <= end_P[page_R]
         last_R = np.searchsorted(pages.first_P, value_R + self._dimension - 1, side="right") - 1
         self._check_pages(part, mapped, page_R, last_R)
@@ -65,6 +71,40 @@ class RowReader:
         for row in np.flatnonzero(~in_one_R).tolist():
             rows_RW[row] = self._across_pages(mapped, int(value_R[row]), int(page_R[row]))
         return rows_RW.view(mapped.dtype)
+
+    def read_all(self, wanted: Sequence[Wanted]) -> list[Floats | Halves]:
+        """`read` of several parts. Where the first rows show that the disk is slow, the others are
+        requested at once and not one after another; from memory that would cost more than it saves.
+        """
+        blocks, cold = list[Floats | Halves](), False
+        for number, one in enumerate(wanted):
+            begin = time.perf_counter()
+            blocks.append(self.read(*one))
+            if not cold and time.perf_counter() - begin > COLD_ROW_S * len(one[2]):
+                cold = True
+                for other in wanted[number + 1 :]:
+                    self._request(*other)
+        return blocks
+
+    def _request(self, part: str, shard_sha256: str, row_R: Ints) -> None:
+        """Ask the operating system for rows that will be read."""
+        mapped = self._part(part, shard_sha256)
+        pages = mapped.pages
+        _, page_R, begin_R = self._find(mapped, row_R)
+        end_R = begin_R + self._dimension * mapped.dtype.itemsize
+        # Of a page that was not read yet the whole is compared with its checksum.
+        new_R = ~mapped.verified_P[page_R]
+        begin_R = np.where(new_R, pages.page_P[page_R], begin_R) // mmap.PAGESIZE * mmap.PAGESIZE
+        end_R = np.where(new_R, pages.end_P[page_R], end_R)
+        for begin, end in dict.fromkeys(zip(begin_R.tolist(), end_R.tolist(), strict=True)):
+            mapped.file.madvise(mmap.MADV_WILLNEED, begin, end - begin)
+
+    def _find(self, mapped: _MappedPart, row_R: Ints) -> tuple[Ints, Ints, Ints]:
+        """Number of each row's first value, of the page that it begins in, and the byte there."""
+        pages, value_R = mapped.pages, row_R * self._dimension
+        page_R = np.searchsorted(pages.first_P, value_R, side="right") - 1
+        within_R = (value_R - pages.first_P[page_R]) * mapped.dtype.itemsize
+        return value_R, page_R, pages.begin_P[page_R] + within_R
 
     def _check_pages(self, part: str, mapped: _MappedPart, first_R: Ints, last_R: Ints) -> None:
         """Compare the checksums of the pages that rows reach, each from a first to a last page.
@@ -141,6 +181,7 @@ def _map(parquet: pq.ParquetFile, path: str, dtype: str) -> _MappedPart:
             f"as jobs/embed_gallery.py writes them; {REPAIR_HINT}"
         ) from None
     return _MappedPart(
+        file=data,
         bytes_N=np.frombuffer(data, np.uint8),
         pages=pages,
         dtype=stored,

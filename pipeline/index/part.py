@@ -93,12 +93,11 @@ class IndexPart:
         columns = self.ids.take(row_R, ("table_part", "part_row"))
         part_R, part_row_R = (columns[name].to_numpy() for name in ("table_part", "part_row"))
         bounds = np.flatnonzero(np.diff(part_R, prepend=NO_ROW, append=NO_ROW))
-        blocks = []
-        for first, last in pairwise(bounds.tolist()):
-            name, shard = self._table_parts[int(part_R[first])]
-            rows = part_row_R[first:last].astype(np.int64)
-            blocks.append(self._reader.read(name, shard, rows))
-        vectors_RD: Floats = np.concatenate(blocks, dtype=np.float32)
+        wanted = [
+            (*self._table_parts[int(part_R[first])], part_row_R[first:last].astype(np.int64))
+            for first, last in pairwise(bounds.tolist())
+        ]
+        vectors_RD: Floats = np.concatenate(self._reader.read_all(wanted), dtype=np.float32)
         return vectors_RD
 
     def _exact_scores(self, queries_QD: Floats, row_C: Ints) -> Floats:

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.core.arrays import Ints
 from pipeline.core.errors import InputError
 from pipeline.features import row_reader
 from pipeline.features.row_reader import RowReader, supports_row_reads
@@ -65,9 +66,11 @@ def test_row_reader_finds_rows_across_pages(
         .reshape(rows, dimension)
     )
     numbers = np.arange(rows)[::-1].copy()
-    assert np.array_equal(
-        RowReader(str(folder), dimension).read(NAME, "shard 0", numbers), expected[::-1]
-    )
+    reader = RowReader(str(folder), dimension)
+    wanted = [(NAME, "shard 0", numbers), (NAME, "shard 0", numbers[:1])]
+    first, second = reader.read_all(wanted)
+    assert np.array_equal(first, expected[::-1])
+    assert np.array_equal(second, expected[-1:])
 
 
 STORED: list[dict[str, object]] = [
@@ -88,6 +91,29 @@ def test_row_reader_rejects_encoded_embeddings(tmp_path: Path, stored: dict[str,
     pq.write_table(table, tmp_path / NAME, **stored)
     with pytest.raises(InputError, match="compressed, encoded or damaged, expected plain ones"):
         RowReader(str(tmp_path), 8).read(NAME, "shard 0", np.array([3]))
+
+
+@pytest.mark.parametrize(("seconds", "requests"), [(0.0, 2), (60.0, 0)])
+def test_row_reader_requests_what_a_slow_disk_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: float, requests: int
+) -> None:
+    monkeypatch.setattr(row_reader, "COLD_ROW_S", seconds)
+    vectors = clustered(3_000, 24, 0)
+    write_table_part(tmp_path, 0, vectors)
+    reader, asked = RowReader(str(tmp_path), 24), list[str]()
+    request = reader._request
+
+    def counted(part: str, shard_sha256: str, row_R: Ints) -> None:
+        asked.append(part)
+        request(part, shard_sha256, row_R)
+
+    monkeypatch.setattr(reader, "_request", counted)
+    rows = [np.array([5, 2_000]), np.array([2_999]), np.array([0, 1, 1_000])]
+    found = reader.read_all([(NAME, "shard 0", row_R) for row_R in rows])
+    assert [
+        np.array_equal(one, vectors[row_R]) for one, row_R in zip(found, rows, strict=True)
+    ] == 3 * [True]
+    assert len(asked) == requests
 
 
 def test_row_reader_rejects_changed_or_missing_part(tmp_path: Path) -> None:
