@@ -16,7 +16,7 @@ from pipeline.core.records import Split, View
 from pipeline.features.table import open_table
 from pipeline.index.build import build_index
 from pipeline.index.metadata import SearchParams
-from pipeline.index.part import FILTERED_EXACT_ROWS, NO_ROW
+from pipeline.index.part import FILTERED_EXACT_ROWS, NO_ROW, filtered_params
 from pipeline.index.searcher import Index, merge_results
 from pipeline.index.settings import IndexSettings
 from tests.index.index_tables import write_gallery
@@ -225,3 +225,14 @@ def test_search_rejects_queries_of_another_network(
 def test_open_index_absent_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no index at"):
         Index(str(tmp_path))
+
+
+def test_filtered_params_widen_as_fewer_rows_match() -> None:
+    usual = SearchParams(nprobe_or_ef=8, rerank_factor=2)
+    assert filtered_params(usual, 1.0) == usual
+    quarter = filtered_params(usual, 0.25)
+    assert (quarter.nprobe_or_ef, quarter.rerank_factor) == (32, 4)
+    fifth = filtered_params(usual, 0.2)
+    assert (fifth.nprobe_or_ef, fifth.rerank_factor) == (40, 5)  # 2 / sqrt(0.2) is 4.47
+    # Without candidates that are scored again, more of them would change nothing.
+    assert filtered_params(SearchParams(nprobe_or_ef=8, rerank_factor=1), 0.25).rerank_factor == 1
