@@ -79,7 +79,7 @@ def adapt(settings: AdaptSettings) -> list[Expectation]:
     with step(seconds, "2 flights", "simulated photos: to learn from, to check with, to expect by"):
         flights = [take_flight(one) for one in plan_flights(region, of_files, cameras)]
     with step(seconds, "3 encoder", "the built-in one, fine-tuned on this map"):
-        choose_encoder(region, settings, *flights[:2])
+        choose_encoder(region, of_files, *flights[:2])
     with step(seconds, "4 index", "the tiles embedded and indexed"):
         embed_tiles(region)
         print_command("build_index", table=region.table, out=region.index)
