@@ -142,7 +142,7 @@ def match_all(
             [window] = windows.around([(lat, lon, key)], 1, reach_m)
         longest = refine.PHOTO_PX
         if name == "xfeat" and promised_33 is not None:
-            longest = round(2 * reach_m / window.window.metres_per_pixel)
+            longest = round(2 * reach_m / window.metres_per_pixel)
         with photo_pixels(longest), matched.timed("photo"):
             prepared = refine.prepare_photo(image_HW3, pose)
         with matched.timed("fit"):

@@ -47,8 +47,8 @@ def open_map(
     reader = _open_tiles(shards)
     windows = None if reader is None else _windows_of(reader, gallery)
     if windows is not None and whole_map:
-        features = _feature_file(shards, gallery, index)
-        windows.search = MapSearch(partial(features.read_or_make, windows))
+        kept = _feature_file(shards, gallery, index)
+        windows.search = MapSearch(kept.read, partial(kept.make, windows))
     if windows is None:
         console.print(
             f"the images of {shards} do not say which ground their corners show: photos are not "
@@ -65,7 +65,7 @@ def open_photo_map(shards: str, match: bool, index: str, gallery: GalleryMap) ->
         return None
     windows = _windows_of(reader, gallery)
     if windows is not None and match:
-        windows.search = MapSearch(_feature_file(shards, gallery, index).read)
+        windows.search = MapSearch(_feature_file(shards, gallery, index).read, lambda: None)
     return PhotoMap(gallery, reader.fetch, windows, match)
 
 

@@ -39,22 +39,22 @@ class FeatureFile:
                 if str(kept["belongs_to"]) != self._name():
                     return None
                 lat, lon, reach_m = kept["frame"].tolist()
+                index = FAISS.deserialize_index(kept["index"])
+                index.make_direct_map()
                 return MapFeatures(
                     plane=LocalPlane(lat=lat, lon=lon),
                     points_N2=kept["points_N2"],
-                    index=FAISS.deserialize_index(kept["index"]),
+                    metres_per_pixel_N=kept["metres_per_pixel_N"],
+                    index=index,
                     reach_m=reach_m,
                 )
         except (OSError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
             console.print(f"{self.path} is damaged ({error}); it is made anew", markup=False)
             return None
 
-    def read_or_make(self, windows: MapWindows) -> MapFeatures | None:
-        """The features that are kept; else those of the windows, which are kept if the folder can
-        be written to. None of a map that is too large."""
-        kept = self.read()
-        if kept is not None:
-            return kept
+    def make(self, windows: MapWindows) -> MapFeatures | None:
+        """The features of the windows, which are kept if the folder can be written to. None of a
+        map that is too large."""
         found = find_map_features(windows)
         if found is not None:
             self._keep(found)
@@ -67,6 +67,7 @@ class FeatureFile:
             belongs_to=np.array(self._name()),
             frame=np.array([features.plane.lat, features.plane.lon, features.reach_m]),
             points_N2=features.points_N2,
+            metres_per_pixel_N=features.metres_per_pixel_N,
             index=FAISS.serialize_index(features.index),
         )
         try:

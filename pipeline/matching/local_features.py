@@ -43,12 +43,12 @@ def find_features(image_HW3: Pixels, most: int, mask_HW: Pixels | None = None) -
     )
 
 
-def match_features(one: LocalFeatures, other: LocalFeatures, ratio: float) -> Ints:
-    """Pairs (M, 2) of points, numbers in `one` and `other`: mutually nearest, and nearer than
+def match_features(one_ND: Floats, other_ND: Floats, ratio: float) -> Ints:
+    """Pairs (M, 2) of descriptors, numbers in `one` and `other`: mutually nearest, and nearer than
     `ratio` times the distance of the second nearest."""
-    if len(one.points_N2) == 0 or len(other.points_N2) < 2:
+    if len(one_ND) == 0 or len(other_ND) < 2:
         return np.zeros((0, 2), np.int64)
-    similarity_NM = one.descriptors_ND @ other.descriptors_ND.T
+    similarity_NM = one_ND @ other_ND.T
     nearest_N = similarity_NM.argmax(axis=1)
     rows_N = np.arange(len(nearest_N))
     best_N = similarity_NM[rows_N, nearest_N]

@@ -21,7 +21,7 @@ from pipeline.core.arrays import Doubles, Floats
 from pipeline.core.geo import Circle
 from pipeline.core.progress import progress
 from pipeline.matching.map_windows import MapWindows
-from pipeline.matching.refine import MatchablePhoto, prepare_window
+from pipeline.matching.refine import MatchablePhoto, MatchableWindow, prepare_window
 
 FAISS: Any = faiss
 "Without types: FAISS's stubs lack the keyword arguments."
@@ -30,8 +30,9 @@ MOST_MAP_WINDOWS = 256
 square kilometre to make, some 200 MB. A larger map is left to the encoder."""
 VOTE_RATIO = 0.85
 "Of the distances of the nearest and the second nearest descriptor, as for windows."
-LISTS_PER_ROOT, SEARCHED_LISTS, SAMPLE_PER_LIST = 4, 16, 64
-"Lists of N features: so many times the square root of N; how many a feature searches."
+LISTS_PER_ROOT, SEARCHED_LISTS, SAMPLE_PER_LIST, ROUNDS = 2, 12, 64, 8
+"""Lists of N features: so many times the square root of N; how many of them a feature searches;
+what their centres are learned from, and in how many rounds: seconds, not a minute."""
 NEIGHBOURS = 10
 "That are looked at to find two away from a place."
 LEAST_VOTES = 4
@@ -45,8 +46,10 @@ class MapFeatures:
     plane: LocalPlane
     points_N2: Floats
     "(east, north) in metres."
+    metres_per_pixel_N: Floats
+    "Of the map where they were found."
     index: Any
-    "FAISS's index of their descriptors (N, 128)."
+    "FAISS's index of their descriptors (N, 128), which gives them back."
     reach_m: float
     "Votes within so many metres of each other are for one place."
 
@@ -67,6 +70,22 @@ class MapFeatures:
             found.append((lat, lon))
             votes_M2 = votes_M2[np.abs(votes_M2 - middle_12).max(axis=1) > 2 * self.reach_m]
         return found
+
+    def window(self, lat: float, lon: float, half_m: float) -> MatchableWindow | None:
+        """Those within `half_m` metres east, west, north and south of a position; None where there
+        are none."""
+        here_12 = self.plane.to_metres(np.array([[lat, lon]])).astype(np.float32)
+        within = np.flatnonzero(np.abs(self.points_N2 - here_12).max(axis=1) <= half_m)
+        if len(within) == 0:
+            return None
+        plane = LocalPlane(lat=lat, lon=lon)
+        positions_N2 = self.plane.to_degrees(self.points_N2[within].astype(np.float64))
+        return MatchableWindow(
+            plane=plane,
+            metres_per_pixel=float(np.median(self.metres_per_pixel_N[within])),
+            ground_N2=plane.to_metres(positions_N2),
+            descriptors_ND=self.index.reconstruct_batch(within),
+        )
 
     def _votes(self, descriptors_QD: Floats, away_from: Circle | None) -> Doubles:
         """The ground (M, 2) of those features of the map that a photo's are clearly nearest to."""
@@ -94,20 +113,23 @@ def find_map_features(windows: MapWindows) -> MapFeatures | None:
     if not middles:
         return None
     plane = LocalPlane(lat=middles[0][0], lon=middles[0][1])
-    points, descriptors = [], []
+    points, descriptors, scales = [], [], []
     with progress(len(middles), "features of the map", "windows") as meter:
         for lat, lon in middles:
             window = windows.compose(lat, lon, half_m)
             if window is not None:
                 found = prepare_window(window)
-                points.append(plane.to_metres(found.positions()).astype(np.float32))
-                descriptors.append(found.features.descriptors_ND)
+                positions_N2 = found.plane.to_degrees(found.ground_N2)
+                points.append(plane.to_metres(positions_N2).astype(np.float32))
+                descriptors.append(found.descriptors_ND)
+                scales.append(np.full(len(positions_N2), found.metres_per_pixel, np.float32))
             meter.advance()
     if sum(map(len, points)) < NEIGHBOURS:
         return None
     return MapFeatures(
         plane=plane,
         points_N2=np.concatenate(points),
+        metres_per_pixel_N=np.concatenate(scales),
         index=_index_of(np.concatenate(descriptors)),
         reach_m=min(windows.tile_sides_m()),
     )
@@ -118,21 +140,32 @@ def _index_of(descriptors_ND: Floats) -> Any:
     lists = max(1, round(LISTS_PER_ROOT * math.sqrt(len(descriptors_ND))))
     lists = min(lists, max(1, len(descriptors_ND) // SAMPLE_PER_LIST))
     index = FAISS.index_factory(descriptors_ND.shape[1], f"IVF{lists},SQ8")
-    index.cp.max_points_per_centroid = SAMPLE_PER_LIST
+    index.cp.max_points_per_centroid, index.cp.niter = SAMPLE_PER_LIST, ROUNDS
     index.train(descriptors_ND)
     index.add(descriptors_ND)
+    index.make_direct_map()
     return index
 
 
 class MapSearch:
-    """A map's features, found or loaded when first asked for."""
+    """A map's features: those that are kept; if places are searched, else made."""
 
-    def __init__(self, load: Callable[[], MapFeatures | None]) -> None:
-        self._load = load
+    def __init__(
+        self, read: Callable[[], MapFeatures | None], make: Callable[[], MapFeatures | None]
+    ) -> None:
+        self._read, self._make = read, make
+
+    @cached_property
+    def _kept(self) -> MapFeatures | None:
+        return self._read()
 
     @cached_property
     def _features(self) -> MapFeatures | None:
-        return self._load()
+        return self._kept or self._make()
+
+    def window(self, lat: float, lon: float, half_m: float) -> MatchableWindow | None:
+        """`MapFeatures.window` of those that are kept: no window waits for all of a map."""
+        return None if self._kept is None else self._kept.window(lat, lon, half_m)
 
     def places(
         self, photo: MatchablePhoto, most: int, away_from: Circle | None = None

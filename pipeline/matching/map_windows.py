@@ -46,8 +46,11 @@ class TilePositions(Protocol):
         """Numbers of the tiles nearest to a position, nearest first; of the level of this side."""
 
 
-class PlaceSearch(Protocol):
-    """A search for places of a map besides retrieval's: `map_features.MapSearch`."""
+class FeatureSearch(Protocol):
+    """The features of a whole map: `map_features.MapSearch`."""
+
+    def window(self, lat: float, lon: float, half_m: float) -> MatchableWindow | None:
+        """Those within `half_m` metres of a position, if they are at hand and there are any."""
 
     def places(
         self, photo: MatchablePhoto, most: int, away_from: Circle | None = None
@@ -78,7 +81,7 @@ class MapWindows:
 
     def __init__(self, gallery: TilePositions, fetch: ImageLoader, footprints: Footprints) -> None:
         self._gallery, self._fetch, self._footprints = gallery, fetch, footprints
-        self.search: PlaceSearch | None = None
+        self.search: FeatureSearch | None = None
         "By the features of the whole map, if they are to be searched."
         self._kept: OrderedDict[Place, MatchableWindow | None] = OrderedDict()
 
@@ -153,6 +156,10 @@ class MapWindows:
     def _make(self, place: Place) -> MatchableWindow | None:
         half_m, row, column = place
         lat, lon = row * self._step_lat(half_m), column * self._step_lon(half_m, row)
+        if self.search and self._level_for(half_m) == min(self._sides_m, default=None):
+            known = self.search.window(lat, lon, half_m)
+            if known is not None:
+                return known
         window = self.compose(lat, lon, half_m)
         return None if window is None else prepare_window(window)
 
@@ -181,8 +188,7 @@ class MapWindows:
         TILES_ACROSS come nearest to filling it; at most `most_px` pixels wide. None where no tile
         shows it."""
         plane = LocalPlane(lat=lat, lon=lon)
-        wanted_m = 2 * half_m / TILES_ACROSS
-        side_m = min(self._sides_m, key=lambda side: abs(math.log(side / wanted_m)), default=None)
+        side_m = self._level_for(half_m)
         keys = self._keys_within(plane, half_m, side_m)
         footprints = self._footprints(keys)
         images = self._fetch(footprints)
@@ -199,6 +205,11 @@ class MapWindows:
             return None
         finest_m = min(tile.metres_per_pixel for tile in tiles)
         return compose_window(plane, tiles, half_m, max(finest_m, 2 * half_m / most_px))
+
+    def _level_for(self, half_m: float) -> float | None:
+        """The side of the tiles that a window is put together from; None where none is known."""
+        wanted_m = 2 * half_m / TILES_ACROSS
+        return min(self._sides_m, key=lambda side: abs(math.log(side / wanted_m)), default=None)
 
     def _keys_within(self, plane: LocalPlane, half_m: float, side_m: float | None) -> list[str]:
         """Tiles of a level that a window may show, nearest first."""

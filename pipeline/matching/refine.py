@@ -19,11 +19,12 @@ from pipeline.camera.ground import (
     heading_of,
     photo_to_ground,
 )
+from pipeline.camera.local_plane import LocalPlane
 from pipeline.camera.map_window import MapWindow
 from pipeline.camera.pose import PartialPose
 from pipeline.camera.uncertainty import Ellipse, ellipse_of
 from pipeline.camera.warp import north_up, warp
-from pipeline.core.arrays import Doubles, Pixels
+from pipeline.core.arrays import Doubles, Floats, Pixels
 from pipeline.matching.ground_fit import (
     GroundFit,
     agree_with_promise,
@@ -173,21 +174,24 @@ def _flat_frame(ground_42: Doubles, to_ground_33: Doubles) -> tuple[Doubles, tup
 
 @dataclass(frozen=True, kw_only=True)
 class MatchableWindow:
-    """A window of the map with its features."""
+    """The features of a window of the map."""
 
-    window: MapWindow
-    features: LocalFeatures
-
-    def positions(self) -> Doubles:
-        """Latitudes and longitudes (N, 2) of its features."""
-        ground_N2 = apply_homography(self.window.to_ground_33, self.features.points_N2)
-        return self.window.plane.to_degrees(ground_N2)
+    plane: LocalPlane
+    metres_per_pixel: float
+    ground_N2: Doubles
+    "(east, north) in metres from the plane's zero."
+    descriptors_ND: Floats
 
 
 def prepare_window(window: MapWindow) -> MatchableWindow:
     """The features of a window."""
     found = find_features(window.pixels_HW3, WINDOW_FEATURES, window.shown_HW)
-    return MatchableWindow(window=window, features=found)
+    return MatchableWindow(
+        plane=window.plane,
+        metres_per_pixel=window.metres_per_pixel,
+        ground_N2=apply_homography(window.to_ground_33, found.points_N2),
+        descriptors_ND=found.descriptors_ND,
+    )
 
 
 def refine(photo: MatchablePhoto, windows: Iterable[MatchableWindow]) -> Refinement | None:
@@ -203,13 +207,12 @@ def refine(photo: MatchablePhoto, windows: Iterable[MatchableWindow]) -> Refinem
     return best
 
 
-def refine_in(photo: MatchablePhoto, matchable: MatchableWindow) -> Refinement | None:
+def refine_in(photo: MatchablePhoto, window: MatchableWindow) -> Refinement | None:
     """The refinement by one window; None where no homography holds, or no camera makes it."""
-    window = matchable.window
     ratio = ALONE_RATIO if photo.promised_33 is None else PROMISED_RATIO
-    pairs_M2 = match_features(photo.features, matchable.features, ratio)
+    pairs_M2 = match_features(photo.features.descriptors_ND, window.descriptors_ND, ratio)
     photo_M2 = photo.features.points_N2[pairs_M2[:, 0]]
-    ground_M2 = apply_homography(window.to_ground_33, matchable.features.points_N2[pairs_M2[:, 1]])
+    ground_M2 = window.ground_N2[pairs_M2[:, 1]]
     if photo.promised_33 is not None:
         agree_M = agree_with_promise(apply_homography(photo.promised_33, photo_M2), ground_M2)
         photo_M2, ground_M2 = photo_M2[agree_M], ground_M2[agree_M]
@@ -224,7 +227,7 @@ def refine_in(photo: MatchablePhoto, matchable: MatchableWindow) -> Refinement |
 
 
 def _points(
-    photo_K2: Doubles, ground_K2: Doubles, size: tuple[int, int], window: MapWindow
+    photo_K2: Doubles, ground_K2: Doubles, size: tuple[int, int], window: MatchableWindow
 ) -> tuple[MatchedPoint, ...]:
     """POINTS_KEPT of the inliers, from the photo's left to its right."""
     order = np.argsort(photo_K2[:, 0], kind="stable")
@@ -255,7 +258,7 @@ def _fits_the_pose(to_ground_33: Doubles, photo: MatchablePhoto) -> bool:
 def _refinement(
     fit: GroundFit,
     photo: MatchablePhoto,
-    window: MapWindow,
+    window: MatchableWindow,
     matches: int,
     points: tuple[MatchedPoint, ...],
 ) -> Refinement:

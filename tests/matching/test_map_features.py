@@ -14,7 +14,7 @@ from pipeline.locate.refined import refine_answer
 from pipeline.matching.gate import holds
 from pipeline.matching.kept_features import FeatureFile
 from pipeline.matching.map_features import MapFeatures, MapSearch, find_map_features
-from pipeline.matching.refine import MatchablePhoto, prepare_photo
+from pipeline.matching.refine import MatchablePhoto, prepare_photo, refine
 from tests.matching.made_maps import PLANE, POSE, MadeMap, error_m, made_map, photo_of, window_of
 
 pytestmark = pytest.mark.slow
@@ -96,7 +96,7 @@ def test_refine_answer_finds_what_no_candidate_shows(
     windows = made.windows()
     alone = refine_answer(answer, photo, windows)
     assert alone is None or not holds(alone)
-    windows.search = MapSearch(lambda: features)
+    windows.search = MapSearch(lambda: None, lambda: features)
     found = refine_answer(answer, photo, windows)
     assert found is not None
     assert holds(found)
@@ -107,12 +107,38 @@ def test_refine_answer_finds_what_no_candidate_shows(
     assert elsewhere is None or not holds(elsewhere)
 
 
+def test_window_of_kept_features_places_as_its_pixels(
+    made: MadeMap, features: MapFeatures, photo: MatchablePhoto
+) -> None:
+    lat, lon = PLANE.lat, PLANE.lon
+    window = features.window(lat, lon, 80)
+    assert window is not None
+    assert np.abs(window.ground_N2).max() <= 80
+    found = refine(photo, [window])
+    assert found is not None
+    assert holds(found)
+    assert error_m(found) < 1
+    assert features.window(lat + 1, lon, 80) is None
+
+
+def test_windows_take_features_that_are_kept(
+    made: MadeMap, features: MapFeatures, photo: MatchablePhoto, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    windows, key = made.windows(), str(made.gallery.keys[0])
+    windows.search = MapSearch(lambda: features, lambda: None)
+    monkeypatch.setattr(windows, "compose", lambda *_: pytest.fail("reads tiles"))
+    [window] = windows.around([(PLANE.lat, PLANE.lon, key)], 1)
+    found = refine(photo, [window])
+    assert found is not None
+    assert error_m(found) < 1
+
+
 def test_feature_file_keeps_what_was_made(
     made: MadeMap, photo: MatchablePhoto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = FeatureFile(path=str(tmp_path / "features.npz"), belongs_to="these tiles")
     assert file.read() is None
-    first = file.read_or_make(made.windows())
+    first = file.make(made.windows())
     again = file.read()
     assert first is not None
     assert again is not None
@@ -124,7 +150,7 @@ def test_feature_file_keeps_what_was_made(
     Path(file.path).write_bytes(bytes(content))
     assert file.read() is None
     monkeypatch.setattr("pipeline.core.storage.write_bytes", _full)
-    remade = file.read_or_make(made.windows())
+    remade = file.make(made.windows())
     assert remade is not None
     assert remade.places(photo, 2) == first.places(photo, 2)
 
