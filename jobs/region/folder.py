@@ -69,9 +69,11 @@ def claim(region: Region, settings: AdaptSettings) -> None:
     check_map(settings)
     mosaic = settings.mosaic
     files = find_sheets(mosaic) if storage.is_folder(mosaic) else [mosaic]
-    about = settings_record(settings, ("out", "extend")) | {
-        "mosaic_bytes": sum(map(storage.size, files))
-    }
+    about = (
+        settings_record(settings, ("out", "extend", "camera"))
+        | settings.lens
+        | {"mosaic_bytes": sum(map(storage.size, files))}
+    )
     path = region.path("region.json")
     if not storage.exists(path):
         if storage.is_folder(region.out) and storage.walk(region.out):

@@ -41,7 +41,8 @@ def fly(settings: MapFlightSettings) -> Path:
     Raises InputError for a map that cannot be flown over, or a folder of another flight.
     """
     root = local_root(settings.out)
-    about = settings_record(settings, ("out", "workers", *UNUSED_FIELDS[settings.plan]))
+    left_out = ("out", "workers", "camera", *UNUSED_FIELDS[settings.plan])
+    about = settings_record(settings, left_out) | settings.lens
     if is_complete(root, about, COMPLETE, "a flight with other settings,", "jobs/fly.py"):
         console.print(f"{root} is complete already; nothing to do")
         return root

@@ -56,6 +56,11 @@ class CameraRanges:
         fov = CAMERAS[self.camera].fov_deg
         return fov, fov
 
+    @property
+    def lens(self) -> dict[str, list[float]]:
+        """What a record of the settings has of the lens: however it was named."""
+        return {"fov": list(self.fov_range)}
+
 
 Plan = Literal["places", "survey", "spiral"]
 
