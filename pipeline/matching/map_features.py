@@ -154,6 +154,7 @@ class MapSearch:
         self, read: Callable[[], MapFeatures | None], make: Callable[[], MapFeatures | None]
     ) -> None:
         self._read, self._make = read, make
+        self._made: MapFeatures | None = None
 
     @cached_property
     def _kept(self) -> MapFeatures | None:
@@ -161,11 +162,13 @@ class MapSearch:
 
     @cached_property
     def _features(self) -> MapFeatures | None:
-        return self._kept or self._make()
+        self._made = self._kept or self._make()
+        return self._made
 
     def window(self, lat: float, lon: float, half_m: float) -> MatchableWindow | None:
-        """`MapFeatures.window` of those that are kept: no window waits for all of a map."""
-        return None if self._kept is None else self._kept.window(lat, lon, half_m)
+        """`MapFeatures.window` of those that are at hand: no window waits for all of a map."""
+        known = self._made or self._kept
+        return None if known is None else known.window(lat, lon, half_m)
 
     def places(
         self, photo: MatchablePhoto, most: int, away_from: Circle | None = None

@@ -133,6 +133,15 @@ def test_windows_take_features_that_are_kept(
     assert error_m(found) < 1
 
 
+def test_windows_take_features_once_they_are_made(
+    made: MadeMap, features: MapFeatures, photo: MatchablePhoto
+) -> None:
+    search = MapSearch(lambda: None, lambda: features)
+    assert search.window(PLANE.lat, PLANE.lon, 80) is None
+    search.places(photo, 1)
+    assert search.window(PLANE.lat, PLANE.lon, 80) is not None
+
+
 def test_feature_file_keeps_what_was_made(
     made: MadeMap, photo: MatchablePhoto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -78,8 +78,8 @@ def fit_calibration(
     if location_count < MIN_LOCATIONS:
         raise InputError(
             f"{len(examples)} photos of {location_count} locations to calibrate on, expected at "
-            f"least {MIN_LOCATIONS} locations that the encoder was not trained on; take more photos, "
-            "of a larger map; or from shards of another --split, or train with --hold-out 0.1"
+            f"least {MIN_LOCATIONS} locations that the encoder was not trained on; take more "
+            "photos, of a larger map; or name another --split, or train with --hold-out 0.1"
         )
     radius_m = choose_agreement_radius(
         examples, criteria.tolerance, context.spacing_m, context.finest_side_m
