@@ -95,7 +95,7 @@ def search_flight(
     truth = {photo.path: photo.truth for photo in photos}
     searched = []
     for way in WAYS:
-        queries = encode_photos(list(truth), encoder, view_maker(windows, way))
+        queries = encode_photos(list(truth), encoder, view_maker(windows.tile_sides_m(), way))
         decoded = [(one, one.views_VD) for one in queries if one.views_VD is not None]
         tags = [truth[query.name] for query, _ in decoded]
         found = search_near_and_away(

@@ -16,6 +16,7 @@ from jobs.encoding.queries import Query, ViewMaker, encode_photos, merge_by_fold
 from jobs.stages.flight import locate_flight, search_queries, with_times
 from jobs.stages.matching import open_map, overhead_maker, refine_answers, view_maker
 from jobs.stages.settings import LocateSettings
+from pipeline.camera.pose import Perspective
 from pipeline.core import storage
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.filters import Filter
@@ -63,12 +64,8 @@ def locate_photos(
     )
     gallery = read_gallery_map(index)
     windows = _open_map(settings, gallery)
-    make_views: ViewMaker = one_view
-    if windows:
-        make_views = view_maker(windows, settings)
-    elif encoder.encoding.perspective == "overhead":
-        make_views = overhead_maker(settings)
-    queries = encode_photos(photos, encoder, make_views)
+    perspective = encoder.encoding.perspective
+    queries = encode_photos(photos, encoder, _view_maker(settings, gallery, windows, perspective))
     if settings.together:
         queries = merge_by_folder(queries)
     decoded = [query for query in queries if query.views_VD is not None]
@@ -104,6 +101,22 @@ def _open_map(settings: LocateSettings, gallery: GalleryMap) -> MapWindows | Non
         return None
     whole_map = settings.whole_map and (settings.near is None or settings.track)
     return open_map(settings.shards, gallery, settings.index, whole_map)
+
+
+def _view_maker(
+    settings: LocateSettings,
+    gallery: GalleryMap,
+    windows: MapWindows | None,
+    perspective: Perspective,
+) -> ViewMaker:
+    """How the encoder is shown photos: framed as the gallery's tiles are, where their size is
+    known; several of one place as they are."""
+    if windows is None and perspective == "overhead":
+        return overhead_maker(settings)
+    sides_m = windows.tile_sides_m() if windows else gallery.level_sides_m
+    if not sides_m or settings.together:
+        return one_view
+    return view_maker(sides_m, settings)
 
 
 def answer_queries(

@@ -88,9 +88,9 @@ def _windows_of(reader: TileReader, gallery: GalleryMap) -> MapWindows | None:
     return MapWindows(gallery, reader.fetch, reader.footprints)
 
 
-def view_maker(windows: MapWindows, pose: PoseSettings) -> ViewMaker:
-    """Frames photos as the tiles of a map, as far as tags and flags tell the camera."""
-    sides_m = windows.tile_sides_m()
+def view_maker(sides_m: Sequence[float], pose: PoseSettings) -> ViewMaker:
+    """Frames photos as tiles of these sides (metres, rising), as far as tags and flags tell the
+    camera."""
 
     def make_views(photo_HW3: Pixels, tags: CameraTags) -> PhotoViews:
         known = pose_of_photo(tags, (photo_HW3.shape[1], photo_HW3.shape[0]), pose)

@@ -5,6 +5,7 @@ import csv
 import io
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     footer = PartFooter(fingerprint=mark, shard_sha256="s", rows=LOCATIONS, encoding=ENCODING)
     write_part(str(folder / "table" / "gallery-satellite-000000.parquet"), rows, footer)
     build_index(IndexSettings(table=str(folder / "table"), out=str(folder / "index")))
+    sized = replace(rows, sides_m=[55.0] * LOCATIONS)
+    write_part(str(folder / "sized-table" / "gallery-satellite-000000.parquet"), sized, footer)
+    build_index(IndexSettings(table=str(folder / "sized-table"), out=str(folder / "sized")))
     (folder / "photos").mkdir()
     for number in range(4):
         (folder / "photos" / f"{number}.jpg").write_bytes(photo(number, 96))
@@ -84,7 +88,7 @@ def world(tmp_path: Path, made: tuple[Path, str]) -> dict[str, str]:
     """A copy of what was made, and where the answers go."""
     folder, mark = made
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
-    paths = {name: str(tmp_path / name) for name in ("index", "photos")}
+    paths = {name: str(tmp_path / name) for name in ("index", "sized", "photos")}
     return paths | {
         "checkpoint": str(tmp_path / "last.pt"),
         "out": str(tmp_path / "out.geojson"),
@@ -142,6 +146,22 @@ def test_locate_together_is_one_query_per_folder(world: dict[str, str]) -> None:
     assert one.name == world["photos"]
     assert len(one.photos) == 4
     assert one.answer is not None
+
+
+def test_locate_frames_photos_as_tiles_of_a_known_size(world: dict[str, str]) -> None:
+    """Without the tiles' pixels: their sides are in the index."""
+    camera = {"fov": 60.0, "height": 100.0, "heading": 0.0, "pitch": -90.0}
+    sized = world | {"index": world["sized"]}
+    assert framings(sized, **camera) == {"ground"}
+    assert framings(sized, heading=90.0) == {"north"}
+    assert framings(sized, **camera, together=True) == {"none"}
+    assert framings(world, **camera) == {"none"}  # nobody knows how large its tiles are
+
+
+def framings(world: dict[str, str], **changes: Any) -> set[str]:
+    """How the photos of a call were framed."""
+    answers = [one.answer for one in locate_photos(settings(world, **changes))]
+    return {answer.framing for answer in answers if answer is not None}
 
 
 def test_locate_near_restricts_candidates(world: dict[str, str]) -> None:
