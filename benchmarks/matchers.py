@@ -8,8 +8,9 @@ Photos of known places over a map (another day's, or another renderer's) are mat
 of the map around each photo's own place, moved by up to a tile's half side, with the camera's tags
 and without: retrieval plays no part. Fit, tolerance and gate are those of jobs/locate.py. XFeat
 knows no turn and no scale, so with tags its photo lies on the ground at the window's scale; its
-pairs are those of mutually nearest descriptors. Seconds are by part. Then how often the features of
-the whole map vote for the photo's place first.
+pairs are those of mutually nearest descriptors. Beside it the most inliers that a window elsewhere
+gave, and seconds by part. Then how often the features of the whole map vote for the photo's place
+first.
 """
 
 import argparse
@@ -46,6 +47,7 @@ from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
 
 LEAST_SCORE = 0.05
 "XFeat's own threshold of a keypoint."
+SHARES = ("any view within 5 m", "by the rule within 1 m", "5 m", "wrong")
 PARTS = ("photo", "window", "fit")
 "Features of the photo; the map's pixels and their features; pairs of them and a homography."
 
@@ -105,7 +107,11 @@ class Matched:
     """How photos were matched."""
 
     errors_m: list[float] = field(default_factory=list)
-    "Infinite where nothing holds."
+    "Infinite where no view holds that a camera can have."
+    held: list[bool] = field(default_factory=list)
+    "Whether it holds by the rule for all maps."
+    elsewhere: list[int] = field(default_factory=list)
+    "Inliers in a window that does not show the photo's ground; 0 where nothing holds."
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     "Of all photos, by PARTS."
 
@@ -148,11 +154,28 @@ def match_all(
         with matched.timed("fit"):
             found = refine.refine(prepared, [window])
         error_m = np.inf
-        if found is not None and holds(found):
+        matched.held.append(found is not None and holds(found))
+        if found is not None:
             truth_2 = np.array([photo.truth.lat, photo.truth.lon])
             error_m = float(haversine_m(np.array([found.lat, found.lon]), truth_2))
         matched.errors_m.append(error_m)
+        strange = next(windows.around([(*_elsewhere(photo, gallery, windows, rng), key)], 1), None)
+        other = None if strange is None else refine.refine(prepared, [strange])
+        matched.elsewhere.append(0 if other is None else other.inliers)
     return matched
+
+
+def _elsewhere(
+    photo: FlightPhoto, gallery: GalleryMap, windows: MapWindows, rng: np.random.Generator
+) -> tuple[float, float]:
+    """A tile's position whose window does not show a photo's ground; of a small map, the farthest
+    one."""
+    truth_2 = np.array([photo.truth.lat, photo.truth.lon])
+    away_N = haversine_m(gallery.positions_N2, truth_2)
+    far = np.flatnonzero(away_N > windows.apart_m(None))
+    number = int(rng.choice(far)) if len(far) else int(away_N.argmax())
+    lat, lon = gallery.positions_N2[number].tolist()
+    return lat, lon
 
 
 def print_votes(photos: list[FlightPhoto], windows: MapWindows) -> None:
@@ -189,7 +212,7 @@ def main() -> None:
     torch.set_grad_enabled(False)
     photos = flight_of(options.flight, options.photos)
     print(f"{len(photos)} photos, {os.cpu_count()} cores; seconds a photo")
-    headings = ("features", "tags", "within 1 m", "within 5 m", "wrong", *PARTS, "x the first row")
+    headings = ("features", "tags", *SHARES, "inliers elsewhere", *PARTS, "x the first row")
     print(f"| {' | '.join(headings)} |\n{'|---' * len(headings)}|")
     baseline = 0.0
     gallery = read_gallery_map(Index(options.index))
@@ -207,7 +230,8 @@ def main() -> None:
                 shares = " | ".join(f"{share:.1%}" for share in (*within, wrong))
                 seconds = " | ".join(f"{matched.seconds[part] / len(photos):.2f}" for part in PARTS)
                 print(
-                    f"| {name} | {'yes' if posed else 'no'} | {shares} | {seconds} "
+                    f"| {name} | {'yes' if posed else 'no'} | {shares} "
+                    f"| {max(matched.elsewhere)} | {seconds} "
                     f"| {within[1] / baseline:.2f} x |",
                     flush=True,
                 )

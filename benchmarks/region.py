@@ -154,6 +154,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--height", type=float, nargs=2, default=(60.0, 120.0), help="metres")
     parser.add_argument("--pitch", type=float, nargs=2, default=(-90.0, -45.0), help="degrees")
+    parser.add_argument("--only-after", action="store_true", help="leave out what was before adapt")
     options = parser.parse_args()
     out: Path = options.out
     cluster.connect()
@@ -186,12 +187,15 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|---|---|")
     baseline, seen, by_tiles = 0.0, {}, {}
     for posed, way in ((True, "with tags"), (False, "without")):
-        for name, settings in (
-            ("before, tiles", before),
-            ("before, matched by rule", replace(before, match=True)),
-            ("after, tiles", replace(after, match=False)),
-            ("after", replace(after, match=True)),
-        ):
+        ways = {
+            "before, tiles": before,
+            "before, matched by rule": replace(before, match=True),
+            "after, tiles": replace(after, match=False),
+            "after": replace(after, match=True),
+        }
+        for name, settings in ways.items():
+            if options.only_after and name.startswith("before"):
+                continue
             found, seconds = locate_all(replace(settings, pose=posed), truth)
             share = print_row(f"{name}, {way}", found, seconds, baseline)
             baseline = baseline or share

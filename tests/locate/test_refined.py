@@ -43,7 +43,7 @@ def matched(count: int = LOCATIONS) -> list[MatchedExample]:
             inside=hits(True, rng), outside=hits(False, rng),
         )  # fmt: skip
         inside = make_refinement(inliers=int(rng.integers(30, 90))) if n % 3 else None
-        chance = make_refinement(inliers=int(rng.integers(8, 14)), lat=46.01)
+        chance = make_refinement(inliers=int(rng.integers(8, 14)), lon=8.01)
         outside = chance if n % 2 else None
         examples.append(MatchedExample(searched=searched, inside=inside, outside=outside))
     return examples
