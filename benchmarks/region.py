@@ -154,6 +154,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--height", type=float, nargs=2, default=(60.0, 120.0), help="metres")
     parser.add_argument("--pitch", type=float, nargs=2, default=(-90.0, -45.0), help="degrees")
+    parser.add_argument("--tile-m", type=float, nargs="+", default=[55.0], help="of each level")
     parser.add_argument("--only-after", action="store_true", help="leave out what was before adapt")
     options = parser.parse_args()
     out: Path = options.out
@@ -171,6 +172,7 @@ def main() -> None:
             mosaic=mosaic, surface=surface, out=str(region), minutes=options.minutes,
             checks=options.checks, seed=options.seed, height=tuple(options.height),
             pitch=tuple(options.pitch),
+            tile_m=tuple(options.tile_m) if len(options.tile_m) > 1 else options.tile_m[0],
         )
     )  # fmt: skip
     print(f"adapt: {(time.perf_counter() - begin) / 60:.1f} minutes")
