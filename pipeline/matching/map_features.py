@@ -1,8 +1,8 @@
 """The features of a whole map in one nearest-neighbour index: candidates where retrieval has none.
 
 In: all windows of a map, and a photo's features. Out: the places of the map that the photo's
-features vote for. The encoder bears another day and season, local features do not; of a map that
-looks as the photo does, they find what the encoder ranks low. 140 bytes a feature in memory.
+features vote for: they find what the encoder ranks low, also on another day (docs/results.md).
+140 bytes a feature in memory.
 Shapes: N features of the map, Q of a photo, K neighbours, M votes, 2 = (east, north) in metres.
 """
 
