@@ -7,8 +7,6 @@ not told apart: their positions are a test, never a label.
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from jobs.region.folder import Region, print_command
 from jobs.region.settings import AdaptSettings
 from jobs.training.driver import train
@@ -16,6 +14,7 @@ from jobs.training.recipes.pvda_unlabelled import pvda_unlabelled
 from jobs.training.settings import TrainSettings
 from model.weights.builtin import BUILTIN
 from pipeline.core import storage
+from pipeline.core.arrays import evenly_spaced
 from pipeline.core.progress import console
 from pipeline.core.records import Split, View
 from pipeline.locate.photo_files import find_photos
@@ -61,7 +60,6 @@ def pack_views(region: Region, settings: AdaptSettings, photos: Sequence[str]) -
     storage.remove_folder(out)  # of a run that was killed
     tiles = GeoTiff(tile_m=settings.tile_sides_m[0], split=Split.TRAIN)
     pack(tiles, PackingSettings(root=settings.mosaic, out=out))
-    kept = np.unique(np.linspace(0, len(photos) - 1, min(len(photos), MOST_PHOTOS)).astype(int))
     rows = [
         {
             "path": storage.absolute(photos[at]),
@@ -69,7 +67,7 @@ def pack_views(region: Region, settings: AdaptSettings, photos: Sequence[str]) -
             "view": View.DRONE,
             "split": Split.TRAIN,
         }
-        for at in kept
+        for at in evenly_spaced(len(photos), MOST_PHOTOS)
     ]
     listed = region.path("photos.csv")
     write_table(Path(listed), rows)

@@ -9,6 +9,7 @@ from jobs.region.folder import Region
 from jobs.stages.calibrate_flight import flight_of
 from jobs.stages.locate import locate_photos
 from jobs.stages.settings import LocateSettings
+from pipeline.core.arrays import evenly_spaced
 from pipeline.core.records import GeoTag, ImageRecord, View
 from pipeline.features.table import open_table
 from pipeline.index.searcher import Index
@@ -84,7 +85,7 @@ def lookalikes(region: Region, tile_sides_m: Sequence[float]) -> list[Lookalike]
     index = Index(region.index)
     table = open_table(region.table).select(None, View.SATELLITE)
     labels = table.labels()
-    rows = np.unique(np.linspace(0, table.rows - 1, min(table.rows, LOOKALIKE_ROWS)).astype(int))
+    rows = evenly_spaced(table.rows, LOOKALIKE_ROWS)
     positions_N2 = np.stack([labels.lats, labels.lons], axis=1)[rows]
     return find_lookalikes(
         index, [str(key) for key in labels.keys[rows]], positions_N2, table.embeddings()[rows],

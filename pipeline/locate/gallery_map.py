@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipeline.camera.framing import level_range, tile_levels
-from pipeline.core.arrays import Doubles, Ints, Mask, Strings
+from pipeline.core.arrays import Doubles, Ints, Mask, Strings, evenly_spaced
 from pipeline.core.geo import on_sphere
 from pipeline.index.searcher import Index
 
@@ -89,7 +89,7 @@ def read_gallery_map(index: Index) -> GalleryMap:
     """The rows of an index, or MAX_GALLERY_ROWS evenly spaced ones; removed locations are left
     out."""
     total = index.metadata.rows
-    rows = np.unique(np.linspace(0, total - 1, min(total, MAX_GALLERY_ROWS)).astype(np.int64))
+    rows = evenly_spaced(total, MAX_GALLERY_ROWS)
     names = index.ids_of(rows[None])
     location_N = np.asarray(names["location"].to_pylist(), dtype=np.str_)
     kept_N = np.ones(len(rows), np.bool_)

@@ -49,7 +49,7 @@ class FeatureFile:
                     reach_m=reach_m,
                 )
         except (OSError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile) as error:
-            console.print(f"{self.path} is damaged ({error}); it is made anew", markup=False)
+            console.print(f"{self.path} is damaged ({error}); it is not used", markup=False)
             return None
 
     def make(self, windows: MapWindows) -> MapFeatures | None:

@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.camera.framing import tile_levels
 from pipeline.camera.local_plane import LocalPlane, tile_side_m
 from pipeline.camera.map_window import MapWindow, Tile, compose_window
-from pipeline.core.arrays import Doubles, Ints, Pixels, Strings
+from pipeline.core.arrays import Doubles, Ints, Pixels, Strings, evenly_spaced
 from pipeline.core.geo import Circle
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.inspect import inspect
@@ -113,8 +113,7 @@ class MapWindows:
     def _sides_m(self) -> list[float]:
         if self._gallery.level_sides_m:
             return self._gallery.level_sides_m
-        count = len(self._gallery.keys)
-        numbers = np.unique(np.linspace(0, count - 1, min(count, SIDES_SAMPLE)).astype(int))
+        numbers = evenly_spaced(len(self._gallery.keys), SIDES_SAMPLE)
         shown = self._footprints([str(key) for key in self._gallery.keys[numbers]])
         return tile_levels(np.array([tile_side_m(footprint) for footprint in shown.values()]))
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.camera.pose import PartialPose
 from pipeline.core import storage
+from pipeline.core.arrays import evenly_spaced
 from pipeline.images.decode import DecodeError
 from pipeline.images.inspect import inspect
 from pipeline.locate.photo_files import read_photo_tags
@@ -26,7 +27,7 @@ Range = tuple[float, float]
 
 def ranges_of_photos(photos: Sequence[str], otherwise: CameraRanges) -> CameraRanges:
     """The ranges of photos of one UAV; `otherwise` where their tags do not tell."""
-    kept = np.unique(np.linspace(0, len(photos) - 1, min(len(photos), MOST_PHOTOS)).astype(int))
+    kept = evenly_spaced(len(photos), MOST_PHOTOS)
     poses = [pose for at in kept if (pose := _pose(photos[at])) is not None]
     pitches = [one.pitch_deg for one in poses if one.pitch_deg is not None]
     return CameraRanges(

@@ -42,7 +42,7 @@ def window_of(image_HW3: Pixels) -> MapWindow:
     shown_HW = np.full(image_HW3.shape[:2], 255, np.uint8)
     return MapWindow(
         pixels_HW3=image_HW3, shown_HW=shown_HW, metres_per_pixel=METRES_PER_PIXEL,
-        plane=LocalPlane(lat=47.0, lon=8.0),
+        plane=PLANE,
     )  # fmt: skip
 
 
@@ -56,7 +56,7 @@ def photo_of(window: MapWindow) -> Pixels:
 
 
 def error_m(found: Refinement) -> float:
-    [[lat, lon]] = LocalPlane(lat=47.0, lon=8.0).to_degrees(np.array([looked_at(POSE)]))
+    [[lat, lon]] = PLANE.to_degrees(np.array([looked_at(POSE)]))
     return float(haversine_m(np.array([found.lat, found.lon]), np.array([lat, lon])))
 
 

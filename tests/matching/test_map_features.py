@@ -1,5 +1,6 @@
 """Places that the features of a whole map vote for, and answers that need them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from pipeline.locate.refined import refine_answer
 from pipeline.matching.gate import holds
 from pipeline.matching.kept_features import FeatureFile
 from pipeline.matching.map_features import MapFeatures, MapSearch, find_map_features
+from pipeline.matching.map_windows import MapWindows
 from pipeline.matching.refine import MatchablePhoto, prepare_photo, refine
 from tests.matching.made_maps import PLANE, POSE, MadeMap, error_m, made_map, photo_of, window_of
 
@@ -73,6 +75,8 @@ def test_places_of_another_map_have_few_votes(features: MapFeatures) -> None:
 def test_map_features_of_a_sample_or_a_large_map_are_not_made(
     made: MadeMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    sampled = replace(made.gallery, rows=len(made.gallery.keys) + 1)
+    assert find_map_features(MapWindows(sampled, made.fetch, made.footprints)) is None
     monkeypatch.setattr("pipeline.matching.map_features.MOST_MAP_WINDOWS", 3)
     assert find_map_features(made.windows()) is None
 
