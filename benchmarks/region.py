@@ -7,8 +7,9 @@ The map is a mosaic of overhead images, or a town with its surface model. Photos
 (over the town: of another day's sun, season and haze, with relief) are then located with the
 camera's tags (heading wrong by 3 degrees, pitch by 1, height by 3 %) and without: before (the
 built-in encoder, tiles alone, then matched, without any fitting) and after `adapt`; matched around
-the first candidate alone; and by plain SIFT over the whole map. Beside it: what `adapt` promised,
-photos of another map, and how often matching makes a right tile's answer worse.
+the first candidate alone; with the ground taken for flat; and by plain SIFT over the whole map.
+Beside it: what `adapt` promised, photos of another map, and how often matching makes a right tile's
+answer worse.
 """
 
 import argparse
@@ -28,10 +29,12 @@ from whole_map import open_whole_map
 from jobs.region.adapt import adapt
 from jobs.region.expect import outcome_of
 from jobs.region.settings import AdaptSettings
+from jobs.stages import matching
 from jobs.stages.calibrate_flight import flight_of
 from jobs.stages.locate import locate_photos
 from jobs.stages.settings import LocateSettings
 from model.weights.builtin import BUILTIN
+from pipeline.camera.local_plane import LocalPlane
 from pipeline.core import cluster
 from pipeline.core.geo import haversine_m
 from pipeline.core.records import GeoTag
@@ -72,7 +75,7 @@ def take_photos(
     flight = fly(
         MapFlightSettings(
             mosaic=over, surface=surface, out=str(out), photos=count, seed=1000 + options.seed,
-            height=tuple(options.height), pitch=tuple(options.pitch),
+            relight=False, height=tuple(options.height), pitch=tuple(options.pitch),
         )
     )  # fmt: skip
     return {photo.path: photo.truth for photo in flight_of(str(flight / TABLE), count)}
@@ -115,6 +118,20 @@ def windows_per_photo(count: int) -> Iterator[None]:
         yield
     finally:
         refined.MOST_WINDOWS = usual
+
+
+@contextmanager
+def flat_ground() -> Iterator[None]:
+    """Matching knows nothing of a surface model."""
+    usual, matching.height_reader = matching.height_reader, lambda surface: no_heights
+    try:
+        yield
+    finally:
+        matching.height_reader = usual
+
+
+def no_heights(plane: LocalPlane, half_m: float) -> None:
+    """As if a surface model ended there."""
 
 
 def print_row(name: str, outcomes: Sequence[Outcome], seconds: float, baseline: float) -> float:
@@ -179,7 +196,7 @@ def main() -> None:
     tiles = str(region / "tiles")
     before = LocateSettings(
         photos=tuple(truth), checkpoint=BUILTIN, index=make_index(out / "before", tiles, BUILTIN),
-        shards=tiles, out=str(out / "where.geojson"), match=False,
+        shards=tiles, out=str(out / "where.geojson"), match=False, surface=surface,
     )  # fmt: skip
     after = replace(before, index=str(region / "index"))
     print(
@@ -208,6 +225,10 @@ def main() -> None:
         with windows_per_photo(1):
             first = locate_all(replace(after, match=True, pose=posed), truth)
         print_row(f"after, around the first candidate alone, {way}", *first, baseline)
+        if surface is not None:
+            with flat_ground():
+                flat = locate_all(replace(after, match=True, pose=posed), truth)
+            print_row(f"after, the ground taken for flat, {way}", *flat, baseline)
     print_row("plain SIFT over the whole map, without", *locate_by_sift(mosaic, truth), baseline)
     print_promises(promised, seen)
     pairs = [

@@ -45,7 +45,7 @@ def take_flights(options: argparse.Namespace) -> list[Path]:
                 mosaic=options.over, surface=options.surface, photos=options.photos,
                 out=str(options.out / f"flight-{number}"), plan="survey", seed=2000 + number,
                 height=tuple(options.height), pitch=tuple(options.pitch),
-                odometry_error=options.odometry_error, every_m=options.every_m,
+                odometry_error=options.odometry_error, every_m=options.every_m, relight=False,
             )
         )
         for number in range(options.flights)

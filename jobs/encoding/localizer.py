@@ -1,18 +1,20 @@
-"""What belongs to an index: its encoder and its tiles, named in a file beside it.
+"""What belongs to an index: its encoder, its tiles and the heights of its ground, named in a file
+beside it.
 
-In: the settings of a job that searches an index. Out: the same with the encoder and the shards of
-the index, where flags name none. `jobs/adapt.py` writes the file.
+In: the settings of a job that searches an index. Out: the same with the encoder, the shards and the
+surface model of the index, where flags name none. `jobs/adapt.py` writes the file.
 """
 
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from typing import Protocol, TypeVar
 
 from model.weights.builtin import BUILTIN
 from pipeline.core import json_files, storage
 from pipeline.core.errors import InputError
+from pipeline.core.progress import console
 
 LOCALIZER_FILE = "localizer.json"
-"In the index's folder: paths of `checkpoint` and `shards` from there."
+"In the index's folder: paths of `checkpoint` and `shards` from there, and of `surface`, if any."
 
 
 class SearchSettings(Protocol):
@@ -24,36 +26,75 @@ class SearchSettings(Protocol):
     def checkpoint(self) -> str: ...
     @property
     def shards(self) -> str | None: ...
+    @property
+    def surface(self) -> str | None: ...
 
 
 S = TypeVar("S", bound=SearchSettings)
 
 
-def write_localizer(index: str, checkpoint: str, shards: str) -> None:
-    """Note encoder and shards, paths relative to the index, beside it."""
-    paths = {"checkpoint": checkpoint, "shards": shards}
-    json_files.write_checksummed(storage.join(index, LOCALIZER_FILE), paths)
+@dataclass(frozen=True, kw_only=True)
+class Localizer:
+    """What belongs to an index."""
+
+    checkpoint: str
+    "Path from the index."
+    shards: str
+    "Path from the index."
+    surface: str | None = None
+    "Path of the surface model."
 
 
-def with_localizer(settings: S) -> S:
-    """The settings with the index's own encoder and shards, where they name neither.
+def write_localizer(index: str, localizer: Localizer) -> None:
+    """Note beside an index what belongs to it."""
+    json_files.write_checksummed(storage.join(index, LOCALIZER_FILE), asdict(localizer))
 
-    Raises InputError where the file beside the index is damaged.
+
+def read_localizer(index: str) -> Localizer | None:
+    """What is noted beside an index; None where nothing is.
+
+    Raises InputError where the file is damaged.
     """
-    path = storage.join(settings.index, LOCALIZER_FILE)
+    path = storage.join(index, LOCALIZER_FILE)
     if not storage.exists(path):
-        return settings
+        return None
     try:
         found = json_files.read_checksummed(path)
-        checkpoint, shards = (str(found[name]) for name in ("checkpoint", "shards"))
+        return Localizer(
+            checkpoint=str(found["checkpoint"]),
+            shards=str(found["shards"]),
+            surface=found.get("surface"),
+        )
     except (ValueError, KeyError) as error:
         raise InputError(
             f"{path} is damaged ({error}), expected what jobs/adapt.py writes; remove it and give "
             "--checkpoint and --shards"
         ) from None
-    given = {"checkpoint": settings.checkpoint, "shards": settings.shards}
+
+
+def with_localizer(settings: S) -> S:
+    """The settings with the index's own encoder, shards and surface model, where they name none.
+
+    Raises InputError where the file beside the index is damaged.
+    """
+    found = read_localizer(settings.index)
+    if found is None:
+        return settings
+    given = {"surface": settings.surface or usable_surface(settings.index, found.surface)}
     if settings.checkpoint == BUILTIN:
-        given["checkpoint"] = storage.join(settings.index, checkpoint)
+        given["checkpoint"] = storage.join(settings.index, found.checkpoint)
     if settings.shards is None:
-        given["shards"] = storage.join(settings.index, shards)
+        given["shards"] = storage.join(settings.index, found.shards)
     return replace(settings, **given)  # type: ignore[type-var]
+
+
+def usable_surface(index: str, surface: str | None) -> str | None:
+    """The surface model if it is there; a region may have been moved without it."""
+    if surface is None or storage.exists(surface):
+        return surface
+    console.print(
+        f"the surface model {surface} of {index} is not there: what stands above the ground is "
+        "placed some metres beside; give it by --surface",
+        style="yellow",
+    )
+    return None

@@ -13,7 +13,7 @@ from rich import box
 from rich.table import Table
 
 from jobs.encoding.encoder import make_encoder_spec, read_checkpoint_bytes
-from jobs.encoding.localizer import write_localizer
+from jobs.encoding.localizer import Localizer, write_localizer
 from jobs.region.expect import located_outcomes, lookalikes, real_photos
 from jobs.region.flights import CHECK, EXPECT, plan_flights, take_flight
 from jobs.region.folder import Region, claim, print_command, with_absolute_paths
@@ -85,12 +85,13 @@ def adapt(settings: AdaptSettings) -> list[Expectation]:
         print_command("build_index", table=region.table, out=region.index)
         build_index(IndexSettings(table=region.table, out=region.index))
     with step(seconds, "5 confidence", "fitted on photos of places that were not learned"):
-        fit_confidence(region)
+        fit_confidence(region, of_files.surface)
     with step(seconds, "6 what to expect", "other photos of such places, located"):
-        outcomes = located_outcomes(region, [storage.join(flights[3], TABLE)], settings.checks)
-        real = real_photos(region, settings.photos)
+        tables = [storage.join(flights[3], TABLE)]
+        outcomes = located_outcomes(region, of_files.surface, tables, settings.checks)
+        real = real_photos(region, of_files.surface, settings.photos)
         found = expectations(outcomes)
-    write_localizer(region.index, "../encoder.safetensors", "../tiles")
+    note_localizer(region, of_files.surface)
     maps = [identify_map(settings.mosaic)]
     write_page(region, settings, seconds, found, outcomes, real, maps, [EXPECT])
     results.print(expectation_table([*found, *([real] if real else [])]))
@@ -136,15 +137,25 @@ def embed_tiles(region: Region) -> None:
     embed_gallery(embedding, make_encoder_spec(data, region.encoder, embedding))
 
 
-def fit_confidence(region: Region) -> None:
+def fit_confidence(region: Region, surface: str | None) -> None:
     """The calibration, by the flight that is there for it; again where the gallery has changed."""
     flight = region.path("flights", CHECK, TABLE)
     fitting = CalibrateSettings(
-        checkpoint=region.encoder, shards=region.tiles, index=region.index, flight=flight
-    )
+        checkpoint=region.encoder, shards=region.tiles, index=region.index, flight=flight,
+        surface=surface,
+    )  # fmt: skip
+    heights = {} if surface is None else {"surface": surface}
     print_command("calibrate", checkpoint=region.encoder, shards=region.tiles,
-                  index=region.index, flight=flight)  # fmt: skip
+                  index=region.index, flight=flight, **heights)  # fmt: skip
     calibrate_index(fitting)
+
+
+def note_localizer(region: Region, surface: str | None) -> None:
+    """Say beside the index what belongs to it."""
+    write_localizer(
+        region.index,
+        Localizer(checkpoint="../encoder.safetensors", shards="../tiles", surface=surface),
+    )
 
 
 def locate_command(region: Region) -> str:

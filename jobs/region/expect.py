@@ -24,7 +24,9 @@ LOOKALIKES, LOOKALIKE_ROWS, APART_TILES = 6, 1000, 3
 at least apart."""
 
 
-def located_outcomes(region: Region, tables: Sequence[str], most: int) -> list[Outcome]:
+def located_outcomes(
+    region: Region, surface: str | None, tables: Sequence[str], most: int
+) -> list[Outcome]:
     """The photos of tables, at most `most` of each, located with and without their tags, against
     the truth."""
     photos = [photo for table in tables for photo in flight_of(table, most)]
@@ -32,11 +34,11 @@ def located_outcomes(region: Region, tables: Sequence[str], most: int) -> list[O
     return [
         outcome
         for posed, way in ((True, "with-tags"), (False, "without-tags"))
-        for outcome in _locate(region, truths, posed, way)
+        for outcome in _locate(region, surface, truths, posed, way)
     ]
 
 
-def real_photos(region: Region, folder: str | None) -> Expectation | None:
+def real_photos(region: Region, surface: str | None, folder: str | None) -> Expectation | None:
     """The UAV's own photos, located and compared with their GPS; None where they have none."""
     if not folder:
         return None
@@ -48,15 +50,18 @@ def real_photos(region: Region, folder: str | None) -> Expectation | None:
     }
     if not truths:
         return None
-    return expect("your photos, against their GPS", _locate(region, truths, True, "photos"))
+    outcomes = _locate(region, surface, truths, True, "photos")
+    return expect("your photos, against their GPS", outcomes)
 
 
-def _locate(region: Region, truths: Mapping[str, GeoTag], posed: bool, name: str) -> list[Outcome]:
+def _locate(
+    region: Region, surface: str | None, truths: Mapping[str, GeoTag], posed: bool, name: str
+) -> list[Outcome]:
     """Photos located by the region, against the truth by their paths; the answers and their page
     lie in its folder."""
     settings = LocateSettings(
         photos=tuple(truths), checkpoint=region.encoder, index=region.index, shards=region.tiles,
-        pose=posed, out=region.path("expect", f"{name}.geojson"),
+        surface=surface, pose=posed, out=region.path("expect", f"{name}.geojson"),
         page=region.path("expect", f"{name}.html"),
     )  # fmt: skip
     located = locate_photos(settings, {path: (tag.lat, tag.lon) for path, tag in truths.items()})

@@ -14,13 +14,14 @@ from jobs.region.adapt import (
     expectation_table,
     fit_confidence,
     locate_command,
+    note_localizer,
     pack_tiles,
     write_page,
 )
 from jobs.region.expect import located_outcomes, real_photos
 from jobs.region.flights import EXPECT, plan_flights, take_flight
 from jobs.region.folder import Region, check_map, print_command, with_absolute_paths
-from jobs.region.maps import RegionMap, identify_map, with_one_file_each
+from jobs.region.maps import RegionMap, identify_map, join_surfaces, with_one_file_each
 from jobs.region.settings import AdaptSettings
 from jobs.stages.demo import step
 from pipeline.core import storage
@@ -62,13 +63,15 @@ def extend_region(settings: AdaptSettings) -> list[Expectation]:
         print_command("build_index", table=region.table, out=region.index, extend=True)
         extend_index(region.table, region.index)
     with step(seconds, "4 confidence", "fitted among all tiles"):
-        fit_confidence(region)
+        surface = join_surfaces(region, of_files.surface, len(known))
+        fit_confidence(region, surface)
     with step(seconds, "5 what to expect", "photos of all maps, located"):
         flights = [*figures["flights"], flight]
         tables = [region.path("flights", one, TABLE) for one in flights]
-        outcomes = located_outcomes(region, tables, settings.checks)
-        real = real_photos(region, settings.photos)
+        outcomes = located_outcomes(region, surface, tables, settings.checks)
+        real = real_photos(region, surface, settings.photos)
         found = expectations(outcomes)
+    note_localizer(region, surface)
     write_page(region, settings, seconds, found, outcomes, real, [*known, more], flights)
     results.print(expectation_table([*found, *([real] if real else [])]))
     results.print(f"now: {locate_command(region)}", soft_wrap=True)

@@ -8,10 +8,13 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from jobs.encoding.localizer import read_localizer, usable_surface
 from jobs.region.folder import Region
 from jobs.region.settings import AdaptSettings
 from pipeline.core import storage
+from pipeline.core.errors import InputError
 from pipeline.core.integrity import checksum_file
+from pipeline.core.progress import console
 from pipeline.sources.maps.sheets import as_one_map, find_sheets, join_sheets
 
 
@@ -70,3 +73,20 @@ def with_one_file_each(
         mosaic=join_sheets([mosaic], vrt) if taken and mosaic != vrt else mosaic,
         surface=surface and as_one_map(surface, region.path("maps", f"{stem}-surface.vrt")),
     )
+
+
+def join_surfaces(region: Region, surface: str | None, known: int) -> str | None:
+    """The surface model of a region of `known` maps and of another one: a VRT of both where both
+    have one. Where they are of different grids, that of the region, with a message."""
+    noted = read_localizer(region.index)
+    before = usable_surface(region.index, noted.surface) if noted else None
+    if before is None or surface is None:
+        return before or surface
+    try:
+        return join_sheets([before, surface], region.path("maps", f"surface-{known}.vrt"))
+    except InputError as error:
+        console.print(
+            f"heights are known of the first map alone: {surface} does not join {before} ({error})",
+            style="yellow",
+        )
+        return before

@@ -102,7 +102,7 @@ def _calibrate_on_flight(
     gallery: GalleryMap,
     context: CalibrationContext,
 ) -> Calibration:
-    windows = open_map(settings.shards, gallery, settings.index)
+    windows = open_map(settings.shards, gallery, settings.index, settings.surface)
     if windows is None:
         raise InputError(
             f"the tiles of {settings.shards} do not know their corners, expected such as a "

@@ -7,12 +7,17 @@ metres where matching holds.
 from collections.abc import Callable, Sequence
 from functools import partial
 
+import numpy as np
+from rasterio.errors import RasterioError
+
 from jobs.encoding.photo_encoder import decode_photo
 from jobs.encoding.queries import Query, ViewMaker, read_photo
 from pipeline.camera.framing import PhotoViews, views_of_photo
+from pipeline.camera.local_plane import LocalPlane
 from pipeline.camera.overhead import overhead_view
 from pipeline.core import storage
 from pipeline.core.arrays import Pixels
+from pipeline.core.errors import InputError
 from pipeline.core.integrity import sha256_of
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.progress import console, progress
@@ -24,28 +29,38 @@ from pipeline.locate.locate import Answer
 from pipeline.locate.refined import refine_answer, with_refinement
 from pipeline.matching.kept_features import MAP_FEATURES_FILE, FeatureFile
 from pipeline.matching.map_features import MapSearch
-from pipeline.matching.map_windows import MapWindows
+from pipeline.matching.map_windows import HeightReader, MapWindows
 from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
 from pipeline.matching.refine import MatchablePhoto, Refinement, prepare_photo
+from pipeline.matching.relief import Relief
 from pipeline.service.photo_map import PhotoMap
 from pipeline.shards.manifest import MANIFEST
 from pipeline.shards.shard_set import open_shards
 from pipeline.shards.tile_reader import TileReader
+from pipeline.sources.maps.heights import read_heights
+from pipeline.sources.maps.mosaic import open_mosaic
 
 AHEAD = 4
 "Photos that are read while another is matched."
+HEIGHT_PIXEL_M = 0.5
+"Side of a pixel of the heights, metres."
 Matcher = Callable[[Answer, MatchablePhoto, MapWindows], Refinement | None]
 "Matches a photo with the map where its answer says."
 
 
 def open_map(
-    shards: str, gallery: GalleryMap, index: str, whole_map: bool = True
+    shards: str,
+    gallery: GalleryMap,
+    index: str,
+    surface: str | None = None,
+    whole_map: bool = True,
 ) -> MapWindows | None:
-    """The windows of a map, and with `whole_map` a search for places by all of its features, which
-    are kept beside the index. None, with a message, where its tiles do not know their corners:
-    these are in the record tables of jobs/make_shards.py, which shards of others lack."""
+    """The windows of a map, with the heights of a surface model, and with `whole_map` a search for
+    places by all of its features, which are kept beside the index. None, with a message, where its
+    tiles do not know their corners: these are in the record tables of jobs/make_shards.py, which
+    shards of others lack. Raises InputError for a surface model that cannot be read."""
     reader = _open_tiles(shards)
-    windows = None if reader is None else _windows_of(reader, gallery)
+    windows = None if reader is None else _windows_of(reader, gallery, surface)
     if windows is not None and whole_map:
         kept = _feature_file(shards, gallery, index)
         windows.search = MapSearch(kept.read, partial(kept.make, windows))
@@ -57,13 +72,16 @@ def open_map(
     return windows
 
 
-def open_photo_map(shards: str, match: bool, index: str, gallery: GalleryMap) -> PhotoMap | None:
+def open_photo_map(
+    shards: str, match: bool, index: str, surface: str | None, gallery: GalleryMap
+) -> PhotoMap | None:
     """The pixels of a map for the service; None for shards of others. Places are searched by
-    features of the whole map where they are kept beside the index: no request waits for them."""
+    features of the whole map where they are kept beside the index: no request waits for them.
+    Raises InputError for a surface model that cannot be read."""
     reader = _open_tiles(shards)
     if reader is None:
         return None
-    windows = _windows_of(reader, gallery)
+    windows = _windows_of(reader, gallery, surface)
     if windows is not None and match:
         windows.search = MapSearch(_feature_file(shards, gallery, index).read, lambda: None)
     return PhotoMap(gallery, reader.fetch, windows, match)
@@ -82,10 +100,38 @@ def _open_tiles(shards: str) -> TileReader | None:
     return TileReader(open_shards(shards)) if storage.exists(manifest) else None
 
 
-def _windows_of(reader: TileReader, gallery: GalleryMap) -> MapWindows | None:
+def _windows_of(reader: TileReader, gallery: GalleryMap, surface: str | None) -> MapWindows | None:
     if not len(gallery.keys) or not reader.footprints([str(gallery.keys[0])]):
         return None
-    return MapWindows(gallery, reader.fetch, reader.footprints)
+    windows = MapWindows(gallery, reader.fetch, reader.footprints)
+    windows.heights = None if surface is None else height_reader(surface)
+    return windows
+
+
+def height_reader(surface: str) -> HeightReader:
+    """Reads heights of a surface model. Raises InputError where there is none to be read."""
+    try:
+        placed = open_mosaic(surface).crs is not None
+    except RasterioError as error:
+        raise InputError(
+            f"{surface} cannot be read ({error}), expected a GeoTIFF of heights in metres; check "
+            "--surface"
+        ) from None
+    if not placed:
+        raise InputError(
+            f"{surface} has no coordinate system, expected a georeferenced surface model; check "
+            "--surface"
+        )
+
+    def read(plane: LocalPlane, half_m: float) -> Relief | None:
+        height_HW = read_heights(surface, plane, round(2 * half_m / HEIGHT_PIXEL_M), HEIGHT_PIXEL_M)
+        missing_HW = np.isnan(height_HW)
+        if missing_HW.all():
+            return None
+        height_HW[missing_HW] = np.nanmedian(height_HW)
+        return Relief(height_HW=height_HW, metres_per_pixel=HEIGHT_PIXEL_M)
+
+    return read
 
 
 def view_maker(sides_m: Sequence[float], pose: PoseSettings) -> ViewMaker:

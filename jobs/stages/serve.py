@@ -36,13 +36,18 @@ from pipeline.service.replicas import Replicas
 
 
 def load_predictor(
-    checkpoint: str, index: str, shards: str | None, threads: int, match: bool = True
+    checkpoint: str,
+    index: str,
+    shards: str | None,
+    threads: int,
+    match: bool = True,
+    surface: str | None = None,
 ) -> Predictor:
     """Load the encoder, the index and the map's pixels; called on each replica. Raises
     InputError."""
     torch.set_num_threads(threads)  # FAISS takes OMP_NUM_THREADS, which Ray sets to the cores
     cv2.setNumThreads(threads)
-    open_map = no_map if shards is None else partial(open_photo_map, shards, match, index)
+    open_map = no_map if shards is None else partial(open_photo_map, shards, match, index, surface)
 
     def encoder_for(metadata: IndexMetadata) -> PhotoEncoder:
         try:
@@ -74,10 +79,11 @@ async def listen(settings: ServeSettings, token: str | None) -> None:
         cluster.nodes(), settings.replicas, settings.replicas, settings.threads
     )
     shards = None if settings.shards is None else storage.absolute(settings.shards)
+    surface = None if settings.surface is None else storage.absolute(settings.surface)
     checkpoint = absolute_checkpoint(settings.checkpoint)
     index = storage.absolute(settings.index)
     make_predictor = partial(
-        load_predictor, checkpoint, index, shards, placement.cpus, settings.match
+        load_predictor, checkpoint, index, shards, placement.cpus, settings.match, surface
     )
     replicas = Replicas(f"pvda-{os.getpid()}", placement, make_predictor)
     runner = Service(settings, replicas, token, concurrency=placement.workers).runner()

@@ -17,6 +17,7 @@ from pipeline.locate.settings import CalibrationCriteria, FlightSettings
 from pipeline.matching.photo_pose import PoseSettings
 from pipeline.service.settings import ServiceSettings
 from pipeline.shards.settings import PackingSettings
+from pipeline.simulation.over_map.settings import SURFACE_FLAG
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +115,9 @@ class LocateSettings(FlightSettings, PoseSettings):
     """Match each photo with the map's pixels around its candidates: its place within metres instead
     of a tile's middle. Takes --shards whose tiles know their corners, such as those of a GeoTIFF;
     --no-match answers with tiles."""
+    surface: Annotated[str | None, SURFACE_FLAG] = None
+    """A surface model of the map's ground (a GeoTIFF of heights): roofs and slopes are then placed
+    where they stand. By default the one that jobs/adapt.py was given."""
     whole_map: bool = True
     """Search for a photo that no candidate's map matches by the features of the whole map too, up
     to some 12 square kilometres: made once, half a minute a square kilometre, and kept beside the
@@ -143,6 +147,8 @@ class CalibrateSettings(CalibrationCriteria):
     """Table of photos over the map with the places that they show, such as photos.csv of
     jobs/fly.py (columns path, lat, lon): they are searched and matched, with and without the
     camera's tags, instead of the shards' photos."""
+    surface: Annotated[str | None, SURFACE_FLAG] = None
+    "With --flight, a surface model of the map's ground, if photos are to be located with one."
     index: str
     "Folder or URI of the index."
     out: str | None = None
@@ -176,6 +182,9 @@ class ServeSettings(ServiceSettings):
     match: bool = True
     """Match each photo with the map's pixels around its candidates, as jobs/locate.py does. Takes
     --shards whose tiles know their corners; --no-match answers with tiles."""
+    surface: Annotated[str | None, SURFACE_FLAG] = None
+    """A surface model of the map's ground (a GeoTIFF of heights): roofs and slopes are then placed
+    where they stand. By default the one that jobs/adapt.py was given."""
     replicas: int = 1
     "Processes that each load encoder and index."
     threads: int | None = None

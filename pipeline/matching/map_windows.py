@@ -7,6 +7,7 @@ features. Windows lie on a grid of half their own size, so that neighbouring pho
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import Protocol
 
@@ -21,6 +22,7 @@ from pipeline.images.decode import DecodeError, decode
 from pipeline.images.inspect import inspect
 from pipeline.images.thumbnails import ImageLoader
 from pipeline.matching.refine import MatchablePhoto, MatchableWindow, prepare_window
+from pipeline.matching.relief import Relief
 
 
 class TilePositions(Protocol):
@@ -58,6 +60,8 @@ class FeatureSearch(Protocol):
         """The likeliest places (lat, lon), at most `most`, none within `away_from`."""
 
 
+HeightReader = Callable[[LocalPlane, float], Relief | None]
+"Heights within so many metres of a plane's zero; None where there are none."
 Footprints = Callable[[Iterable[str]], Mapping[str, list[list[float]]]]
 "Corners (lat, lon) of gallery images by key, where known."
 TILES_ACROSS = 4.0
@@ -83,6 +87,8 @@ class MapWindows:
         self._gallery, self._fetch, self._footprints = gallery, fetch, footprints
         self.search: FeatureSearch | None = None
         "By the features of the whole map, if they are to be searched."
+        self.heights: HeightReader | None = None
+        "Of the map's ground, where there is a surface model."
         self._kept: OrderedDict[Place, MatchableWindow | None] = OrderedDict()
 
     def around(
@@ -155,6 +161,12 @@ class MapWindows:
     def _make(self, place: Place) -> MatchableWindow | None:
         half_m, row, column = place
         lat, lon = row * self._step_lat(half_m), column * self._step_lon(half_m, row)
+        window = self._features_at(lat, lon, half_m)
+        if window is None or self.heights is None:
+            return window
+        return replace(window, relief=self.heights(LocalPlane(lat=lat, lon=lon), half_m))
+
+    def _features_at(self, lat: float, lon: float, half_m: float) -> MatchableWindow | None:
         if self.search and self._level_for(half_m) == min(self._sides_m, default=None):
             known = self.search.window(lat, lon, half_m)
             if known is not None:

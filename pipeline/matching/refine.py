@@ -32,6 +32,7 @@ from pipeline.matching.ground_fit import (
     is_camera_view,
 )
 from pipeline.matching.local_features import LocalFeatures, find_features, match_features
+from pipeline.matching.relief import Relief, fit_relief
 
 PHOTO_PX = 640
 "Longest side of a photo when it is matched."
@@ -181,6 +182,8 @@ class MatchableWindow:
     ground_N2: Doubles
     "(east, north) in metres from the plane's zero."
     descriptors_ND: Floats
+    relief: Relief | None = None
+    "The heights of the ground, where they are known; else it is taken for flat."
 
 
 def prepare_window(window: MapWindow) -> MatchableWindow:
@@ -216,7 +219,12 @@ def refine_in(photo: MatchablePhoto, window: MatchableWindow) -> Refinement | No
     if photo.promised_33 is not None:
         agree_M = agree_with_promise(apply_homography(photo.promised_33, photo_M2), ground_M2)
         photo_M2, ground_M2 = photo_M2[agree_M], ground_M2[agree_M]
-    fit = fit_ground(photo_M2, ground_M2, photo.size, TOLERANCE_PX * window.metres_per_pixel)
+    tolerance_m = TOLERANCE_PX * window.metres_per_pixel
+    fit = fit_ground(photo_M2, ground_M2, photo.size, tolerance_m)
+    if fit is not None and window.relief is not None:
+        fit = fit_relief(
+            photo_M2, ground_M2, window.relief, fit, photo.size, photo.pose.fov_deg, tolerance_m
+        )
     if fit is None or not is_camera_view(fit.to_ground_33, photo.size):
         return None
     if not _fits_the_pose(fit.to_ground_33, photo):

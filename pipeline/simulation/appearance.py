@@ -18,6 +18,8 @@ from pipeline.simulation.world import ByteMap, FloatMap, World
 Season = Literal["spring", "summer", "autumn", "winter"]
 SEASONS: tuple[Season, ...] = ("spring", "summer", "autumn", "winter")
 Rgb = tuple[float, float, float]
+SHADOW_EDGE_M = 0.5
+"Depth below a shadow's top in which the sunlight ends."
 
 # Gains on the summer colours of grass and leaves; each tree's leaves have a gain between the first
 # and the second.
@@ -132,18 +134,24 @@ def light_world(world: World, day: Day) -> LitMap:
             world.height_HW, world.metres_per_pixel, toward_sun=day.toward_sun()
         )
     if not world.light_is_baked:
-        depth_HW = shadow_top_HW - world.height_HW
-        open_HW = 1 - np.clip(depth_HW / np.float32(0.5), 0, 1)
-        direct_HW = open_HW * _slope_shading(world, day)
-        sky_HW = 1 - np.float32(0.45) * _sky_occlusion(world)
-        sky_3, sun_3 = day.sky_light(), day.sun_light()
-        for c in range(3):
-            colour_HW3[..., c] *= sky_3[c] * sky_HW + sun_3[c] * direct_HW
+        colour_HW3 *= daylight(world.height_HW, shadow_top_HW, world.metres_per_pixel, day)
     if day.saturation != 1.0:
         grey_HW1 = colour_HW3.mean(axis=2, keepdims=True)
         colour_HW3 = grey_HW1 + np.float32(day.saturation) * (colour_HW3 - grey_HW1)
     return LitMap(
         colour_HW3=np.clip(colour_HW3, 0, 255).astype(np.uint8), shadow_top_HW=shadow_top_HW
+    )
+
+
+def daylight(
+    height_HW: FloatMap, shadow_top_HW: FloatMap, metres_per_pixel: float, day: Day
+) -> FloatMap:
+    """Light (H, W, 3) on ground, roofs and crowns: about 1 on flat ground in the sun."""
+    open_HW = 1 - np.clip((shadow_top_HW - height_HW) / np.float32(SHADOW_EDGE_M), 0, 1)
+    direct_HW = open_HW * _slope_shading(height_HW, metres_per_pixel, day)
+    sky_HW = 1 - np.float32(0.45) * _sky_occlusion(height_HW, metres_per_pixel)
+    return np.asarray(
+        sky_HW[..., None] * day.sky_light() + direct_HW[..., None] * day.sun_light(), np.float32
     )
 
 
@@ -165,12 +173,12 @@ def _apply_season(world: World, season: Season) -> FloatMap:
     return colour_HW3
 
 
-def _slope_shading(world: World, day: Day) -> FloatMap:
+def _slope_shading(height_HW: FloatMap, metres_per_pixel: float, day: Day) -> FloatMap:
     """Sunlight on roofs and crowns by their slope, 1 on flat ground; walls count as flat."""
-    span = np.float32(2 * world.metres_per_pixel)
-    east_HW, south_HW = np.zeros_like(world.height_HW), np.zeros_like(world.height_HW)
-    east_HW[:, 1:-1] = (world.height_HW[:, 2:] - world.height_HW[:, :-2]) / span
-    south_HW[1:-1] = (world.height_HW[2:] - world.height_HW[:-2]) / span
+    span = np.float32(2 * metres_per_pixel)
+    east_HW, south_HW = np.zeros_like(height_HW), np.zeros_like(height_HW)
+    east_HW[:, 1:-1] = (height_HW[:, 2:] - height_HW[:, :-2]) / span
+    south_HW[1:-1] = (height_HW[2:] - height_HW[:-2]) / span
     wall_HW = np.maximum(np.abs(east_HW), np.abs(south_HW)) > 2.0
     east_HW[wall_HW] = 0
     south_HW[wall_HW] = 0
@@ -180,11 +188,11 @@ def _slope_shading(world: World, day: Day) -> FloatMap:
     return lit_HW
 
 
-def _sky_occlusion(world: World) -> FloatMap:
+def _sky_occlusion(height_HW: FloatMap, metres_per_pixel: float) -> FloatMap:
     """Fraction of the sky that the surroundings hide, estimated from the mean height around."""
-    radius = max(1, round(3.5 / world.metres_per_pixel))
-    around_HW = _box_mean(_box_mean(world.height_HW, radius).T, radius).T
-    hidden: FloatMap = np.clip((around_HW - world.height_HW) / np.float32(6), 0, 1)
+    radius = max(1, round(3.5 / metres_per_pixel))
+    around_HW = _box_mean(_box_mean(height_HW, radius).T, radius).T
+    hidden: FloatMap = np.clip((around_HW - height_HW) / np.float32(6), 0, 1)
     return hidden
 
 

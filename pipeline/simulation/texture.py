@@ -2,8 +2,8 @@
 
 The image's middle square is used. Beside `quad.jpg` there may be `quad.height.npy`: a
 two-dimensional array of metres above the ground that covers the whole image, at any resolution;
-without it the ground is flat. Sun and shadows stay as in the image; season, sensor and haze change
-with the day.
+without it the ground is flat. Season, sensor and haze change with the day; so do sun and shadows
+where heights show which sun lit the image, else they stay as in it.
 
 Letters: H, W pixels of the map; 3 red, green, blue.
 """
@@ -15,7 +15,9 @@ from PIL import Image, UnidentifiedImageError
 
 from pipeline.core.errors import InputError
 from pipeline.images.decode import PILLOW_FORMATS
+from pipeline.simulation.appearance import Day
 from pipeline.simulation.flight import FlightPlan
+from pipeline.simulation.relight import find_day, without_light
 from pipeline.simulation.town.town import TEXELS_PER_RADIUS
 from pipeline.simulation.world import ByteMap, FloatMap, World
 
@@ -88,18 +90,29 @@ def textured_world(path: str, *, metres_per_pixel: float, frame_pixels: int = 25
     side = round(TEXELS_PER_RADIUS / RADIUS_FRACTION * frame_pixels / 256)
     box = (left, top, left + square, top + square)
     texture_HW3 = np.asarray(image.resize((side, side), Image.Resampling.BICUBIC, box=box))
+    height_HW = _read_heights(path, image.size, box, side)
+    pixel_m = extent_m / side
     return photographed_world(
         texture_HW3,
-        _read_heights(path, image.size, box, side),
-        metres_per_pixel=extent_m / side,
+        height_HW,
+        metres_per_pixel=pixel_m,
         target_radius_m=RADIUS_FRACTION * extent_m,
+        day=find_day(texture_HW3, height_HW, pixel_m),
     )
 
 
 def photographed_world(
-    texture_HW3: ByteMap, height_HW: FloatMap, *, metres_per_pixel: float, target_radius_m: float
+    texture_HW3: ByteMap,
+    height_HW: FloatMap,
+    *,
+    metres_per_pixel: float,
+    target_radius_m: float,
+    day: Day | None,
 ) -> World:
-    """The world of a photograph from above, with its light, and heights in metres."""
+    """The world of a photograph from above with heights in metres: without the light of the day
+    that it is known to be from, else with its light."""
+    if day is not None:
+        texture_HW3 = without_light(texture_HW3, height_HW, metres_per_pixel, day)
     grass_HW, trees_HW = _vegetation(texture_HW3.astype(np.float32))
     shape = height_HW.shape
     return World(
@@ -112,7 +125,7 @@ def photographed_world(
         facade_HW=np.zeros(shape, np.uint8),
         along_HW=np.zeros(shape, np.float32),
         facing_HW=np.zeros(shape, np.float32),
-        light_is_baked=True,
+        light_is_baked=day is None,
     )
 
 

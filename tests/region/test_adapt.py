@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from jobs.encoding.localizer import with_localizer
+from jobs.encoding.localizer import read_localizer, with_localizer
 from jobs.region import extend
 from jobs.region.adapt import PAGE, adapt
 from jobs.region.expect import located_outcomes
@@ -44,6 +44,7 @@ def test_adapt_makes_a_localizer_and_says_what_to_expect(adapted_region: AdaptSe
     )
     assert Path(located.checkpoint).resolve() == (out / "encoder.safetensors").resolve()
     assert Path(located.shards or "").resolve() == (out / "tiles").resolve()
+    assert located.surface == adapted_region.surface
     named = with_localizer(replace(located, checkpoint="mine.pt", shards="tiles"))
     assert (named.checkpoint, named.shards) == ("mine.pt", "tiles")
     (out / "index" / "localizer.json").rename(out / "elsewhere.json")
@@ -89,9 +90,9 @@ def test_extend_adds_a_map_once(
     hidden = tmp_path / "hidden"
     more = replace(adapted_region, mosaic=sheets, surface=None, out=str(out), extend=True)
     fitted = list[Region]()
-    monkeypatch.setattr(extend, "fit_confidence", fitted.append)
+    monkeypatch.setattr(extend, "fit_confidence", lambda region, _: fitted.append(region))
     some = partial(located_outcomes, most=1)
-    monkeypatch.setattr(extend, "located_outcomes", lambda region, tables, _: some(region, tables))
+    monkeypatch.setattr(extend, "located_outcomes", lambda *given: some(*given[:3]))
     first = len(Index(str(out / "index")))
     Path(adapted_region.out).rename(hidden)  # so that nothing of it is read
     try:
@@ -104,6 +105,9 @@ def test_extend_adds_a_map_once(
     assert len(index) == rows > first
     assert len(fitted) == 1
     assert "What to expect of map.tif and map" in (out / PAGE).read_text()
+    noted = read_localizer(str(out / "index"))
+    assert noted is not None
+    assert noted.surface == adapted_region.surface  # the other map has none
     kept = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
     assert extend_region(more)[0].photos == 2
     assert {path: path.stat().st_mtime_ns for path in kept} == kept

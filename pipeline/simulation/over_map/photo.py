@@ -2,32 +2,31 @@
 with the cameras' tags and the true position go out.
 
 A pure function of its spec and the map. The ground is the map's own pixels, on another day's
-season, haze and sensor; with a surface model it has relief and parallax, without one it is flat.
-Sun and shadows stay as in the map.
+season, haze and sensor; with a surface model it has relief, parallax and another sun's shadows, and
+without one it is flat and its shadows stay as in the map.
 """
 
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import rasterio
 import simplejpeg
 from rasterio.enums import Resampling
-from rasterio.transform import Affine
-from rasterio.warp import reproject
 
 from pipeline.camera.local_plane import LocalPlane
 from pipeline.camera.map_window import MapWindow, Tile, compose_window
 from pipeline.camera.pose import Pose
 from pipeline.core.errors import InputError
-from pipeline.simulation.appearance import sample_day
+from pipeline.simulation.appearance import Day, sample_day
 from pipeline.simulation.over_map.photo_tags import with_camera_tags
 from pipeline.simulation.over_map.poses import draw_poses, reach_m, spiral_poses, survey_pose
 from pipeline.simulation.over_map.settings import MapFlightSettings, Part
+from pipeline.simulation.relight import find_day
 from pipeline.simulation.render import render_perspective
 from pipeline.simulation.scene import REACH_IN_RADII, prepare_scene
 from pipeline.simulation.texture import photographed_world
 from pipeline.simulation.world import FloatMap, World
+from pipeline.sources.maps.heights import read_heights
 from pipeline.sources.maps.mosaic import colours_for, open_mosaic, read_window
 from pipeline.sources.maps.placement import MosaicRejected, Placement, place_mosaic
 from pipeline.sources.maps.tiles import Window
@@ -114,12 +113,13 @@ def photos_over_map(settings: MapFlightSettings, place: int, count: int) -> MapP
             f"as a photo reaches, some {max(reaches_m):.0f} m; fly lower or steeper, or give a "
             "larger map"
         )
+    day = _day_of(settings, widest)
     photos = []
     for pose in poses[place : place + 1] if spiral else poses:
         window = widest
         if reach_m(pose) < max(reaches_m):
             window = _window_around(settings.mosaic, placement, middle, reach_m(pose))
-        photos.append(_take(settings, window, pose, rng))
+        photos.append(_take(settings, window, day, pose, rng))
     overhead = None
     if settings.overhead_m is not None and settings.location_of(place) == place:
         piece = _window_around(settings.mosaic, placement, middle, settings.overhead_m / 2)
@@ -129,12 +129,23 @@ def photos_over_map(settings: MapFlightSettings, place: int, count: int) -> MapP
     return MapPlace(lat=widest.plane.lat, lon=widest.plane.lon, photos=photos, overhead=overhead)
 
 
+def _day_of(settings: MapFlightSettings, window: MapWindow) -> Day | None:
+    """The day whose light is in the map, where it is to be replaced and heights show its sun."""
+    if settings.surface is None or not settings.relight:
+        return None
+    heights_HW = _heights(settings.surface, window)
+    return find_day(window.pixels_HW3, heights_HW, window.metres_per_pixel)
+
+
 def _take(
-    settings: MapFlightSettings, window: MapWindow, pose: Pose, rng: np.random.Generator
+    settings: MapFlightSettings,
+    window: MapWindow,
+    day: Day | None,
+    pose: Pose,
+    rng: np.random.Generator,
 ) -> MapPhoto:
-    """One photo of a window's middle, on a day of its own."""
-    heights_HW = _heights(settings.surface, window) if settings.surface else None
-    world = _world(window, heights_HW)
+    """One photo of a window's middle, on a day of its own; `day` is the map's."""
+    world = _world(window, _heights(settings.surface, window) if settings.surface else None, day)
     middle = len(world.height_HW) // 2
     ground_m = float(world.height_HW[middle, middle])
     raised = replace(pose, altitude_m=pose.altitude_m + ground_m)
@@ -212,16 +223,8 @@ def _window_around(
 
 def _heights(path: str, window: MapWindow) -> FloatMap:
     """Metres (H, W) above the lowest ground of a window, by a surface model in any CRS."""
-    dataset = open_mosaic(path)
-    side = len(window.pixels_HW3)
-    plane, scale = window.plane, window.metres_per_pixel
-    local = f"+proj=aeqd +lat_0={plane.lat:.9f} +lon_0={plane.lon:.9f} +datum=WGS84 +units=m"
-    heights_HW = np.full((side, side), np.nan, np.float32)
-    reproject(
-        source=rasterio.band(dataset, 1), destination=heights_HW, dst_crs=local,
-        dst_transform=Affine(scale, 0, -side / 2 * scale, 0, -scale, side / 2 * scale),
-        dst_nodata=np.nan, resampling=Resampling.bilinear,
-    )  # fmt: skip
+    plane, side = window.plane, len(window.pixels_HW3)
+    heights_HW = read_heights(path, plane, side, window.metres_per_pixel)
     if np.isnan(heights_HW).mean() > MOST_WITHOUT_HEIGHT:
         raise InputError(
             f"{path} has no heights around latitude {plane.lat:.5f}, longitude {plane.lon:.5f}; "
@@ -231,7 +234,7 @@ def _heights(path: str, window: MapWindow) -> FloatMap:
     return np.where(np.isnan(heights_HW), 0, heights_HW - lowest).astype(np.float32)
 
 
-def _world(window: MapWindow, heights_HW: FloatMap | None) -> World:
+def _world(window: MapWindow, heights_HW: FloatMap | None, day: Day | None) -> World:
     side = len(window.pixels_HW3)
     return photographed_world(
         window.pixels_HW3,
@@ -239,6 +242,7 @@ def _world(window: MapWindow, heights_HW: FloatMap | None) -> World:
         metres_per_pixel=window.metres_per_pixel,
         # The scene's mirrored margin follows from it: none is needed.
         target_radius_m=side * window.metres_per_pixel / 2 / REACH_IN_RADII,
+        day=day,
     )
 
 

@@ -128,6 +128,9 @@ class MapFlightSettings(PlanSettings, CameraRanges):
     the middle of each photo lies well within such a block, with `learn` in no such block."""
     surface: Annotated[str | None, SURFACE_FLAG] = None
     "A surface model (as the map, in metres): relief and parallax. None: the ground is flat."
+    relight: bool = True
+    """With a surface model: the sun that lit the map is found by its shadows, its light taken away,
+    and each photo has that of another day. Without: sun and shadows stay as in the map."""
     size: int = 512
     "Side of a photo, pixels."
     heading_error: float = 3.0
