@@ -1,8 +1,8 @@
 # Each target sets up .venv by itself; nothing is installed outside it.
 PYTHON ?= python3
 BIN := .venv/bin
-# Processes that share the tests, of which two have a Ray; 0: this one alone.
-TEST_PROCESSES ?= 2
+# Processes that share the tests, of which two have a Ray and wait for it much; 0: this one alone.
+TEST_PROCESSES ?= 3
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo region test test-fast check format bench chaos
@@ -19,11 +19,11 @@ SAMPLE := runs/region
 
 region: .venv/installed  ## a made-up town as a map, adapted to; photos of another day located on it: five minutes on two cores
 	$(BIN)/pvda town --out $(SAMPLE)/town --side 500 --resolution 0.5
-	$(BIN)/pvda fly --mosaic $(SAMPLE)/town/another_day.tif --surface $(SAMPLE)/town/surface.tif --out $(SAMPLE)/flight --photos 12
+	$(BIN)/pvda fly --mosaic $(SAMPLE)/town/another_day.tif --surface $(SAMPLE)/town/surface.tif --no-relight --out $(SAMPLE)/flight --photos 12
 	$(BIN)/pvda adapt --mosaic $(SAMPLE)/town/map.tif --surface $(SAMPLE)/town/surface.tif --out $(SAMPLE)/region --minutes 1 --checks 20
 	$(BIN)/pvda locate --index $(SAMPLE)/region/index --out $(SAMPLE)/where.geojson --page $(SAMPLE)/where.html $(SAMPLE)/flight/photos
 
-test: .venv/installed  ## all tests, shared by two processes
+test: .venv/installed  ## all tests, shared by three processes
 	$(BIN)/pytest -n $(TEST_PROCESSES) --no-loadscope-reorder
 
 test-fast: .venv/installed  ## the tests without Ray, training, fuzzing and browsers: minutes

@@ -49,7 +49,12 @@ SLOW_FIXTURES = RAY_FIXTURES | {"prepared", "browser"}
 does with tests/fuzz, and with tests and files that are marked."""
 STARTS = re.compile(r"\b(ray_session|ray_cluster|ray_address|prepared|adapted_region)\b")
 "In a file of tests: it needs the session's Ray, or the process that starts jobs."
-RAY_UNITS = ("tests/jobs/", "tests/")
+RAY_UNITS = {
+    "training and the service": tuple(
+        f"tests/{room}/" for room in ("jobs", "chaos", "service", "features", "core")
+    ),
+    "regions and benchmarks": ("tests/",),
+}
 """Beginnings of such files' names: of several test processes (pytest -n), one runs a unit to its
 end, with a Ray and a launcher of its own. Of the others, each file is a unit."""
 
@@ -59,7 +64,7 @@ def unit_of(file: str) -> str:
     """The name of a file's unit."""
     if not STARTS.search((ROOT / file).read_text()):
         return file
-    return next(unit for unit in RAY_UNITS if file.startswith(unit))
+    return next(unit for unit, begins in RAY_UNITS.items() if file.startswith(begins))
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
