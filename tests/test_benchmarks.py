@@ -67,6 +67,10 @@ CASES: dict[str, tuple[str, str]] = {
         "--rows 2000 --dimension 32 --rounds 1 --factories planned former",
         r"Flat \(the planner\) .* [\d.]+ x \|(.|\n)*Flat \(the former rule\) ",
     ),
+    "fixed_costs": (
+        "--out {out} --rounds 1 --jobs simulate",
+        r"\| simulate \| [\d.]+ \| [\d.]+ x \|",
+    ),
     "filters": (
         "--rows 2000 --dimension 32 --selectivities 0.001 0.5 1 --factories IVF16,SQ8",
         r"\| 0.5 \| 1,000 \| IVF16,SQ8 \| [\d.]+ \|.* [\d.]+ x \|",

@@ -30,6 +30,9 @@ _Item = TypeVar("_Item")
 CORES_PER_WORKER = 8
 "Of a worker without a GPU, unless the user chooses: a network's threads gain little beyond."
 
+START_S = 10.0
+"About what a Ray of this machine takes to start, on quiet cores."
+
 
 @dataclass(frozen=True, kw_only=True)
 class Node:
@@ -51,6 +54,14 @@ class Placement:
 
     def __str__(self) -> str:
         return f"{self.cpus} CPUs and {self.gpus:g} GPUs" if self.gpus else f"{self.cpus} CPUs"
+
+
+def tasks_pay(work_s: float) -> bool:
+    """Whether tasks finish what takes this process `work_s` seconds sooner than it would: where a
+    cluster is at hand, or there is more to do than on two cores while one starts."""
+    named = os.environ.get("RAY_ADDRESS") or "local"
+    at_hand = ray.is_initialized() or named != "local" or _noted_address() is not None
+    return at_hand or work_s > 2 * START_S
 
 
 def connect() -> None:

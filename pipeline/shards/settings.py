@@ -30,8 +30,8 @@ class PackingSettings:
     extend: bool = False
     "Add the imagery to the finished set in `out`, as new tars."
     workers: int | None = None
-    """Tars packed at once, each by a Ray task; None for as many as there are cores, 0 for one after
-    the other in this process."""
+    """Tars packed at once, each by a Ray task; None for as many as there are cores, or none
+    where all is done before a Ray has started; 0 for one after the other in this process."""
 
     def __post_init__(self) -> None:
         samples, megabytes, bad = (

@@ -43,8 +43,8 @@ class SimulationSettings:
     texture_metres_per_pixel: float = 0.3
     "Resolution of those images."
     workers: int | None = None
-    """Locations rendered at once, each by a Ray task; None for as many as there are cores, 0 for
-    one after the other in this process."""
+    """Locations rendered at once, each by a Ray task; None for as many as there are cores, or none
+    where all is done before a Ray has started; 0 for one after the other in this process."""
 
     def __post_init__(self) -> None:
         for name in ("train_locations", "test_locations", "distractors", "seed"):

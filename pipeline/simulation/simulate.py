@@ -33,6 +33,8 @@ from pipeline.simulation.resume import begin, is_complete, local_root, settings_
 from pipeline.simulation.settings import SimulationSettings
 from pipeline.simulation.texture import usable_textures
 
+IMAGE_S = 0.1
+"About what an image takes a core: fewer of them do not wait for Ray."
 COMPLETE = "simulation.json"
 
 
@@ -110,7 +112,10 @@ def _run_jobs(missing: list[LocationJob], total: int, settings: SimulationSettin
     with progress(len(missing) * images, "simulate", "images") as meter:
         if len(missing) < total:
             meter.note(f"{total - len(missing)} of {total} locations exist already")
-        for seconds in _write_locations(missing, settings.workers):
+        workers = settings.workers
+        if workers is None and not cluster.tasks_pay(len(missing) * images * IMAGE_S):
+            workers = 0
+        for seconds in _write_locations(missing, workers):
             spent.update(seconds)
             meter.advance(images)
     return spent

@@ -17,6 +17,23 @@ NODES = st.lists(
 )
 
 
+def test_tasks_pay_where_a_cluster_is_or_work_outweighs_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))  # where `ray start` notes its address
+    monkeypatch.setenv("RAY_ADDRESS", "local")
+    assert not cluster.tasks_pay(cluster.START_S)
+    assert cluster.tasks_pay(10 * cluster.START_S)
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:6379")
+    assert cluster.tasks_pay(0.0)
+    monkeypatch.delenv("RAY_ADDRESS")
+    assert not cluster.tasks_pay(0.0)
+    (tmp_path / "ray").mkdir()
+    (tmp_path / "ray" / "ray_current_cluster").write_text("127.0.0.1:6379")
+    assert cluster.tasks_pay(0.0)
+
+
 def test_bounded_map_pairs_results_within_its_window(ray_cluster: None) -> None:
     in_flight, most = 0, 0
     double: Any = ray.remote(lambda number: 2 * number)

@@ -31,6 +31,8 @@ from pipeline.simulation.resume import begin, is_complete, local_root, settings_
 from pipeline.sources.maps.sheets import as_one_map
 
 TABLE, COMPLETE = "photos.csv", "flight.json"
+PHOTO_S = 0.7
+"About what a photo takes a core: fewer of them do not wait for Ray."
 TIMES, ODOMETRY = "times.csv", "odometry.csv"
 
 
@@ -76,7 +78,10 @@ def with_one_map(settings: MapFlightSettings, folder: str) -> MapFlightSettings:
 
 
 def _visit_places(settings: MapFlightSettings, root: Path, places: list[int]) -> Iterator[None]:
-    if settings.workers == 0:
+    here = settings.workers == 0
+    if settings.workers is None:
+        here = not cluster.tasks_pay(len(places) * settings.views * PHOTO_S)
+    if here:
         for place in places:
             write_place(settings, str(root), place)
             yield

@@ -142,8 +142,8 @@ class MapFlightSettings(PlanSettings, CameraRanges):
     seed: int = 0
     "Another seed flies elsewhere, on other days."
     workers: int | None = None
-    """Photos rendered at once, each by a Ray task; None for as many as there are cores, 0 for one
-    after the other in this process."""
+    """Photos rendered at once, each by a Ray task; None for as many as there are cores, or none
+    where all is done before a Ray has started; 0 for one after the other in this process."""
 
     def __post_init__(self) -> None:
         PlanSettings.__post_init__(self)
