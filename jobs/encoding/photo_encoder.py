@@ -23,6 +23,7 @@ from model.inference.int8 import PrecisionError, require_int8
 from model.inference.optimise import optimise_encoder
 from pipeline.batches.ordered import stack
 from pipeline.camera.overhead import overhead_view
+from pipeline.camera.pose import Perspective
 from pipeline.core.arrays import Floats, Pixels
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch_map
@@ -130,6 +131,11 @@ class PhotoEncoder:
             return np.empty((0, self.dimension), np.float32)
         return self._encode(torch.from_numpy(stack(images))).cpu().numpy()
 
+    @property
+    def perspective(self) -> Perspective:
+        """How UAV images are seen."""
+        return self.encoding.perspective
+
     def to_input(self, image_HW3: Pixels) -> Pixels:
         """Pixels at the network's size."""
         return resize(image_HW3, self.image_size, self.encoding.resizer)
@@ -138,7 +144,7 @@ class PhotoEncoder:
         data, geotag = tagged
         try:
             photo_HW3 = decode_photo(data)
-            if self.encoding.perspective == "overhead":
+            if self.perspective == "overhead":
                 photo_HW3 = overhead_view(photo_HW3, geotag)
             return self.to_input(photo_HW3)
         except DecodeError as error:

@@ -11,11 +11,14 @@ from typing import Protocol
 import numpy as np
 
 from pipeline.camera.framing import PhotoViews
+from pipeline.camera.overhead import overhead_view
+from pipeline.camera.pose import Perspective
 from pipeline.core.arrays import Floats, Pixels
 from pipeline.core.filters import Filter
 from pipeline.core.geo import Circle
 from pipeline.core.prefetch import prefetch_map
 from pipeline.core.records import Rejection
+from pipeline.images.camera_tags import CameraTags
 from pipeline.images.decode import DecodeError, decode
 from pipeline.index.metadata import IndexMetadata
 from pipeline.locate.locate import (
@@ -25,6 +28,7 @@ from pipeline.locate.locate import (
     search_views,
 )
 from pipeline.locate.photo_files import read_photo_tags
+from pipeline.matching.photo_pose import pose_of_photo
 from pipeline.service.live_index import LiveIndex, OpenedIndex
 from pipeline.service.photo_map import (
     FramedPhoto,
@@ -49,6 +53,10 @@ class Encoder(Protocol):
 
     def forward(self, images: Sequence[Pixels]) -> Floats:
         """Unit embeddings (B, D) of images of the network's size."""
+
+    @property
+    def perspective(self) -> Perspective:
+        """How UAV images are seen."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,11 +113,20 @@ class Predictor:
             photo_HW3 = decode(request.photo)
         except DecodeError as error:
             return Rejection(path="photo", reason=error.reason, found=error.found)
-        framed = FramedPhoto(views=PhotoViews(images=[photo_HW3]))
-        if photo_map is not None:
-            framed = photo_map.frame(photo_HW3, read_photo_tags(request.photo), request.pose)
+        tags = read_photo_tags(request.photo)
+        if photo_map is not None and photo_map.matches:
+            framed = photo_map.frame(photo_HW3, tags, request.pose)
+        else:
+            framed = FramedPhoto(views=PhotoViews(images=[self._seen(photo_HW3, tags, request)]))
         resized = [self._encoder.to_input(view) for view in framed.views.images]
         return replace(framed, views=replace(framed.views, images=resized))
+
+    def _seen(self, photo_HW3: Pixels, tags: CameraTags, request: LocateRequest) -> Pixels:
+        """The photo as the encoder sees UAV images where they are not framed as tiles are."""
+        if self._encoder.perspective == "as_taken":
+            return photo_HW3
+        pose = pose_of_photo(tags, (photo_HW3.shape[1], photo_HW3.shape[0]), request.pose)
+        return overhead_view(photo_HW3, vars(pose))
 
     def _answer(
         self, requests: Sequence[LocateRequest], framed: dict[int, FramedPhoto], opened: OpenedIndex

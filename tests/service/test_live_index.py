@@ -12,14 +12,18 @@ import numpy as np
 import pytest
 from aiohttp.test_utils import TestClient, TestServer
 
+from pipeline.camera.overhead import overhead_view
+from pipeline.camera.pose import Perspective
 from pipeline.core import json_files
 from pipeline.core.arrays import Floats, Pixels
 from pipeline.core.errors import InputError
 from pipeline.core.records import Rejection
 from pipeline.features.part import PartFooter, PartRows, write_part
+from pipeline.images.decode import decode
 from pipeline.index.build import build_index
 from pipeline.index.metadata import IndexMetadata
 from pipeline.index.settings import IndexSettings
+from pipeline.matching.photo_pose import PoseSettings
 from pipeline.service import live_index
 from pipeline.service.app import Service
 from pipeline.service.live_index import LiveIndex
@@ -65,6 +69,8 @@ def replace(path: Path, new: Path) -> None:
 
 class WidthEncoder:
     """Encodes a photo 16 + n pixels wide as location n."""
+
+    perspective: Perspective = "as_taken"
 
     def __init__(self, metadata: IndexMetadata | None = None) -> None:
         self.batches: list[int] = []
@@ -214,6 +220,34 @@ def test_predictor_without_calibration_uses_gallery_spacing(path: Path) -> None:
 
 
 @pytest.mark.slow
+class OverheadEncoder(WidthEncoder):
+    """Keeps what it was shown; any photo is location 0."""
+
+    perspective = "overhead"
+
+    def __init__(self, metadata: IndexMetadata | None = None) -> None:
+        super().__init__()
+        self.shown: list[Pixels] = []
+
+    def to_input(self, image_HW3: Pixels) -> Pixels:
+        self.shown.append(image_HW3)
+        return image_HW3[:, :16]
+
+
+def test_predictor_lays_photos_on_the_ground_for_overhead(path: Path) -> None:
+    predictor = Predictor(str(path), OverheadEncoder)
+    encoder = predictor._encoder
+    assert isinstance(encoder, OverheadEncoder)
+    known = PoseSettings(heading=90.0, pitch=-60.0, fov=55.0)
+    data = photo(size=(64, 48))
+    predictor.predict([LocateRequest(photo=data), LocateRequest(photo=data, pose=known)])
+    as_taken_HW3, on_ground_HW3 = encoder.shown
+    assert (as_taken_HW3 == decode(data)).all()
+    pose = {"heading_deg": 90.0, "pitch_deg": -60.0, "fov_deg": 55.0}
+    assert (on_ground_HW3 == overhead_view(decode(data), pose)).all()
+    assert on_ground_HW3.shape != as_taken_HW3.shape
+
+
 def test_service_answers_while_index_is_replaced(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
