@@ -17,7 +17,7 @@ from pipeline.camera.ground import apply_homography, camera_above
 from pipeline.core.arrays import Doubles, Floats, Mask
 from pipeline.matching.ground_fit import GroundFit, fit_ground, is_camera_view
 
-ROUNDS = 3
+CAMERA_ROUNDS = 3
 "A better homography tells the camera's place better."
 LENSES_DEG = (35.0, 45.0, 55.0, 65.0, 80.0)
 "Fields of view across a photo that are tried where its own is not known."
@@ -92,11 +92,11 @@ class _Pairs:
 def _fit_with_lens(
     pairs: _Pairs, relief: Relief, flat: GroundFit, fov_deg: float
 ) -> GroundFit | None:
-    """The fit after ROUNDS of camera and homography in turn; None where a camera is not above the
-    relief, or no homography holds."""
+    """The fit after CAMERA_ROUNDS of camera and homography in turn; None where a camera is not
+    above the relief, or no homography holds."""
     fit, level_m = flat, float(np.median(pairs.height_M[flat.inliers_M]))
     highest_m = float(pairs.height_M[pairs.near_M].max()) + CLEARANCE_M
-    for _ in range(ROUNDS):
+    for _ in range(CAMERA_ROUNDS):
         if not is_camera_view(fit.to_ground_33, pairs.size):
             return None
         east, north, up = camera_above(fit.to_ground_33, pairs.size, fov_deg)

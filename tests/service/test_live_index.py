@@ -12,51 +12,17 @@ import numpy as np
 import pytest
 from aiohttp.test_utils import TestClient, TestServer
 
-from pipeline.camera.overhead import overhead_view
-from pipeline.camera.pose import Perspective
 from pipeline.core import json_files
-from pipeline.core.arrays import Floats, Pixels
 from pipeline.core.errors import InputError
-from pipeline.core.records import Rejection
-from pipeline.features.part import PartFooter, PartRows, write_part
-from pipeline.images.decode import decode
-from pipeline.index.build import build_index
-from pipeline.index.metadata import IndexMetadata
-from pipeline.index.settings import IndexSettings
-from pipeline.matching.photo_pose import PoseSettings
 from pipeline.service import live_index
 from pipeline.service.app import Service
 from pipeline.service.live_index import LiveIndex
-from pipeline.service.photo_map import Located, MapOpener, PictureRequest, no_map
+from pipeline.service.photo_map import MapOpener, PictureRequest, no_map
 from pipeline.service.predictor import Outcome, Predictor, ServiceStatus
 from pipeline.service.request import LocateRequest
 from pipeline.service.settings import ServiceSettings
+from tests.service.made_index import DIMENSION, WidthEncoder, make_index
 from tests.service.photos import photo
-
-DIMENSION = 8
-
-
-def make_index(path: Path, rows: int, fingerprint: str = "f" * 64) -> Path:
-    """An index of `rows` locations 1,000 m apart; the embedding of location n is the n-th unit
-    vector."""
-    table = path.with_name(f"{path.name}-table")
-    embeddings_BD = np.eye(rows, DIMENSION, dtype=np.float32)
-    part = PartRows(
-        keys=[f"gallery-{n}" for n in range(rows)],
-        locations=[f"place{n}" for n in range(rows)],
-        views=["satellite"] * rows,
-        splits=["gallery"] * rows,
-        lats=[47 + 0.009 * n for n in range(rows)],
-        lons=[8.0] * rows,
-        embeddings_BD=embeddings_BD,
-    )
-    write_part(
-        str(table / "a.parquet"),
-        part,
-        PartFooter(fingerprint=fingerprint, shard_sha256="s", rows=rows),
-    )
-    build_index(IndexSettings(table=str(table), out=str(path)))
-    return path
 
 
 def replace(path: Path, new: Path) -> None:
@@ -65,27 +31,6 @@ def replace(path: Path, new: Path) -> None:
         (entry.name for entry in new.iterdir()), key=lambda name: name == "index.json"
     ):
         (new / name).replace(path / name)
-
-
-class WidthEncoder:
-    """Encodes a photo 16 + n pixels wide as location n."""
-
-    perspective: Perspective = "as_taken"
-
-    def __init__(self, metadata: IndexMetadata | None = None) -> None:
-        self.batches: list[int] = []
-
-    def to_input(self, image_HW3: Pixels) -> Pixels:
-        return image_HW3
-
-    def forward(self, images: Sequence[Pixels]) -> Floats:
-        self.batches.append(len(images))
-        numbers = [image_HW3.shape[1] - 16 for image_HW3 in images]
-        return np.eye(DIMENSION, dtype=np.float32)[numbers].reshape(-1, DIMENSION)
-
-
-def locate_request(number: int, **where: Any) -> LocateRequest:
-    return LocateRequest(photo=photo(size=(16 + number, 16)), **where)
 
 
 @pytest.fixture
@@ -193,61 +138,7 @@ def test_live_index_missing_is_refused(tmp_path: Path) -> None:
         LiveIndex(str(tmp_path / "none"))
 
 
-def test_predictor_batch_is_one_forward_pass(path: Path) -> None:
-    predictor = Predictor(str(path), WidthEncoder)
-    requests = [
-        locate_request(2),
-        LocateRequest(photo=photo()[:-40]),
-        locate_request(0, top=1),
-        locate_request(1),
-        locate_request(2, top=1),
-    ]
-    found = predictor.predict(requests)
-    assert isinstance(found[1], Rejection)
-    answers = [one.answer for one in found if isinstance(one, Located)]
-    assert [one.location for one in answers] == ["place2", "place0", "place1", "place2"]
-    assert [len(one.candidates) for one in answers] == [3, 1, 3, 1]
-    assert predictor._encoder.batches == [4]  # type: ignore[attr-defined]
-
-
-def test_predictor_without_calibration_uses_gallery_spacing(path: Path) -> None:
-    """Locations are 1,000 m apart: half of it is the radius, as `locate` answers."""
-    predictor = Predictor(str(path), WidthEncoder)
-    (located,) = predictor.predict([locate_request(1)])
-    assert isinstance(located, Located)
-    assert located.answer.position is not None
-    assert located.answer.position.radius_m == pytest.approx(0.009 / 2 * 111_195, rel=1e-3)
-
-
 @pytest.mark.slow
-class OverheadEncoder(WidthEncoder):
-    """Keeps what it was shown; any photo is location 0."""
-
-    perspective = "overhead"
-
-    def __init__(self, metadata: IndexMetadata | None = None) -> None:
-        super().__init__()
-        self.shown: list[Pixels] = []
-
-    def to_input(self, image_HW3: Pixels) -> Pixels:
-        self.shown.append(image_HW3)
-        return image_HW3[:, :16]
-
-
-def test_predictor_lays_photos_on_the_ground_for_overhead(path: Path) -> None:
-    predictor = Predictor(str(path), OverheadEncoder)
-    encoder = predictor._encoder
-    assert isinstance(encoder, OverheadEncoder)
-    known = PoseSettings(heading=90.0, pitch=-60.0, fov=55.0)
-    data = photo(size=(64, 48))
-    predictor.predict([LocateRequest(photo=data), LocateRequest(photo=data, pose=known)])
-    as_taken_HW3, on_ground_HW3 = encoder.shown
-    assert (as_taken_HW3 == decode(data)).all()
-    pose = {"heading_deg": 90.0, "pitch_deg": -60.0, "fov_deg": 55.0}
-    assert (on_ground_HW3 == overhead_view(decode(data), pose)).all()
-    assert on_ground_HW3.shape != as_taken_HW3.shape
-
-
 def test_service_answers_while_index_is_replaced(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
