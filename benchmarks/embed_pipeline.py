@@ -26,6 +26,7 @@ from synthetic import jpegs
 
 from jobs.encoding.settings import Compiling, EncoderSettings
 from model.backbones import BACKBONES
+from model.inference.precision import EffectivePrecision
 from pipeline.core import cluster
 from pipeline.features.embed_worker import IN_FLIGHT, EncoderSpec
 from pipeline.shards.manifest import Shard
@@ -65,7 +66,7 @@ def measure_speed(args: argparse.Namespace, images: list[bytes]) -> None:
             args.batch,
             folder,
             images,
-            EncoderSettings(compiling=args.compiling),
+            EncoderSettings(compiling=args.compiling, precision=args.precision),
         )
         actor = start_worker(folder, spec, args.batch, threads, args.decoders)
         ray.get(actor.resident.remote(2 * args.batch))
@@ -85,9 +86,9 @@ def measure_speed(args: argparse.Namespace, images: list[bytes]) -> None:
             )
         # Other work on the machine can only slow a round down: compare the best of each.
         print(
-            f"tar -> Parquet, {args.backbone} at {args.size} px, batches of {args.batch}, "
-            f"{threads} threads, {args.decoders} decoding: {max(stage) / max(resident):.3f} x the "
-            f"encoder alone (best of {args.rounds} rounds)"
+            f"tar -> Parquet, {args.backbone} at {args.size} px in {args.precision}, batches of "
+            f"{args.batch}, {threads} threads, {args.decoders} decoding: "
+            f"{max(stage) / max(resident):.3f} x the encoder alone (best of {args.rounds} rounds)"
         )
         ray.kill(actor)
 
@@ -118,6 +119,12 @@ def main() -> None:
     add("--size", type=int, default=256, help="side of its images, pixels")
     add("--batch", type=int, default=8, help="images of a batch")
     add("--compiling", default="auto", choices=get_args(Compiling), help="of the encoder")
+    add(
+        "--precision",
+        default="float32",
+        choices=get_args(EffectivePrecision),
+        help="of the encoder",
+    )
     add("--threads", type=int, help="threads of the encoder; all cores by default")
     add("--decoders", type=int, default=1, help="threads that decode")
     add("--seconds", type=float, default=8.0, help="length of a measured run, roughly")
