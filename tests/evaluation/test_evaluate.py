@@ -19,6 +19,8 @@ from pipeline.evaluation.settings import EvaluationSettings
 from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.shards.manifest import Manifest, Shard
 
+pytestmark = pytest.mark.slow
+
 COLUMNS = [
     "task",
     "protocol",

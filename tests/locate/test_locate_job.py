@@ -32,6 +32,8 @@ from pipeline.locate.calibration import write_calibration
 from tests.conftest import make_lively_encoder
 from tests.locate.calibrations import make_calibration
 
+pytestmark = pytest.mark.slow
+
 LOCATIONS = 12
 STEP = 1e-3  # degrees between locations, about 111 m
 ENCODING = EncodingConfig(mirror=True, resizer="torch", precision="float32")

@@ -8,6 +8,8 @@ from model.losses.objective import Objective
 from model.pvda import FeatureEncoder, LocationClassifier
 from model.two_views import EncoderWithClassifier
 
+pytestmark = pytest.mark.slow
+
 LOCATIONS = 701
 PUBLISHED = {
     "instance_loss": 24_917_757,

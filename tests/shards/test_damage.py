@@ -34,6 +34,8 @@ from tests.damaging import (
 )
 from tests.shards.imagery import SOURCE, content, imagery, packing
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:

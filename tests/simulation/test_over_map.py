@@ -101,6 +101,7 @@ def test_fly_survey_is_a_flight_with_times_and_odometry(tmp_path: Path) -> None:
         settings(tmp_path, plan="survey", views=2)
 
 
+@pytest.mark.slow
 def test_fly_spiral_circles_one_place_downwards(tmp_path: Path) -> None:
     """Three turns around one place, steep where the UAV is high; at 24 m and 20 m away the lowest
     photo looks down by 50 degrees."""

@@ -131,6 +131,7 @@ def test_sheets_unlike_each_other_are_refused(tmp_path: Path) -> None:
     assert not Path(vrt).exists()
 
 
+@pytest.mark.slow
 def test_vrt_of_others_is_read_and_bounded(tmp_path: Path) -> None:
     """A VRT beside its sheets, by relative names; and one that names something else."""
     values_BHW = noise(3, SIDE, SIDE)
