@@ -62,6 +62,8 @@ def fit_relief(
 
     `fov_deg`: across a photo of `size` (width, height); None where it is not known.
     """
+    if not is_camera_view(flat.to_ground_33, size):
+        return flat
     height_M = relief.at(ground_M2)
     apart_M = np.linalg.norm(apply_homography(flat.to_ground_33, photo_M2) - ground_M2, axis=1)
     pairs = _Pairs(
@@ -95,19 +97,17 @@ def _fit_with_lens(
     """The fit after CAMERA_ROUNDS of camera and homography in turn; None where a camera is not
     above the relief, or no homography holds."""
     fit, level_m = flat, float(np.median(pairs.height_M[flat.inliers_M]))
-    highest_m = float(pairs.height_M[pairs.near_M].max()) + CLEARANCE_M
+    highest_m = float(pairs.height_M[pairs.near_M].max())
     for _ in range(CAMERA_ROUNDS):
-        if not is_camera_view(fit.to_ground_33, pairs.size):
-            return None
         east, north, up = camera_above(fit.to_ground_33, pairs.size, fov_deg)
         camera_3 = np.array([east, north, level_m + up])
-        if camera_3[2] < highest_m:
-            return None
         level_m = _height_of_middle(relief, fit, camera_3, level_m, pairs.size)
+        if camera_3[2] < max(highest_m, level_m) + CLEARANCE_M:
+            return None
         seen_M2 = in_line(pairs.ground_M2, pairs.height_M, camera_3, level_m)
         near = np.flatnonzero(pairs.near_M)
         next_fit = fit_ground(pairs.photo_M2[near], seen_M2[near], pairs.size, pairs.tolerance_m)
-        if next_fit is None:
+        if next_fit is None or not is_camera_view(next_fit.to_ground_33, pairs.size):
             return None
         inliers_M = np.zeros(len(pairs.near_M), np.bool_)
         inliers_M[near[next_fit.inliers_M]] = True

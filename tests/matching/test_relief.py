@@ -1,6 +1,7 @@
 """Roofs in oblique photos: one homography holds for them and for the streets."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -106,6 +107,17 @@ def test_fit_relief_of_a_camera_within_it_is_the_flat_fit(
     """Heights in another unit, or of another place."""
     wrong = Relief(height_HW=(relief.height_HW - 300) * 20, metres_per_pixel=0.5)
     flat, found = fitted(make_pairs(oblique()), wrong, 60.0)
+    assert found is flat
+
+
+def test_fit_relief_below_a_tower_at_the_camera_is_the_flat_fit(
+    relief: Relief, make_pairs: Callable[[Pose], Pairs]
+) -> None:
+    """The ray of the middle begins within it; no pair lies on it."""
+    pose, height_HW = oblique(), relief.height_HW.copy()
+    column, row = 200 + round(pose.x_m / 0.5), 200 - round(pose.y_m / 0.5)
+    height_HW[row - 4 : row + 4, column - 4 : column + 4] = 500
+    flat, found = fitted(make_pairs(pose), replace(relief, height_HW=height_HW), 60.0)
     assert found is flat
 
 
