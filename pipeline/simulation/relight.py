@@ -20,7 +20,7 @@ from pipeline.simulation.world import ByteMap, FloatMap
 
 SUN_PIXEL_M = 1.0
 "Side of a pixel of the smaller image that the sun is looked for in, metres."
-AZIMUTHS_DEG, ELEVATIONS_DEG, APART_DEG = range(0, 360, 30), range(20, 70, 10), (30.0, 10.0)
+AZIMUTHS_DEG, ELEVATIONS_DEG, APART_DEG = range(0, 360, 30), (25, 40, 55), (30.0, 15.0)
 HALVINGS = 3
 "Suns that are tried, and how far apart; around the best of them others, so often half as far."
 LEAST_CORRELATION = 0.15
