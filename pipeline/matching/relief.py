@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.camera.ground import apply_homography, camera_above
-from pipeline.core.arrays import Doubles, Floats, Mask
+from pipeline.core.arrays import Doubles, Floats
 from pipeline.matching.ground_fit import GroundFit, fit_ground, is_camera_view
 
 CAMERA_ROUNDS = 3
@@ -64,40 +64,44 @@ def fit_relief(
     """
     if not is_camera_view(flat.to_ground_33, size):
         return flat
-    height_M = relief.at(ground_M2)
     apart_M = np.linalg.norm(apply_homography(flat.to_ground_33, photo_M2) - ground_M2, axis=1)
+    near = np.flatnonzero(apart_M < MOST_SHIFT_M)
+    height_M = relief.at(ground_M2)
     pairs = _Pairs(
-        photo_M2=photo_M2,
-        ground_M2=ground_M2,
-        height_M=height_M,
-        near_M=apart_M < MOST_SHIFT_M,
+        photo_M2=photo_M2[near],
+        ground_M2=ground_M2[near],
+        height_M=height_M[near],
         size=size,
         tolerance_m=tolerance_m,
     )
+    level_m = float(np.median(height_M[flat.inliers_M]))
     lenses: Sequence[float] = LENSES_DEG if fov_deg is None else (fov_deg,)
-    found = [_fit_with_lens(pairs, relief, flat, lens) for lens in lenses]
+    found = [_fit_with_lens(pairs, relief, flat, level_m, lens) for lens in lenses]
     best = max((one for one in found if one), key=lambda one: one.inliers, default=None)
-    return best if best and best.inliers >= NEARLY * flat.inliers else flat
+    if best is None or best.inliers < NEARLY * flat.inliers:
+        return flat
+    inliers_M = np.zeros(len(photo_M2), np.bool_)
+    inliers_M[near[best.inliers_M]] = True
+    return replace(best, inliers_M=inliers_M)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Pairs:
+    """Pairs that can be right, and the heights of their ground."""
+
     photo_M2: Doubles
     ground_M2: Doubles
     height_M: Doubles
-    near_M: Mask
-    "Which can be right."
     size: tuple[int, int]
     tolerance_m: float
 
 
 def _fit_with_lens(
-    pairs: _Pairs, relief: Relief, flat: GroundFit, fov_deg: float
+    pairs: _Pairs, relief: Relief, fit: GroundFit, level_m: float, fov_deg: float
 ) -> GroundFit | None:
-    """The fit after CAMERA_ROUNDS of camera and homography in turn; None where a camera is not
-    above the relief, or no homography holds."""
-    fit, level_m = flat, float(np.median(pairs.height_M[flat.inliers_M]))
-    highest_m = float(pairs.height_M[pairs.near_M].max())
+    """The fit after CAMERA_ROUNDS of camera and homography in turn, from one to `level_m`; None
+    where a camera is not above the relief, or no view that a camera can have holds."""
+    highest_m = float(pairs.height_M.max())
     for _ in range(CAMERA_ROUNDS):
         east, north, up = camera_above(fit.to_ground_33, pairs.size, fov_deg)
         camera_3 = np.array([east, north, level_m + up])
@@ -105,13 +109,10 @@ def _fit_with_lens(
         if camera_3[2] < max(highest_m, level_m) + CLEARANCE_M:
             return None
         seen_M2 = in_line(pairs.ground_M2, pairs.height_M, camera_3, level_m)
-        near = np.flatnonzero(pairs.near_M)
-        next_fit = fit_ground(pairs.photo_M2[near], seen_M2[near], pairs.size, pairs.tolerance_m)
-        if next_fit is None or not is_camera_view(next_fit.to_ground_33, pairs.size):
+        found = fit_ground(pairs.photo_M2, seen_M2, pairs.size, pairs.tolerance_m)
+        if found is None or not is_camera_view(found.to_ground_33, pairs.size):
             return None
-        inliers_M = np.zeros(len(pairs.near_M), np.bool_)
-        inliers_M[near[next_fit.inliers_M]] = True
-        fit = replace(next_fit, inliers_M=inliers_M)
+        fit = found
     return fit
 
 
