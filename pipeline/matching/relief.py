@@ -19,8 +19,9 @@ from pipeline.matching.ground_fit import GroundFit, fit_ground, is_camera_view
 
 CAMERA_ROUNDS = 3
 "A better homography tells the camera's place better."
-LENSES_DEG = (35.0, 45.0, 55.0, 65.0, 80.0)
-"Fields of view across a photo that are tried where its own is not known."
+LENSES_DEG = (40.0, 55.0, 70.0)
+"""Fields of view across a photo that are tried where its own is not known: five or thirteen of them
+place no more photos (60 over a town, a trial)."""
 MOST_SHIFT_M = 30.0
 "Of a pair from the first homography: a roof of 20 m at the border of an oblique photo."
 CLEARANCE_M = 5.0
