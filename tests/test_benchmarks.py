@@ -97,6 +97,10 @@ CASES: dict[str, tuple[str, str]] = {
         r"\| after, without \| [\d.]+% \|.* [\d.]+ x \|(.|\n)*"
         r"\| plain SIFT over the whole map, without .* [\d.]+ x \|",
     ),
+    "relight": (
+        "--towns 1 --side 120 --resolution 1",
+        r"unexplained of another day: [\d.]+ x that with the map's own light",
+    ),
     "serve": (
         "--checkpoint {trained}/run/last.pt --index {trained}/index "
         "--photos {trained}/flights/test/query_drone --clients 2 --seconds 0.2 --rounds 1 "
