@@ -22,7 +22,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
@@ -38,7 +37,7 @@ from pipeline.images.camera_tags import CameraTags
 from pipeline.index.searcher import Index
 from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
 from pipeline.locate.photo_files import read_photo_tags
-from pipeline.matching import refine
+from pipeline.matching import photo_features, refine
 from pipeline.matching.gate import holds
 from pipeline.matching.local_features import LocalFeatures
 from pipeline.matching.map_features import find_map_features
@@ -79,27 +78,32 @@ def xfeat_finder() -> Callable[..., LocalFeatures]:
 @contextmanager
 def features_by(name: str) -> Iterator[None]:
     """Matching finds these features, and takes their pairs by the rule that suits them."""
-    names = ("find_features", "ALONE_RATIO", "PROMISED_RATIO")
-    usual: dict[str, Any] = {one: getattr(refine, one) for one in names}
+    names = [
+        (photo_features, "find_features"),
+        (refine, "find_features"),
+        (refine, "ALONE_RATIO"),
+        (refine, "PROMISED_RATIO"),
+    ]
+    usual = [getattr(module, one) for module, one in names]
     if name == "xfeat":
-        changed = (xfeat_finder(), 1.0, 1.0)
-        for one, value in zip(names, changed, strict=True):
-            setattr(refine, one, value)
+        find = xfeat_finder()
+        for (module, one), value in zip(names, (find, find, 1.0, 1.0), strict=True):
+            setattr(module, one, value)
     try:
         yield
     finally:
-        for one, value in usual.items():
-            setattr(refine, one, value)
+        for (module, one), value in zip(names, usual, strict=True):
+            setattr(module, one, value)
 
 
 @contextmanager
 def photo_pixels(longest: int) -> Iterator[None]:
     """Photos are matched at so many pixels."""
-    usual, refine.PHOTO_PX = refine.PHOTO_PX, longest
+    usual, photo_features.PHOTO_PX = photo_features.PHOTO_PX, longest
     try:
         yield
     finally:
-        refine.PHOTO_PX = usual
+        photo_features.PHOTO_PX = usual
 
 
 @dataclass
@@ -140,17 +144,17 @@ def match_all(
         key = str(gallery.keys[gallery.nearest(lat, lon, 1)[0]])
         size = (image_HW3.shape[1], image_HW3.shape[0])
         pose = pose_of_photo(tags, size, PoseSettings(pose=posed))
-        promised_33 = refine.promised_ground(pose, size)
+        promised_33 = photo_features.promised_ground(pose, size)
         reach_m = 0.0
         if promised_33 is not None:
-            reach_m = float(refine.ground_extent(promised_33, size).max()) / 2
+            reach_m = float(photo_features.ground_extent(promised_33, size).max()) / 2
         with matched.timed("window"):
             [window] = windows.around([(lat, lon, key)], 1, reach_m)
-        longest = refine.PHOTO_PX
+        longest = photo_features.PHOTO_PX
         if name == "xfeat" and promised_33 is not None:
             longest = round(2 * reach_m / window.metres_per_pixel)
         with photo_pixels(longest), matched.timed("photo"):
-            prepared = refine.prepare_photo(image_HW3, pose)
+            prepared = photo_features.prepare_photo(image_HW3, pose)
         with matched.timed("fit"):
             found = refine.refine(prepared, [window])
         error_m = np.inf
@@ -187,7 +191,7 @@ def print_votes(photos: list[FlightPhoto], windows: MapWindows) -> None:
         return
     made, right, seconds = time.perf_counter() - begin, 0, 0.0
     for photo, (image_HW3, _) in zip(photos, read_all(photos), strict=True):
-        prepared = refine.prepare_photo(image_HW3)
+        prepared = photo_features.prepare_photo(image_HW3)
         begin = time.perf_counter()
         places = features.places(prepared, 1)
         seconds += time.perf_counter() - begin

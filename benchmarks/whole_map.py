@@ -17,7 +17,8 @@ from pipeline.camera.ground import apply_homography
 from pipeline.core.arrays import Doubles, Pixels
 from pipeline.matching.ground_fit import fit_ground, is_camera_view
 from pipeline.matching.local_features import LocalFeatures, find_features
-from pipeline.matching.refine import TOLERANCE_PX, prepare_photo
+from pipeline.matching.photo_features import prepare_photo
+from pipeline.matching.refine import TOLERANCE_PX
 
 RATIO = 0.8
 "Of the distances of the nearest and the second nearest descriptor [Lowe 2004]."

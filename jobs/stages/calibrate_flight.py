@@ -32,8 +32,9 @@ from pipeline.locate.locate import CONSENSUS_CANDIDATES, answers_from_hits
 from pipeline.locate.refined import refine_answer
 from pipeline.locate.track import TRACK_CANDIDATES
 from pipeline.matching.map_windows import MapWindows
+from pipeline.matching.photo_features import MatchablePhoto
 from pipeline.matching.photo_pose import PoseSettings
-from pipeline.matching.refine import MatchablePhoto, Refinement
+from pipeline.matching.refine import Refinement
 from pipeline.sources.table import Table
 
 WAYS = (PoseSettings(pose=True), PoseSettings(pose=False))

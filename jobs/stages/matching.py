@@ -30,8 +30,9 @@ from pipeline.locate.refined import refine_answer, with_refinement
 from pipeline.matching.kept_features import MAP_FEATURES_FILE, FeatureFile
 from pipeline.matching.map_features import MapSearch
 from pipeline.matching.map_windows import HeightReader, MapWindows
+from pipeline.matching.photo_features import MatchablePhoto, prepare_photo
 from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
-from pipeline.matching.refine import MatchablePhoto, Refinement, prepare_photo
+from pipeline.matching.refine import Refinement
 from pipeline.matching.relief import Relief
 from pipeline.service.photo_map import PhotoMap
 from pipeline.shards.manifest import MANIFEST

@@ -12,7 +12,8 @@ from pipeline.locate.calibration import Calibration, confidence_features
 from pipeline.locate.locate import Answer, Position, consensus_of, consensus_scores
 from pipeline.matching.gate import holds
 from pipeline.matching.map_windows import MapWindows
-from pipeline.matching.refine import MatchablePhoto, Refinement, refine
+from pipeline.matching.photo_features import MatchablePhoto
+from pipeline.matching.refine import Refinement, refine
 
 MOST_WINDOWS = 3
 "Windows that a photo is matched with: around the answer, then around other candidates."

@@ -7,19 +7,27 @@ early (docs/decisions.md).
 Shapes: M pairs, K inliers, 33 = a homography.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from pipeline.camera.ground import apply_homography, corners
-from pipeline.core.arrays import Doubles, Mask
+from pipeline.core.arrays import Doubles, Floats, Ints, Mask
 
 LEAST_PAIRS = 8
 "Four determine a homography; twice as many can contradict each other."
 MAX_ITERATIONS = 10_000
 "Where one pair in eight is right, they find it with a probability of 0.9; some 0.2 s."
 CONFIDENCE = 0.9999
+HEADINGS_DEG, ALIKE_DEG = tuple(range(0, 360, 40)), 40.0
+"""Headings that are tried, and how far from one a pair may be turned: an image 45 degrees below the
+horizon turns what lies across it by 10, and its sides by 20."""
+ITERATIONS_A_HEADING = 500
+"""Where one of such pairs in four is right, they find it with a probability of 0.9. Six times as
+many found no more (60 photos over a town on another day, a trial)."""
+NEAR_TOLERANCES = 10.0
+"Pairs so near to the best of these fits are fitted once more, however they are turned."
 PROMISED_SHARE = 0.05
 """By which a promised point may err beyond a shift, turn and scale of all, as a share of the ground
 that the photo shows: a pitch wrong by two degrees, 45 degrees below the horizon."""
@@ -45,9 +53,19 @@ class GroundFit:
     def inliers(self) -> int:
         return int(self.inliers_M.sum())
 
+    def among(self, numbers: Ints, pairs: int) -> "GroundFit":
+        """The fit of some pairs, by their numbers, as one of all `pairs`."""
+        inliers_M = np.zeros(pairs, np.bool_)
+        inliers_M[numbers[self.inliers_M]] = True
+        return replace(self, inliers_M=inliers_M)
+
 
 def fit_ground(
-    photo_M2: Doubles, ground_M2: Doubles, size: tuple[int, int], tolerance_m: float
+    photo_M2: Doubles,
+    ground_M2: Doubles,
+    size: tuple[int, int],
+    tolerance_m: float,
+    iterations: int = MAX_ITERATIONS,
 ) -> GroundFit | None:
     """The homography that most pairs agree with to `tolerance_m`; None where none is found.
 
@@ -56,7 +74,7 @@ def fit_ground(
     if len(photo_M2) < LEAST_PAIRS:
         return None
     homography_33, found_M = cv2.findHomography(
-        photo_M2, ground_M2, cv2.RANSAC, tolerance_m, maxIters=MAX_ITERATIONS, confidence=CONFIDENCE
+        photo_M2, ground_M2, cv2.RANSAC, tolerance_m, maxIters=iterations, confidence=CONFIDENCE
     )
     if homography_33 is None or not np.isfinite(homography_33).all():
         return None
@@ -71,6 +89,45 @@ def fit_ground(
         residual_m=float(np.sqrt((apart_K2**2).sum(axis=1).mean())),
         middle_covariance_22=_middle_covariance(to_ground_33, photo_M2[inliers_M], apart_K2, size),
     )
+
+
+def fit_turned(
+    photo_M2: Doubles,
+    ground_M2: Doubles,
+    turn_M: Floats,
+    heading_deg: float | None,
+    size: tuple[int, int],
+    tolerance_m: float,
+) -> GroundFit | None:
+    """`fit_ground` of a photo whose pose is not known: among the pairs that are turned alike, for
+    one heading after the other or for `heading_deg` alone, as every other pair is wrong; then
+    among all that are near the best. None where no view that a camera can have holds.
+
+    `turn_M`: degrees by which a pair's point is turned further on the map than in the photo: the
+    heading, where the pair is right and the camera looks down.
+    """
+    headings = HEADINGS_DEG if heading_deg is None else (heading_deg,)
+    best: GroundFit | None = None
+    for heading in headings:
+        alike = np.flatnonzero(turned_alike(turn_M, heading))
+        fit = fit_ground(photo_M2[alike], ground_M2[alike], size, tolerance_m, ITERATIONS_A_HEADING)
+        if fit is None or not is_camera_view(fit.to_ground_33, size):
+            continue
+        if best is None or fit.inliers > best.inliers:
+            best = fit.among(alike, len(turn_M))
+    if best is None:
+        return None
+    apart_M = np.linalg.norm(apply_homography(best.to_ground_33, photo_M2) - ground_M2, axis=1)
+    near = np.flatnonzero(apart_M < NEAR_TOLERANCES * tolerance_m)
+    again = fit_ground(photo_M2[near], ground_M2[near], size, tolerance_m)
+    if again is None or again.inliers < best.inliers:
+        return best
+    return again.among(near, len(turn_M))
+
+
+def turned_alike(turn_M: Floats, heading_deg: float) -> Mask:
+    """Which pairs (M,) are turned as in a photo of this heading, roughly."""
+    return np.asarray(np.abs((turn_M - heading_deg + 180) % 360 - 180) <= ALIKE_DEG)
 
 
 def agree_with_promise(promised_M2: Doubles, ground_M2: Doubles) -> Mask:

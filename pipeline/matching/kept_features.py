@@ -17,7 +17,7 @@ from pipeline.matching.map_windows import MapWindows
 
 MAP_FEATURES_FILE = "map_features.npz"
 "In the index's folder."
-VERSION = "1"
+VERSION = "2"
 "Of the features: counted up when other code would find others."
 
 
@@ -45,6 +45,7 @@ class FeatureFile:
                     plane=LocalPlane(lat=lat, lon=lon),
                     points_N2=kept["points_N2"],
                     metres_per_pixel_N=kept["metres_per_pixel_N"],
+                    angles_N=kept["angles_N"],
                     index=index,
                     reach_m=reach_m,
                 )
@@ -68,6 +69,7 @@ class FeatureFile:
             frame=np.array([features.plane.lat, features.plane.lon, features.reach_m]),
             points_N2=features.points_N2,
             metres_per_pixel_N=features.metres_per_pixel_N,
+            angles_N=features.angles_N,
             index=FAISS.serialize_index(features.index),
         )
         try:

@@ -25,6 +25,8 @@ class LocalFeatures:
     "Column and row, (0, 0) being the outer corner of the first pixel."
     descriptors_ND: Floats
     "Of unit length."
+    angles_N: Floats | None = None
+    "How each point is turned, degrees clockwise; None where the features know no turn."
 
 
 def find_features(image_HW3: Pixels, most: int, mask_HW: Pixels | None = None) -> LocalFeatures:
@@ -34,12 +36,15 @@ def find_features(image_HW3: Pixels, most: int, mask_HW: Pixels | None = None) -
     points, descriptors_ND = sift.detectAndCompute(grey_HW, mask_HW)
     if descriptors_ND is None:
         return LocalFeatures(
-            points_N2=np.zeros((0, 2)), descriptors_ND=np.zeros((0, 128), np.float32)
+            points_N2=np.zeros((0, 2)),
+            descriptors_ND=np.zeros((0, 128), np.float32),
+            angles_N=np.zeros(0, np.float32),
         )
     total_N1 = descriptors_ND.sum(axis=1, keepdims=True)
     return LocalFeatures(
         points_N2=np.array([point.pt for point in points]) + 0.5,
         descriptors_ND=np.sqrt(descriptors_ND / np.maximum(total_N1, 1e-12)).astype(np.float32),
+        angles_N=np.array([point.angle for point in points], np.float32),
     )
 
 

@@ -21,7 +21,8 @@ from pipeline.core.arrays import Doubles, Floats
 from pipeline.core.geo import Circle
 from pipeline.core.progress import progress
 from pipeline.matching.map_windows import MapWindows
-from pipeline.matching.refine import MatchablePhoto, MatchableWindow, prepare_window
+from pipeline.matching.photo_features import MatchablePhoto
+from pipeline.matching.refine import MatchableWindow, prepare_window
 
 FAISS: Any = faiss
 "Without types: FAISS's stubs lack the keyword arguments."
@@ -48,6 +49,8 @@ class MapFeatures:
     "(east, north) in metres."
     metres_per_pixel_N: Floats
     "Of the map where they were found."
+    angles_N: Floats
+    "How they are turned, degrees clockwise."
     index: Any
     "FAISS's index of their descriptors (N, 128), which gives them back."
     reach_m: float
@@ -85,6 +88,7 @@ class MapFeatures:
             metres_per_pixel=float(np.median(self.metres_per_pixel_N[within])),
             ground_N2=plane.to_metres(positions_N2),
             descriptors_ND=self.index.reconstruct_batch(within),
+            angles_N=self.angles_N[within],
         )
 
     def _votes(self, descriptors_QD: Floats, away_from: Circle | None) -> Doubles:
@@ -113,7 +117,7 @@ def find_map_features(windows: MapWindows) -> MapFeatures | None:
     if not middles:
         return None
     plane = LocalPlane(lat=middles[0][0], lon=middles[0][1])
-    points, descriptors, scales = [], [], []
+    points, descriptors, scales, angles = [], [], [], []
     with progress(len(middles), "features of the map", "windows") as meter:
         for lat, lon in middles:
             window = windows.compose(lat, lon, half_m)
@@ -122,6 +126,7 @@ def find_map_features(windows: MapWindows) -> MapFeatures | None:
                 positions_N2 = found.plane.to_degrees(found.ground_N2)
                 points.append(plane.to_metres(positions_N2).astype(np.float32))
                 descriptors.append(found.descriptors_ND)
+                angles.append(found.angles_N)
                 scales.append(np.full(len(positions_N2), found.metres_per_pixel, np.float32))
             meter.advance()
     if sum(map(len, points)) < NEIGHBOURS:
@@ -130,6 +135,7 @@ def find_map_features(windows: MapWindows) -> MapFeatures | None:
         plane=plane,
         points_N2=np.concatenate(points),
         metres_per_pixel_N=np.concatenate(scales),
+        angles_N=np.concatenate([one for one in angles if one is not None]),
         index=_index_of(np.concatenate(descriptors)),
         reach_m=min(windows.tile_sides_m()),
     )

@@ -21,7 +21,8 @@ from pipeline.core.geo import Circle
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.inspect import inspect
 from pipeline.images.thumbnails import ImageLoader
-from pipeline.matching.refine import MatchablePhoto, MatchableWindow, prepare_window
+from pipeline.matching.photo_features import MatchablePhoto
+from pipeline.matching.refine import MatchableWindow, prepare_window
 from pipeline.matching.relief import Relief
 
 

@@ -7,36 +7,31 @@ In: a photo's pixels, windows around candidate positions, and what is known of t
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from pipeline.camera.ground import (
-    HorizonInView,
     apply_homography,
     camera_above,
     corners,
-    footprint,
     heading_of,
-    photo_to_ground,
 )
 from pipeline.camera.local_plane import LocalPlane
 from pipeline.camera.map_window import MapWindow
-from pipeline.camera.pose import PartialPose
 from pipeline.camera.uncertainty import Ellipse, ellipse_of
-from pipeline.camera.warp import north_up, warp
-from pipeline.core.arrays import Doubles, Floats, Pixels
+from pipeline.core.arrays import Doubles, Floats, Ints
 from pipeline.matching.ground_fit import (
     GroundFit,
     agree_with_promise,
     fit_ground,
+    fit_turned,
     is_camera_view,
+    turned_alike,
 )
 from pipeline.matching.local_features import LocalFeatures, find_features, match_features
+from pipeline.matching.photo_features import MatchablePhoto, ground_extent
 from pipeline.matching.relief import Relief, fit_relief
 
-PHOTO_PX = 640
-"Longest side of a photo when it is matched."
-PHOTO_FEATURES, WINDOW_FEATURES = 2000, 6000
+WINDOW_FEATURES = 6000
 TOLERANCE_PX = 4.0
 "Of an inlier, in pixels of the window."
 ALONE_RATIO, PROMISED_RATIO = 0.85, 0.95
@@ -95,85 +90,6 @@ class Refinement:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MatchablePhoto:
-    """A photo with its features, found once for all windows."""
-
-    size: tuple[int, int]
-    "Width and height when matched."
-    features: LocalFeatures
-    pose: PartialPose
-    promised_33: Doubles | None
-    """The homography to the ground, (east, north) in metres from below the camera, that its pose
-    promises; None where that is not complete, or shows the horizon."""
-
-    @property
-    def reach_m(self) -> float:
-        """Half the extent of the ground that the pose promises, metres; 0 where it promises
-        none."""
-        if self.promised_33 is None:
-            return 0.0
-        return float(ground_extent(self.promised_33, self.size).max() / 2)
-
-
-def prepare_photo(photo_HW3: Pixels, pose: PartialPose | None = None) -> MatchablePhoto:
-    """The features of a photo; a large one is made smaller first."""
-    rows, columns = photo_HW3.shape[:2]
-    scale = min(1.0, PHOTO_PX / max(rows, columns))
-    size = (round(columns * scale), round(rows * scale))
-    small_HW3 = np.asarray(cv2.resize(photo_HW3, size, interpolation=cv2.INTER_AREA), np.uint8)
-    pose = pose or PartialPose()
-    promised_33 = promised_ground(pose, size)
-    features = (
-        find_features(small_HW3, PHOTO_FEATURES)
-        if promised_33 is None
-        else _features_on_the_ground(small_HW3, promised_33)
-    )
-    return MatchablePhoto(size=size, features=features, pose=pose, promised_33=promised_33)
-
-
-def ground_extent(to_ground_33: Doubles, size: tuple[int, int]) -> Doubles:
-    """How far east and north (2,) the ground of a photo of `size` (width, height) extends."""
-    return np.asarray(np.ptp(apply_homography(to_ground_33, corners(size)), axis=0))
-
-
-def promised_ground(pose: PartialPose, size: tuple[int, int]) -> Doubles | None:
-    """The homography to the ground by the pose; None where it is not complete, or shows the
-    horizon."""
-    if not pose.complete:
-        return None
-    try:
-        footprint(pose.over(), size)
-    except HorizonInView:
-        return None
-    return photo_to_ground(pose.over(), size)
-
-
-def _features_on_the_ground(photo_HW3: Pixels, to_ground_33: Doubles) -> LocalFeatures:
-    """Features, in the photo's own pixels, that are found on the photo as it lies on the ground:
-    north up, an oblique view no longer foreshortened."""
-    size = (photo_HW3.shape[1], photo_HW3.shape[0])
-    to_flat_33, flat_size = _flat_frame(apply_homography(to_ground_33, corners(size)), to_ground_33)
-    flat_HW3 = warp(photo_HW3, to_flat_33, flat_size)
-    mask_HW = np.zeros(flat_size[::-1], np.uint8)
-    outline_42 = apply_homography(to_flat_33, corners(size))
-    cv2.fillConvexPoly(mask_HW, np.round(outline_42).astype(np.int32), 255)
-    found = find_features(flat_HW3, PHOTO_FEATURES, mask_HW)
-    return LocalFeatures(
-        points_N2=apply_homography(np.asarray(np.linalg.inv(to_flat_33)), found.points_N2),
-        descriptors_ND=found.descriptors_ND,
-    )
-
-
-def _flat_frame(ground_42: Doubles, to_ground_33: Doubles) -> tuple[Doubles, tuple[int, int]]:
-    """The homography from a photo's pixels to a north-up picture of its ground, and its size."""
-    least_2, most_2 = ground_42.min(axis=0), ground_42.max(axis=0)
-    scale = PHOTO_PX / float((most_2 - least_2).max())
-    width, height = (max(1, round(side)) for side in ((most_2 - least_2) * scale).tolist())
-    place_33 = north_up(scale, float(least_2[0]), float(most_2[1]))
-    return place_33 @ to_ground_33, (width, height)
-
-
-@dataclass(frozen=True, kw_only=True)
 class MatchableWindow:
     """The features of a window of the map."""
 
@@ -182,6 +98,8 @@ class MatchableWindow:
     ground_N2: Doubles
     "(east, north) in metres from the plane's zero."
     descriptors_ND: Floats
+    angles_N: Floats | None = None
+    "How they are turned on the north-up map, degrees clockwise; None where they know no turn."
     relief: Relief | None = None
     "The heights of the ground, where they are known; else it is taken for flat."
 
@@ -194,6 +112,7 @@ def prepare_window(window: MapWindow) -> MatchableWindow:
         metres_per_pixel=window.metres_per_pixel,
         ground_N2=apply_homography(window.to_ground_33, found.points_N2),
         descriptors_ND=found.descriptors_ND,
+        angles_N=found.angles_N,
     )
 
 
@@ -216,11 +135,19 @@ def refine_in(photo: MatchablePhoto, window: MatchableWindow) -> Refinement | No
     pairs_M2 = match_features(photo.features.descriptors_ND, window.descriptors_ND, ratio)
     photo_M2 = photo.features.points_N2[pairs_M2[:, 0]]
     ground_M2 = window.ground_N2[pairs_M2[:, 1]]
+    turn_M = _turns(photo.features, window, pairs_M2)
+    tolerance_m = TOLERANCE_PX * window.metres_per_pixel
     if photo.promised_33 is not None:
+        # Its features were found on the photo as it lies on the ground, north up.
+        agree_M = np.ones(len(pairs_M2), np.bool_) if turn_M is None else turned_alike(turn_M, 0.0)
+        photo_M2, ground_M2 = photo_M2[agree_M], ground_M2[agree_M]
         agree_M = agree_with_promise(apply_homography(photo.promised_33, photo_M2), ground_M2)
         photo_M2, ground_M2 = photo_M2[agree_M], ground_M2[agree_M]
-    tolerance_m = TOLERANCE_PX * window.metres_per_pixel
-    fit = fit_ground(photo_M2, ground_M2, photo.size, tolerance_m)
+    if photo.promised_33 is not None or turn_M is None:
+        fit = fit_ground(photo_M2, ground_M2, photo.size, tolerance_m)
+    else:
+        heading = photo.pose.heading_deg
+        fit = fit_turned(photo_M2, ground_M2, turn_M, heading, photo.size, tolerance_m)
     if fit is not None and window.relief is not None:
         fit = fit_relief(
             photo_M2, ground_M2, window.relief, fit, photo.size, photo.pose.fov_deg, tolerance_m
@@ -232,6 +159,13 @@ def refine_in(photo: MatchablePhoto, window: MatchableWindow) -> Refinement | No
     inliers = fit.inliers_M
     points = _points(photo_M2[inliers], ground_M2[inliers], photo.size, window)
     return _refinement(fit, photo, window, len(photo_M2), points)
+
+
+def _turns(features: LocalFeatures, window: MatchableWindow, pairs_M2: Ints) -> Floats | None:
+    """Degrees (M,) by which points are turned further on the map; None where that is not known."""
+    if features.angles_N is None or window.angles_N is None:
+        return None
+    return window.angles_N[pairs_M2[:, 1]] - features.angles_N[pairs_M2[:, 0]]
 
 
 def _points(

@@ -9,7 +9,7 @@ Shapes: M pairs, N points, H, W pixels, 33 = a homography; ground is (east, nort
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -81,9 +81,7 @@ def fit_relief(
     best = max((one for one in found if one), key=lambda one: one.inliers, default=None)
     if best is None or best.inliers < NEARLY * flat.inliers:
         return flat
-    inliers_M = np.zeros(len(photo_M2), np.bool_)
-    inliers_M[near[best.inliers_M]] = True
-    return replace(best, inliers_M=inliers_M)
+    return best.among(near, len(photo_M2))
 
 
 @dataclass(frozen=True, kw_only=True)

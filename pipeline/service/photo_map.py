@@ -21,8 +21,8 @@ from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.locate import Answer
 from pipeline.locate.refined import refine_answer, with_refinement
 from pipeline.matching.map_windows import MapWindows
+from pipeline.matching.photo_features import MatchablePhoto, prepare_photo
 from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
-from pipeline.matching.refine import MatchablePhoto, prepare_photo
 
 Pictures = Literal["none", "tiles", "map"]
 "What pages can show of the gallery: nothing, its images, or these put together as a map as well."

@@ -16,7 +16,8 @@ from pipeline.matching.gate import holds
 from pipeline.matching.kept_features import FeatureFile
 from pipeline.matching.map_features import MapFeatures, MapSearch, find_map_features
 from pipeline.matching.map_windows import MapWindows
-from pipeline.matching.refine import MatchablePhoto, prepare_photo, refine
+from pipeline.matching.photo_features import MatchablePhoto, prepare_photo
+from pipeline.matching.refine import refine
 from tests.matching.made_maps import PLANE, POSE, MadeMap, error_m, made_map, photo_of, window_of
 
 pytestmark = pytest.mark.slow

@@ -10,7 +10,8 @@ from pipeline.core.arrays import Pixels
 from pipeline.core.geo import haversine_m
 from pipeline.matching.gate import holds
 from pipeline.matching.ground_fit import is_camera_view
-from pipeline.matching.refine import prepare_photo, prepare_window, refine
+from pipeline.matching.photo_features import prepare_photo
+from pipeline.matching.refine import prepare_window, refine
 from tests.matching.made_maps import SIZE, error_m, made_map, photo_of, window_of
 
 
