@@ -1,8 +1,10 @@
 """Flights over a map: photos with tags, true positions, and a rerun that does nothing."""
 
 import csv
+import io
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +26,8 @@ from pipeline.simulation.over_map.photo import BLOCK_M, is_in_part, photos_over_
 from pipeline.simulation.over_map.poses import spiral_poses
 from pipeline.simulation.over_map.settings import MapFlightSettings
 from pipeline.simulation.over_map.survey import camera_of_row
+from pipeline.sources.maps.mosaic import read_window
+from pipeline.sources.maps.tiles import Window
 from pipeline.sources.table import Table
 from tests.sources.mosaics import mosaic, quarters
 
@@ -162,6 +166,33 @@ def test_photo_over_a_surface_model_has_relief(tmp_path: Path) -> None:
         raised.lat, raised.lon, raised.photos[0].pose,
     )  # fmt: skip
     assert flat.photos[0].jpeg != raised.photos[0].jpeg
+
+
+def test_photo_over_a_finer_map_shows_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is read at some 0.2 m a pixel instead of 0.075: a photo of 96 pixels shows no more."""
+    write_map(tmp_path / "map.tif")
+    with rasterio.open(tmp_path / "map.tif") as opened:
+        fine = opened.read().repeat(4, axis=1).repeat(4, axis=2)
+    mosaic(tmp_path / "fine.tif", fine, crs="EPSG:32632", affine=GROUND @ Affine.scale(0.25))
+    sides = list[int]()
+
+    def read(path: str, part: Window, size: tuple[int, int], *given: Any) -> Any:
+        sides.append(part.width // size[0])
+        return read_window(path, part, size, *given)
+
+    monkeypatch.setattr("pipeline.simulation.over_map.photo.read_window", read)
+    names = ("map.tif", "fine.tif")
+    coarse, finer = (
+        photos_over_map(settings(tmp_path, mosaic=str(tmp_path / name)), 0, 1) for name in names
+    )
+    assert min(sides[1:]) >= 2
+    seen, same = (
+        np.asarray(Image.open(io.BytesIO(one.photos[0].jpeg)).convert("L"), float).ravel()
+        for one in (coarse, finer)
+    )
+    assert np.corrcoef(seen, same)[0, 1] > 0.95
 
 
 def test_fly_pairs_can_be_packed_and_trained_on(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ season, haze and sensor; with a surface model it has relief, parallax and anothe
 without one it is flat and its shadows stay as in the map.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -41,6 +42,8 @@ MOST_DRAWS = 3000
 BLOCK_M, HELD_OUT_BLOCKS, MARGIN_SHARE = 160.0, 5, 0.2
 """Side of a block; one block in so many is held out; and the share of its side by which a held-out
 place keeps away from its border."""
+DETAIL = 0.7
+"Of the ground that a photo's pixel shows at best: a finer map is read no finer."
 OVERHEAD_QUALITY = 92
 MOST_WITHOUT_HEIGHT = 0.1
 "Likewise, the share that a surface model may lack, at the map's edge and in its gaps."
@@ -96,9 +99,10 @@ def photos_over_map(settings: MapFlightSettings, place: int, count: int) -> MapP
             )
             middle = _draw_point(settings, placement, for_place)
         reaches_m = [reach_m(pose) for pose in poses]
+        detail_m = DETAIL * min(_pixel_below_m(pose, settings.size) for pose in poses)
         if _edge_m(settings.mosaic, placement, middle) < 0.95 * max(reaches_m):
             continue  # known without reading
-        widest = _window_around(settings.mosaic, placement, middle, max(reaches_m))
+        widest = _window_around(settings.mosaic, placement, middle, max(reaches_m), detail_m)
         if widest.shown_HW.mean() >= LEAST_SHOWN * 255:
             break
         if (tries := tries + 1) == MOST_TRIES:
@@ -118,7 +122,7 @@ def photos_over_map(settings: MapFlightSettings, place: int, count: int) -> MapP
     for pose in poses[place : place + 1] if spiral else poses:
         window = widest
         if reach_m(pose) < max(reaches_m):
-            window = _window_around(settings.mosaic, placement, middle, reach_m(pose))
+            window = _window_around(settings.mosaic, placement, middle, reach_m(pose), detail_m)
         photos.append(_take(settings, window, day, pose, rng))
     overhead = None
     if settings.overhead_m is not None and settings.location_of(place) == place:
@@ -195,10 +199,20 @@ def _edge_m(path: str, placement: Placement, middle: tuple[float, float]) -> flo
     return float(min(min(x, dataset.width - x) * across_m, min(y, dataset.height - y) * down_m))
 
 
+def _pixel_below_m(pose: Pose, size: int) -> float:
+    """The ground straight below the camera that a pixel of a photo of so many shows, metres."""
+    return 2 * pose.altitude_m * math.tan(math.radians(pose.fov_deg) / 2) / size
+
+
 def _window_around(
-    path: str, placement: Placement, middle: tuple[float, float], half_m: float
+    path: str,
+    placement: Placement,
+    middle: tuple[float, float],
+    half_m: float,
+    detail_m: float = 0.0,
 ) -> MapWindow:
-    """The map around one of its pixels (column, row), north up, at its own resolution."""
+    """The map around one of its pixels (column, row), north up, at its own resolution, or at
+    `detail_m` metres a pixel if it is finer."""
     dataset = open_mosaic(path)
     x, y = middle
     [[lat, lon]] = placement.georeference.degrees(np.array([[x, y]])).tolist()
@@ -209,11 +223,15 @@ def _window_around(
     right, bottom = min(dataset.width, int(x + across) + 1), min(dataset.height, int(y + down) + 1)
     part = Window(x=left, y=top, width=right - left, height=bottom - top)
     colours = colours_for(path, None)
-    pixels_HW3 = read_window(path, part, (part.width, part.height), Resampling.average, colours)
+    pixel_m = max(min(placement.pixel_m), detail_m)
+    size = tuple(
+        max(1, round(count * side_m / pixel_m))
+        for count, side_m in zip((part.width, part.height), placement.pixel_m, strict=True)
+    )
+    pixels_HW3 = read_window(path, part, (size[0], size[1]), Resampling.average, colours)
     [tag] = placement.georeference.geotags([part])
     if tag is None or tag.footprint is None:
         raise InputError(f"{path} has ground without a position, expected one; cut the map")
-    pixel_m = min(placement.pixel_m)
     tile = Tile(read=lambda: pixels_HW3, footprint=tag.footprint, metres_per_pixel=pixel_m)
     window = compose_window(plane, [tile], half_m, pixel_m)
     if colours.gaps:  # black is a gap there
