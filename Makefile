@@ -1,8 +1,10 @@
 # Each target sets up .venv by itself; nothing is installed outside it.
 PYTHON ?= python3
 BIN := .venv/bin
-# Processes that share the tests, of which two have a Ray and wait for it much; 0: this one alone.
-TEST_PROCESSES ?= 3
+# Processes that share the tests, of which two have a Ray; 0: this one alone.
+TEST_PROCESSES ?= 2
+# Compiled modules are kept: else each process of the tests compiles them anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo region test test-fast check format bench chaos
@@ -23,10 +25,10 @@ region: .venv/installed  ## a made-up town as a map, adapted to; photos of anoth
 	$(BIN)/pvda adapt --mosaic $(SAMPLE)/town/map.tif --surface $(SAMPLE)/town/surface.tif --out $(SAMPLE)/region --minutes 1 --checks 20
 	$(BIN)/pvda locate --index $(SAMPLE)/region/index --out $(SAMPLE)/where.geojson --page $(SAMPLE)/where.html $(SAMPLE)/flight/photos
 
-test: .venv/installed  ## all tests, shared by three processes
+test: .venv/installed  ## all tests, shared by two processes
 	$(BIN)/pytest -n $(TEST_PROCESSES) --no-loadscope-reorder
 
-test-fast: .venv/installed  ## the tests without Ray, training, fuzzing and browsers: minutes
+test-fast: .venv/installed  ## the tests without Ray, training, fuzzing and browsers: a minute
 	$(BIN)/pytest -n $(TEST_PROCESSES) -m "not slow"
 
 check: .venv/installed  ## formatting, lint and types

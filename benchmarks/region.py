@@ -18,7 +18,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -81,18 +81,36 @@ def take_photos(
     return {photo.path: photo.truth for photo in flight_of(str(flight / TABLE), count)}
 
 
-def locate_all(settings: LocateSettings, truth: Truth) -> tuple[list[Outcome], float]:
-    """The photos' outcomes in their order, and the seconds a photo."""
+@dataclass(frozen=True, kw_only=True)
+class Way:
+    """How photos were located."""
+
+    outcomes: list[Outcome]
+    "In the photos' order."
+    seconds: float
+    "A photo."
+    turns_deg: list[float]
+    "Between the headings of matched photos and the true ones."
+
+
+def locate_all(settings: LocateSettings, truth: Truth) -> Way:
     begin = time.perf_counter()
     located = {one.name: one for one in locate_photos(settings)}
     seconds = (time.perf_counter() - begin) / len(truth)
-    outcomes = [outcome_of(located[path], tag, settings.pose) for path, tag in truth.items()]
-    return outcomes, seconds
+    answers = [(located[path].answer, tag.heading_deg) for path, tag in truth.items()]
+    return Way(
+        outcomes=[outcome_of(located[path], tag, settings.pose) for path, tag in truth.items()],
+        seconds=seconds,
+        turns_deg=[
+            abs((answer.refinement.heading_deg - heading + 180) % 360 - 180)
+            for answer, heading in answers
+            if answer is not None and answer.refinement is not None and heading is not None
+        ],
+    )
 
 
-def locate_by_sift(mosaic: str, truth: Truth) -> tuple[list[Outcome], float]:
-    """The outcomes of plain SIFT over the whole map, and the seconds a photo; the map's features
-    are found before."""
+def locate_by_sift(mosaic: str, truth: Truth) -> Way:
+    """By plain SIFT over the whole map, whose features are found before."""
     whole, outcomes = open_whole_map(Path(mosaic)), []
     begin = time.perf_counter()
     for path, tag in truth.items():
@@ -107,7 +125,8 @@ def locate_by_sift(mosaic: str, truth: Truth) -> tuple[list[Outcome], float]:
                 pitch_deg=tag.pitch_deg or 0,
             )
         )  # fmt: skip
-    return outcomes, (time.perf_counter() - begin) / len(truth)
+    seconds = (time.perf_counter() - begin) / len(truth)
+    return Way(outcomes=outcomes, seconds=seconds, turns_deg=[])
 
 
 @contextmanager
@@ -134,16 +153,17 @@ def no_heights(plane: LocalPlane, half_m: float) -> None:
     """As if a surface model ended there."""
 
 
-def print_row(name: str, outcomes: Sequence[Outcome], seconds: float, baseline: float) -> float:
+def print_row(name: str, way: Way, baseline: float) -> float:
     """A row of the table; the share within 25 m."""
-    found = expect(name, outcomes)
+    found = expect(name, way.outcomes)
     within = [f"{one.value:.1%} [{one.low:.1%}, {one.high:.1%}]" for one in found.within]
     gap = "" if np.isnan(found.calibration_gap) else f"{100 * found.calibration_gap:+.1f} points"
     share = found.within[-1].value
-    ratio = share / max(baseline or share, 1 / len(outcomes))
+    ratio = share / max(baseline or share, 1 / len(way.outcomes))
+    turn = f"{np.median(way.turns_deg):.2f} degrees" if way.turns_deg else ""
     print(
         f"| {name} | {found.answered.value:.1%} | {' | '.join(within)} | {found.wrong.value:.1%} "
-        f"| {found.median_m:.2f} m | {gap} | {seconds:.2f} s | {ratio:.2f} x |",
+        f"| {found.median_m:.2f} m | {turn} | {gap} | {way.seconds:.2f} s | {ratio:.2f} x |",
         flush=True,
     )
     return share
@@ -201,9 +221,9 @@ def main() -> None:
     after = replace(before, index=str(region / "index"))
     print(
         "| photos | answered | within 1 m | within 5 m | within 25 m | wrong answers | median "
-        "| promised too much | a photo | within 25 m, x the first row |"
+        "| heading off, median | promised too much | a photo | within 25 m, x the first row |"
     )
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
     baseline, seen, by_tiles = 0.0, {}, {}
     for posed, way in ((True, "with tags"), (False, "without")):
         ways = {
@@ -215,21 +235,21 @@ def main() -> None:
         for name, settings in ways.items():
             if options.only_after and name.startswith("before"):
                 continue
-            found, seconds = locate_all(replace(settings, pose=posed), truth)
-            share = print_row(f"{name}, {way}", found, seconds, baseline)
+            found = locate_all(replace(settings, pose=posed), truth)
+            share = print_row(f"{name}, {way}", found, baseline)
             baseline = baseline or share
             if name == "after":
-                seen[posed] = found
+                seen[posed] = found.outcomes
             elif name == "after, tiles":
-                by_tiles[posed] = found
+                by_tiles[posed] = found.outcomes
         with windows_per_photo(1):
             first = locate_all(replace(after, match=True, pose=posed), truth)
-        print_row(f"after, around the first candidate alone, {way}", *first, baseline)
+        print_row(f"after, around the first candidate alone, {way}", first, baseline)
         if surface is not None:
             with flat_ground():
                 flat = locate_all(replace(after, match=True, pose=posed), truth)
-            print_row(f"after, the ground taken for flat, {way}", *flat, baseline)
-    print_row("plain SIFT over the whole map, without", *locate_by_sift(mosaic, truth), baseline)
+            print_row(f"after, the ground taken for flat, {way}", flat, baseline)
+    print_row("plain SIFT over the whole map, without", locate_by_sift(mosaic, truth), baseline)
     print_promises(promised, seen)
     pairs = [
         pair for posed in seen for pair in zip(by_tiles[posed], seen[posed], strict=True)
@@ -239,7 +259,7 @@ def main() -> None:
     print(f"right tiles made worse by matching (and more than 5 m off): {worse} of {len(pairs)}")
     for posed, way in ((True, "with tags"), (False, "without")):
         settings = replace(after, photos=tuple(strangers), match=True, pose=posed)
-        given = sum(one.known for one in locate_all(settings, strangers)[0])
+        given = sum(one.known for one in locate_all(settings, strangers).outcomes)
         print(f"photos of another map, {way}: {given} of {len(strangers)} answered")
     print(json.dumps({"minutes": options.minutes, "seed": options.seed, "photos": len(truth)}))
 

@@ -15,13 +15,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from region import locate_all, print_row
+import numpy as np
+from region import Way, locate_all, print_row
 
 from jobs.stages.calibrate_flight import flight_of
 from jobs.stages.settings import LocateSettings
 from pipeline.core import cluster
 from pipeline.core.records import GeoTag
-from pipeline.region.expectation import Outcome
 from pipeline.simulation.over_map.fly import ODOMETRY, TABLE, TIMES, fly
 from pipeline.simulation.over_map.settings import MapFlightSettings
 
@@ -54,9 +54,9 @@ def take_flights(options: argparse.Namespace) -> list[Path]:
 
 def locate_flights(
     options: argparse.Namespace, flights: Sequence[Path], way: Mapping[str, Any]
-) -> tuple[list[Outcome], float]:
-    """The outcomes of all photos, and the seconds a photo."""
-    outcomes, seconds = list[Outcome](), 0.0
+) -> Way:
+    """All photos, one flight after the other."""
+    found = []
     for flight in flights:
         photos = flight_of(str(flight / TABLE), options.photos)
         truth: dict[str, GeoTag] = {photo.path: photo.truth for photo in photos}
@@ -67,10 +67,12 @@ def locate_flights(
         files = {"times": TIMES} if way.get("track") else {}
         files |= {"odometry": way["odometry"]} if "odometry" in way else {}
         named = {name: str(flight / file) for name, file in files.items()}
-        found, each = locate_all(replace(settings, **{**way, **named}), truth)
-        outcomes += found
-        seconds += each / len(flights)
-    return outcomes, seconds
+        found.append(locate_all(replace(settings, **{**way, **named}), truth))
+    return Way(
+        outcomes=[outcome for one in found for outcome in one.outcomes],
+        seconds=float(np.mean([one.seconds for one in found])),
+        turns_deg=[turn for one in found for turn in one.turns_deg],
+    )
 
 
 def main() -> None:
@@ -92,13 +94,12 @@ def main() -> None:
     print(f"{len(flights)} flights of {options.photos} photos")
     print(
         "| photos | answered | within 1 m | within 5 m | within 25 m | wrong answers | median "
-        "| promised too much | a photo | within 25 m, x the first row |"
+        "| heading off, median | promised too much | a photo | within 25 m, x the first row |"
     )
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
     baseline = 0.0
     for name in options.ways:
-        found, seconds = locate_flights(options, flights, WAYS[name])
-        share = print_row(name, found, seconds, baseline)
+        share = print_row(name, locate_flights(options, flights, WAYS[name]), baseline)
         baseline = baseline or share
 
 

@@ -21,6 +21,8 @@ from pipeline.shards.shard_set import open_shards
 from tests.batches.conftest import CLASSES, DRONES, PLAIN, epoch, keys
 from tests.batches.test_damaged_images import with_damage
 
+pytestmark = pytest.mark.slow
+
 PAIRED = replace(PLAIN, sampler="paired", batch_size=2)
 
 

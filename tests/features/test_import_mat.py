@@ -23,6 +23,8 @@ from pipeline.features.settings import ImportSettings
 from pipeline.features.table import open_table
 from tests.evaluation.test_evaluate import TEST_SET, made_table
 
+pytestmark = pytest.mark.slow
+
 FIGURES = ("queries", "gallery", "r1", "r5", "r10", "r1p", "ap")
 
 

@@ -11,6 +11,8 @@ from pipeline.core.errors import InputError
 from pipeline.index.searcher import Index
 from tests.index.index_tables import build, write_gallery
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory: pytest.TempPathFactory) -> str:

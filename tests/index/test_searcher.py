@@ -21,6 +21,8 @@ from pipeline.index.searcher import Index, merge_results
 from pipeline.index.settings import IndexSettings
 from tests.index.index_tables import write_gallery
 
+pytestmark = pytest.mark.slow
+
 FACTORIES = [
     "Flat",
     "SQ8",

@@ -16,6 +16,8 @@ from model.pvda import FeatureEncoder
 from model.weights.load import read_state_dict
 from tests.damaging import count_detected, damaged_versions, error_message, raising_if_missing
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def held() -> Checkpoint:

@@ -37,6 +37,8 @@ from pipeline.images.transforms import Resizer
 from pipeline.shards.shard_set import open_or_scan
 from tests.jobs.tiny_runs import initial_checkpoint
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def checkpoint(tiny_shards: str) -> bytes:

@@ -20,6 +20,8 @@ from pipeline.features.encoding import EncodingConfig
 from pipeline.images.decode import decode
 from pipeline.images.transforms import Resizer, resize
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def checkpoint(lively_encoder: FeatureEncoder) -> bytes:

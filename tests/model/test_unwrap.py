@@ -16,6 +16,8 @@ from model.errors import CheckpointError
 from model.weights.load import infer_backbone, load_backbone, read_state_dict
 from model.weights.unwrap import MAX_DEPTH, find_state_dict, prefix_variants
 
+pytestmark = pytest.mark.slow
+
 State = dict[str, Tensor]
 
 

@@ -24,6 +24,8 @@ from pipeline.service.settings import ServiceSettings
 from tests.service.made_index import DIMENSION, WidthEncoder, make_index
 from tests.service.photos import photo
 
+pytestmark = pytest.mark.slow
+
 
 def replace(path: Path, new: Path) -> None:
     """Replace an index safely: the parts first, each by renaming, index.json last."""

@@ -12,6 +12,8 @@ from tests.service.hostile_requests import HOSTILE
 from tests.service.http_client import TOKEN, Client, FakeEngine, post, run_with_service
 from tests.service.photos import photo
 
+pytestmark = pytest.mark.slow
+
 
 async def published(client: Client) -> dict[str, Any]:
     document: dict[str, Any] = await (await client.get("/openapi.json")).json()

@@ -27,6 +27,8 @@ from tests.service.http_client import Client, FakeEngine, post, run_with_service
 from tests.service.photos import photo
 from tests.service.test_openapi import validate
 
+pytestmark = pytest.mark.slow
+
 POSE_KNOWN = PoseSettings(fov=55.0, height=60.0, heading=30.0, pitch=-60.0)
 
 

@@ -18,6 +18,8 @@ from tests.service.http_client import (
 )
 from tests.service.photos import photo
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize(
     ("status", "word", "harm"), [row[1:] for row in HOSTILE], ids=[row[0] for row in HOSTILE]
