@@ -53,6 +53,8 @@ def calibrate_index(settings: CalibrateSettings) -> Calibration:
     selection = f"{views}, at most {settings.photos} photos"
     if settings.flight:
         selection = selection_of(settings.flight, settings.photos)
+        if settings.surface:
+            selection += ", heights known"
     if done := load_if_done(out, index, selection, settings):
         console.print(f"{out} is complete; nothing to do")
         return done

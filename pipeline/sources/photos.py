@@ -11,7 +11,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
+from pipeline.camera.ground import looked_at
 from pipeline.camera.lens import field_of_view, focal_length_35mm
+from pipeline.camera.pose import Pose
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.prefetch import prefetch_map
@@ -45,6 +47,9 @@ are read before the consumer asks for them."""
 MAX_PITCH_DEG = -20.0
 """Above this pitch the optical axis meets the ground 2.7 heights away or further, where a degree of
 pitch moves that point a long way."""
+
+ANY_FOV_DEG = 60.0
+"Of a photo's middle, which every lens sees in the same place."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,12 +194,17 @@ def equivalent_focal_length(tags: CameraTags) -> float | None:
 def aim_point(
     lat: float, lon: float, height_m: float, heading_deg: float, pitch_deg: float
 ) -> tuple[float, float]:
-    """Latitude and longitude at which the optical axis meets the ground: height / tan(-pitch)
-    metres along the heading, on a geodesic of WGS84.
+    """Latitude and longitude at which the optical axis meets the ground: `looked_at`, along a
+    geodesic of WGS84.
 
-    Angles in degrees, pitch from -90 (straight down) to below 0. The ground is flat and as high as
-    where the height is measured from.
+    Angles in degrees, pitch from -90 (straight down) to MAX_PITCH_DEG. The ground is flat and as
+    high as where the height is measured from.
     """
-    distance_m = height_m / math.tan(math.radians(-pitch_deg))
-    aim_lon, aim_lat, _ = ELLIPSOID.fwd(lon, lat, heading_deg, distance_m)
+    pose = Pose(
+        x_m=0.0, y_m=0.0, altitude_m=height_m, heading_deg=heading_deg, pitch_deg=pitch_deg,
+        fov_deg=ANY_FOV_DEG,
+    )  # fmt: skip
+    east, north = looked_at(pose)
+    azimuth_deg = math.degrees(math.atan2(east, north))
+    aim_lon, aim_lat, _ = ELLIPSOID.fwd(lon, lat, azimuth_deg, math.hypot(east, north))
     return float(aim_lat), float(aim_lon)

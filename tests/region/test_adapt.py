@@ -18,7 +18,8 @@ from jobs.region.expect import located_outcomes
 from jobs.region.extend import extend_region
 from jobs.region.folder import Region
 from jobs.region.settings import AdaptSettings
-from jobs.stages.settings import LocateSettings
+from jobs.stages import calibrate
+from jobs.stages.settings import CalibrateSettings, LocateSettings
 from model.weights.builtin import BUILTIN
 from pipeline.core.errors import InputError
 from pipeline.index.searcher import Index
@@ -60,6 +61,21 @@ def test_adapt_again_makes_nothing_anew(adapted_region: AdaptSettings) -> None:
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
     with pytest.raises(InputError, match="adapted with another seed"):
         adapt(replace(adapted_region, seed=1))
+
+
+def test_calibrate_with_and_without_heights_are_two(
+    adapted_region: AdaptSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = Path(adapted_region.out)
+    settings = CalibrateSettings(
+        checkpoint=str(out / "encoder.safetensors"), shards=str(out / "tiles"),
+        index=str(out / "index"), flight=str(out / "flights" / "check" / "photos.csv"),
+        surface=adapted_region.surface,
+    )  # fmt: skip
+    monkeypatch.setattr(calibrate, "_calibrate_on_flight", lambda *_: pytest.fail("fitted anew"))
+    assert calibrate.calibrate_index(settings).matching is not None
+    with pytest.raises(pytest.fail.Exception, match="fitted anew"):
+        calibrate.calibrate_index(replace(settings, surface=None))
 
 
 def test_adapt_without_a_map_is_refused(tmp_path: Path) -> None:
