@@ -39,11 +39,13 @@ from pipeline.core import cluster
 from pipeline.core.geo import haversine_m
 from pipeline.core.records import GeoTag
 from pipeline.locate import refined
-from pipeline.region.expectation import Expectation, Outcome, expect
+from pipeline.region.expectation import WITHIN_M, Expectation, Outcome, coverage, expect
 from pipeline.simulation.over_map.fly import TABLE, fly
 from pipeline.simulation.over_map.settings import MapFlightSettings, TownMapSettings
 from pipeline.simulation.over_map.town_map import ANOTHER_DAY, MAP, SURFACE, make_town_map
 
+PRECISION = 0.95
+"Of answers: the share of photos that is answered so is their coverage."
 Truth = dict[str, GeoTag]
 "Where and how photos were taken, by their paths."
 
@@ -169,6 +171,13 @@ def print_row(name: str, way: Way, baseline: float) -> float:
     return share
 
 
+def print_coverage(seen: dict[bool, list[Outcome]]) -> None:
+    """The share of photos that can be answered with a precision of PRECISION."""
+    for posed, way in ((True, "with tags"), (False, "without")):
+        shares = [f"{coverage(seen[posed], PRECISION, m):.1%} within {m:g} m" for m in WITHIN_M]
+        print(f"answered with a precision of {PRECISION:.0%}, {way}: {', '.join(shares)}")
+
+
 def print_promises(promised: Sequence[Expectation], seen: dict[bool, list[Outcome]]) -> None:
     """How near `what to expect` came to what was seen."""
     for way, posed in zip(promised[:2], (True, False), strict=True):
@@ -250,6 +259,7 @@ def main() -> None:
                 flat = locate_all(replace(after, match=True, pose=posed), truth)
             print_row(f"after, the ground taken for flat, {way}", flat, baseline)
     print_row("plain SIFT over the whole map, without", locate_by_sift(mosaic, truth), baseline)
+    print_coverage(seen)
     print_promises(promised, seen)
     pairs = [
         pair for posed in seen for pair in zip(by_tiles[posed], seen[posed], strict=True)

@@ -85,6 +85,24 @@ def share_of(yes: Sequence[bool]) -> Share:
     )
 
 
+def coverage(outcomes: Sequence[Outcome], precision: float, within_m: float) -> float:
+    """The largest share of the photos that is answered by probabilities of a threshold and above,
+    where at least `precision` of these answers are within `within_m` metres; 0 where no threshold
+    does. Answers of the same probability are given together."""
+    sure = sorted(
+        (one for one in outcomes if one.known and one.probability is not None),
+        key=lambda one: one.probability or 0.0,
+        reverse=True,
+    )
+    best = right = 0
+    for given, one in enumerate(sure, 1):
+        right += one.error_m <= within_m
+        tied = given < len(sure) and sure[given].probability == one.probability
+        if not tied and right >= precision * given:
+            best = given
+    return best / len(outcomes) if outcomes else 0.0
+
+
 def expect(title: str, outcomes: Sequence[Outcome]) -> Expectation:
     """The figures of some photos."""
     given = [one for one in outcomes if one.known]

@@ -3,7 +3,7 @@
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -16,7 +16,14 @@ from pipeline.core.records import View
 from pipeline.index.searcher import Hit
 from pipeline.region import camera_ranges
 from pipeline.region.camera_ranges import ranges_of_photos
-from pipeline.region.expectation import Outcome, expect, expectations, read_expectations, share_of
+from pipeline.region.expectation import (
+    Outcome,
+    coverage,
+    expect,
+    expectations,
+    read_expectations,
+    share_of,
+)
 from pipeline.region.lookalikes import find_lookalikes
 from pipeline.region.page import RegionPage, render_region
 from pipeline.simulation.over_map.settings import CameraRanges
@@ -52,6 +59,22 @@ def test_expectation_counts_unknown_photos_as_not_found() -> None:
     nothing = expect("none", [outcome(0, math.inf, known=False)])
     assert math.isnan(nothing.median_m)
     assert nothing.within[2].value == 0
+
+
+def test_coverage_at_a_precision_by_hand() -> None:
+    """Surest first: right, right, wrong, right, right, and one that is unknown."""
+    sure = zip((0.99, 0.9, 0.8, 0.7, 0.6, 0.5), (1.0, 2.0, 30.0, 3.0, 4.0, 1.0), strict=True)
+    given = [
+        replace(outcome(number, error_m, known=number < 5), probability=probability)
+        for number, (probability, error_m) in enumerate(sure)
+    ]
+    assert coverage(given, 1.0, 5.0) == pytest.approx(2 / 6)
+    assert coverage(given, 0.75, 5.0) == pytest.approx(5 / 6)
+    assert coverage(given, 0.75, 1.5) == pytest.approx(1 / 6)
+    assert coverage(given, 0.9, 0.5) == 0
+    tied = [replace(one, probability=0.9) for one in given[:3]]
+    assert coverage(tied, 0.9, 5.0) == 0  # two right ones cannot be told from the wrong one
+    assert coverage([], 0.9, 5.0) == 0
 
 
 def test_expectations_by_way_height_and_pitch() -> None:
