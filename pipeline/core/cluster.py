@@ -64,6 +64,12 @@ def tasks_pay(work_s: float) -> bool:
     return at_hand or work_s > 2 * START_S
 
 
+def workers_for(workers: int | None, work_s: float) -> int | None:
+    """As many tasks at once as are asked for; 0, this process, where none are asked for and they
+    do not pay."""
+    return 0 if workers is None and not tasks_pay(work_s) else workers
+
+
 def connect() -> None:
     """Join the cluster that RAY_ADDRESS names (`ray job submit` sets it) or that `ray start` began
     on this machine, else start one for this process. Idempotent.

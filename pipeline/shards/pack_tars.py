@@ -78,9 +78,9 @@ def pack_plans(
             (plan, source, out, digests[plan.name], settings.check, left_out.get(plan.name))
             for plan in todo
         )
-        workers = settings.workers
-        if workers is None and (len(todo) <= 1 or not cluster.tasks_pay(images * IMAGE_S)):
-            workers = 0
+        # One tar is one task: nothing runs beside it.
+        workers = cluster.workers_for(settings.workers, images * IMAGE_S)
+        workers = 0 if settings.workers is None and len(todo) <= 1 else workers
         for done in write_shards(arguments, workers):
             packed[done.shard.name] = done
             refused += done.rejected

@@ -112,9 +112,7 @@ def _run_jobs(missing: list[LocationJob], total: int, settings: SimulationSettin
     with progress(len(missing) * images, "simulate", "images") as meter:
         if len(missing) < total:
             meter.note(f"{total - len(missing)} of {total} locations exist already")
-        workers = settings.workers
-        if workers is None and not cluster.tasks_pay(len(missing) * images * IMAGE_S):
-            workers = 0
+        workers = cluster.workers_for(settings.workers, len(missing) * images * IMAGE_S)
         for seconds in _write_locations(missing, workers):
             spent.update(seconds)
             meter.advance(images)

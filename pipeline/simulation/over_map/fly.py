@@ -78,16 +78,14 @@ def with_one_map(settings: MapFlightSettings, folder: str) -> MapFlightSettings:
 
 
 def _visit_places(settings: MapFlightSettings, root: Path, places: list[int]) -> Iterator[None]:
-    here = settings.workers == 0
-    if settings.workers is None:
-        here = not cluster.tasks_pay(len(places) * settings.views * PHOTO_S)
-    if here:
+    workers = cluster.workers_for(settings.workers, len(places) * settings.views * PHOTO_S)
+    if workers == 0:
         for place in places:
             write_place(settings, str(root), place)
             yield
         return
     cluster.connect()
-    task, window = ray.remote(num_cpus=1)(write_place), settings.workers or 2 * cluster.cpus()
+    task, window = ray.remote(num_cpus=1)(write_place), workers or 2 * cluster.cpus()
     submit = partial(task.remote, settings, str(root))
     for _ in cluster.bounded_map(submit, places, window):
         yield None

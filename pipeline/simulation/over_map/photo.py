@@ -117,13 +117,15 @@ def photos_over_map(settings: MapFlightSettings, place: int, count: int) -> MapP
             f"as a photo reaches, some {max(reaches_m):.0f} m; fly lower or steeper, or give a "
             "larger map"
         )
-    day = _day_of(settings, widest)
+    heights_HW = _heights(settings.surface, widest)
+    day = _day_of(settings, widest, heights_HW)
     photos = []
     for pose in poses[place : place + 1] if spiral else poses:
-        window = widest
+        window, of_window_HW = widest, heights_HW
         if reach_m(pose) < max(reaches_m):
             window = _window_around(settings.mosaic, placement, middle, reach_m(pose), detail_m)
-        photos.append(_take(settings, window, day, pose, rng))
+            of_window_HW = _heights(settings.surface, window)
+        photos.append(_take(settings, _world(window, of_window_HW, day), pose, rng))
     overhead = None
     if settings.overhead_m is not None and settings.location_of(place) == place:
         piece = _window_around(settings.mosaic, placement, middle, settings.overhead_m / 2)
@@ -133,23 +135,19 @@ def photos_over_map(settings: MapFlightSettings, place: int, count: int) -> MapP
     return MapPlace(lat=widest.plane.lat, lon=widest.plane.lon, photos=photos, overhead=overhead)
 
 
-def _day_of(settings: MapFlightSettings, window: MapWindow) -> Day | None:
+def _day_of(
+    settings: MapFlightSettings, window: MapWindow, heights_HW: FloatMap | None
+) -> Day | None:
     """The day whose light is in the map, where it is to be replaced and heights show its sun."""
-    if settings.surface is None or not settings.relight:
+    if heights_HW is None or not settings.relight:
         return None
-    heights_HW = _heights(settings.surface, window)
     return find_day(window.pixels_HW3, heights_HW, window.metres_per_pixel)
 
 
 def _take(
-    settings: MapFlightSettings,
-    window: MapWindow,
-    day: Day | None,
-    pose: Pose,
-    rng: np.random.Generator,
+    settings: MapFlightSettings, world: World, pose: Pose, rng: np.random.Generator
 ) -> MapPhoto:
-    """One photo of a window's middle, on a day of its own; `day` is the map's."""
-    world = _world(window, _heights(settings.surface, window) if settings.surface else None, day)
+    """One photo of a world's middle, on a day of its own."""
     middle = len(world.height_HW) // 2
     ground_m = float(world.height_HW[middle, middle])
     raised = replace(pose, altitude_m=pose.altitude_m + ground_m)
@@ -239,8 +237,11 @@ def _window_around(
     return window
 
 
-def _heights(path: str, window: MapWindow) -> FloatMap:
-    """Metres (H, W) above the lowest ground of a window, by a surface model in any CRS."""
+def _heights(path: str | None, window: MapWindow) -> FloatMap | None:
+    """Metres (H, W) above the lowest ground of a window, by a surface model in any CRS; None
+    without one."""
+    if path is None:
+        return None
     plane, side = window.plane, len(window.pixels_HW3)
     heights_HW = read_heights(path, plane, side, window.metres_per_pixel)
     if np.isnan(heights_HW).mean() > MOST_WITHOUT_HEIGHT:
