@@ -50,10 +50,9 @@ does with tests/fuzz, and with tests and files that are marked."""
 STARTS = re.compile(r"\b(ray_session|ray_cluster|ray_address|prepared|adapted_region)\b")
 "In a file of tests: it needs the session's Ray, or the process that starts jobs."
 RAY_UNITS = {
-    "training and the service": tuple(
-        f"tests/{room}/" for room in ("jobs", "chaos", "service", "features", "core")
-    ),
-    "regions and benchmarks": ("tests/",),
+    "training": ("tests/jobs/",),
+    "regions and benchmarks": ("tests/region/", "tests/test_benchmarks.py"),
+    "other stages": ("tests/",),
 }
 """Beginnings of such files' names: of several test processes (pytest -n), one runs a unit to its
 end, with a Ray and a launcher of its own. Of the others, each file is a unit."""
@@ -190,6 +189,7 @@ def adapted_region(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) 
         patch.setattr(flights, "LEAST_PLACES", 24)
         patch.setattr(flights, "TESTED_PLACES", 2)
         patch.setattr(flights, "VIEWS", 1)
+        patch.setattr(flights, "CHECK_PX", 256)
         adapt(settings)
     return settings
 

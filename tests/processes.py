@@ -142,7 +142,9 @@ def _start_head(
         f"start --head --block --disable-usage-stats --node-ip-address=127.0.0.1 --port={port} "
         f"--dashboard-port={dashboard} --dashboard-agent-listen-port={agent} "
         f"--dashboard-agent-grpc-port={metrics} --runtime-env-agent-port={environments} "
-        f"--ray-client-server-port={client} --num-cpus={cpus} --temp-dir={scratch}"
+        f"--ray-client-server-port={client} --num-cpus={cpus} --temp-dir={scratch} "
+        # It follows the workers' output for drivers, and ours want none: see cluster.connect.
+        "--include-log-monitor=false"
     )
     folder = Path(sys.executable).parent
     # `python` of a submitted job is the first of its node's PATH.

@@ -19,6 +19,8 @@ PLACES_PER_MINUTE, LEAST_PLACES, MOST_PLACES = 20, 48, 400
 "To learn from: training sees each of them some twenty times."
 LEARN_PX = 256
 "Side of a photo to learn from: the encoder sees 128."
+CHECK_PX = 512
+"Side of a photo that the confidence is fitted on, or that tells what to expect."
 TESTED_PLACES = 60
 "Held-out places that choose between the encoder before and after training."
 
@@ -30,7 +32,7 @@ def plan_flights(
     fitted on, and photos that tell what to expect. Each has days of its own."""
     base = MapFlightSettings(
         mosaic=settings.mosaic, surface=settings.surface, out="", part="held-out",
-        photos=settings.checks, height=cameras.height, pitch=cameras.pitch,
+        photos=settings.checks, size=CHECK_PX, height=cameras.height, pitch=cameras.pitch,
         fov=cameras.fov, camera=cameras.camera,
     )  # fmt: skip
     pairs = replace(base, overhead_m=settings.tile_sides_m[0], size=LEARN_PX)

@@ -109,11 +109,16 @@ def stop_listener(messages: Queue, listener: threading.Thread) -> None:
 
 class _Trainer(TorchTrainer):
     """Ray Train's, without its handler of Ctrl-C: that one ends the process with code 1 from within
-    a call, and stays installed.
+    a call, and stays installed. And without Ray Data, which no run reads from: the process that
+    hands out its data sets takes seconds to start.
     """
 
     def _register_sigint_handler(self, controller: Any) -> None:
         pass
+
+    def _create_default_callbacks(self) -> list[Any]:
+        every: list[Any] = super()._create_default_callbacks()
+        return [one for one in every if type(one).__name__ != "DatasetsCallback"]
 
 
 def ray_worker(config: dict[str, Any]) -> None:

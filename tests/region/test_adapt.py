@@ -12,7 +12,7 @@ import pytest
 import rasterio
 
 from jobs.encoding.localizer import read_localizer, with_localizer
-from jobs.region import extend
+from jobs.region import extend, flights
 from jobs.region.adapt import PAGE, adapt
 from jobs.region.expect import located_outcomes
 from jobs.region.extend import extend_region
@@ -107,6 +107,7 @@ def test_extend_adds_a_map_once(
     more = replace(adapted_region, mosaic=sheets, surface=None, out=str(out), extend=True)
     fitted = list[Region]()
     monkeypatch.setattr(extend, "fit_confidence", lambda region, _: fitted.append(region))
+    monkeypatch.setattr(flights, "CHECK_PX", 256)
     some = partial(located_outcomes, most=1)
     monkeypatch.setattr(extend, "located_outcomes", lambda *given: some(*given[:3]))
     first = len(Index(str(out / "index")))
