@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 # Processes that share the tests, each with a Ray; 0: this one alone.
-TEST_PROCESSES ?= 3
+TEST_PROCESSES ?= 2
 # Compiled modules are kept: else each process of the tests compiles them anew.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -25,7 +25,7 @@ region: .venv/installed  ## a made-up town as a map, adapted to; photos of anoth
 	$(BIN)/pvda adapt --mosaic $(SAMPLE)/town/map.tif --surface $(SAMPLE)/town/surface.tif --out $(SAMPLE)/region --minutes 1 --checks 20
 	$(BIN)/pvda locate --index $(SAMPLE)/region/index --out $(SAMPLE)/where.geojson --page $(SAMPLE)/where.html $(SAMPLE)/flight/photos
 
-test: .venv/installed  ## all tests, shared by three processes
+test: .venv/installed  ## all tests, shared by two processes
 	$(BIN)/pytest -n $(TEST_PROCESSES) --no-loadscope-reorder
 
 test-fast: .venv/installed  ## the tests without Ray, training, fuzzing and browsers: a minute

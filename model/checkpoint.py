@@ -21,6 +21,7 @@ import torch
 from model.config import PVDAConfig
 from model.errors import CheckpointError, MissingLibrary
 from model.pvda import FeatureEncoder
+from model.shapes_alone import shapes_alone
 from model.weights import torch_files
 
 FORMAT = 2
@@ -208,7 +209,7 @@ def _zip_is_intact(data: bytes) -> tuple[bool, str]:
 def _check_fields(checkpoint: Checkpoint) -> None:
     """Raise ValueError where a field has another type, or the weights do not fit the network.
 
-    The network is laid out on the meta device, without memory: a config may claim any size.
+    The network is laid out without memory: a config may claim any size.
     """
     plain = (
         isinstance(checkpoint.recipe, dict)
@@ -223,7 +224,7 @@ def _check_fields(checkpoint: Checkpoint) -> None:
     )
     if not plain:
         raise ValueError("a field of another type")
-    with torch.device("meta"):
+    with shapes_alone():
         expected = {
             name: tensor.shape
             for name, tensor in FeatureEncoder(checkpoint.network).state_dict().items()

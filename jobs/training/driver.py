@@ -16,6 +16,7 @@ from jobs.training.settings import RECIPE, RUN_CONFIG_FILE, RunConfig, TrainSett
 from jobs.training.state import WorkerContext, open_stream
 from jobs.training.worker import train_worker
 from model.pvda import FeatureEncoder
+from model.shapes_alone import shapes_alone
 from model.weights.start import load_start
 from pipeline.core import storage
 from pipeline.core.errors import InputError
@@ -68,7 +69,7 @@ def check_input(settings: TrainSettings, run: RunConfig, resumes: bool) -> int:
     Raises InputError or CheckpointError.
     """
     try:
-        with torch.device("meta"):
+        with shapes_alone():
             FeatureEncoder(run.recipe.network)
     except ValueError as error:  # a width or an image size that this backbone cannot have
         raise InputError(str(error)) from None

@@ -7,11 +7,10 @@ for every method. What is compared is then the ingredients and not what each was
 
 from dataclasses import replace
 
-import torch
-
 from jobs.training.recipes.builtin import builtin
 from jobs.training.recipes.recipe import Recipe
 from model.backbones.base import build_backbone
+from model.shapes_alone import shapes_alone
 
 PART_DIM, DISCRIMINATOR_CHANNELS = 256, 256
 "A quarter to a half of the published widths, as the backbone's is [chosen]."
@@ -29,7 +28,7 @@ def at_equal_budget(recipe: Recipe, epochs: int, seed: int) -> Recipe:
         discriminator_channels=DISCRIMINATOR_CHANNELS,
     )
     if network.neck == "norm":  # it keeps the backbone's channels
-        with torch.device("meta"):
+        with shapes_alone():
             channels = build_backbone(network.backbone, network.width).channels
         network = replace(network, part_dim=channels)
     own = recipe.schedule

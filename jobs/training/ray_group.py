@@ -27,6 +27,9 @@ from pipeline.core import cluster
 from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.progress import Meter
 
+NOT_NEEDED = ("DatasetsCallback", "PlacementGroupCleanerCallback")
+"""Of Ray Train, each with a process that takes seconds to start: one hands out data sets of Ray
+Data, of which a run has none; one frees what a dead controller leaves, as the job's end does."""
 QUEUE_POLL_S = 1.0
 "Timeout of one poll of the queue that carries the workers' messages."
 
@@ -109,16 +112,15 @@ def stop_listener(messages: Queue, listener: threading.Thread) -> None:
 
 class _Trainer(TorchTrainer):
     """Ray Train's, without its handler of Ctrl-C: that one ends the process with code 1 from within
-    a call, and stays installed. And without Ray Data, which no run reads from: the process that
-    hands out its data sets takes seconds to start.
+    a call, and stays installed. And without NOT_NEEDED.
     """
 
     def _register_sigint_handler(self, controller: Any) -> None:
         pass
 
     def _create_default_callbacks(self) -> list[Any]:
-        every: list[Any] = super()._create_default_callbacks()
-        return [one for one in every if type(one).__name__ != "DatasetsCallback"]
+        every: list[Any] = super()._create_default_callbacks()  # type: ignore[misc]
+        return [one for one in every if type(one).__name__ not in NOT_NEEDED]
 
 
 def ray_worker(config: dict[str, Any]) -> None:

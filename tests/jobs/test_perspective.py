@@ -34,9 +34,7 @@ def test_training_sees_uav_images_from_above(tiny_shards: str) -> None:
     assert np.array_equal(taken[1].images_B3HW, above[1].images_B3HW)
 
 
-def test_table_records_the_perspective_of_training(
-    tiny_shards: str, tmp_path: Path, ray_cluster: None
-) -> None:
+def test_table_records_the_perspective_of_training(tiny_shards: str, tmp_path: Path) -> None:
     recipe = replace(tiny(1), perspective="overhead", name="pcl_style")
     path = train(settings(tiny_shards, tmp_path / "run", recipe, probe_epochs=1))
     data = Path(path).read_bytes()
@@ -46,7 +44,7 @@ def test_table_records_the_perspective_of_training(
         ("taken", EncoderSettings(perspective="as_taken")),
     ):
         embedding = EmbeddingSettings(
-            shards=tiny_shards, out=str(tmp_path / name), split=Split.QUERY, workers=1
+            shards=tiny_shards, out=str(tmp_path / name), split=Split.QUERY, workers=0
         )
         specs[name] = make_encoder_spec(data, path, embedding, given)
         embed_gallery(embedding, specs[name])
