@@ -1,5 +1,6 @@
 """Fixtures of several tests: one Ray for all, a tiny simulated data set, a small encoder."""
 
+import gc
 import os
 import re
 from collections.abc import Iterator
@@ -64,6 +65,13 @@ def unit_of(file: str) -> str:
     if not STARTS.search((ROOT / file).read_text()):
         return file
     return next(unit for unit, begins in RAY_UNITS.items() if file.startswith(begins))
+
+
+def pytest_collection_finish() -> None:
+    """What the modules made stays: no collection of garbage goes through it again."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

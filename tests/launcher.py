@@ -6,6 +6,7 @@ what `python FOLDER/NAME.py ARGUMENTS` would do.
 
 import ast
 import atexit
+import gc
 import importlib
 import json
 import os
@@ -157,6 +158,7 @@ def serve() -> dict[str, Any]:
     """
     for name in (*LIBRARIES, *job_modules()):
         importlib.import_module(name)
+    gc.freeze()  # else the children's collections of garbage copy the pages that they share
     buffer, is_open = b"", True
     while is_open:
         with suppress(ChildProcessError):

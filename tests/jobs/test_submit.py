@@ -69,14 +69,17 @@ def answer(submitted: "subprocess.Popen[str]") -> str:
 def test_submit_runs_tasks_training_and_actors(
     submit_environment: dict[str, str], tiny_shards: str, tmp_path: Path
 ) -> None:
-    """Tasks (they verify the shards) and Ray Train, then a pool of actors: all of them import the
+    """Tasks (they verify the shards) and Ray Train, beside a pool of actors: all of them import the
     project."""
     run, table = tmp_path / "run", tmp_path / "table"
     small = (
         "--workers 1 --epochs 1 --batch-size 2 --part-dim 16 --discriminator-channels 16 --verify"
     )
     begin = partial(submit, submit_environment)
-    answer(begin("train", "smoke", "--shards", tiny_shards, "--out", run, *small.split()))
-    network = ("--checkpoint", run / "last.pt", "--split", "query", "--view", "drone")
-    answer(begin("embed_gallery", "--shards", tiny_shards, "--out", table, *network))
+    training = begin("train", "smoke", "--shards", tiny_shards, "--out", run, *small.split())
+    images = ("--split", "query", "--view", "drone")
+    embedding = begin("embed_gallery", "--shards", tiny_shards, "--out", table, *images)
+    answer(training)
+    answer(embedding)
+    assert (run / "last.pt").exists()
     assert list(table.glob("*.parquet"))
