@@ -42,7 +42,7 @@ class Localizer:
     shards: str
     "Path from the index."
     surface: str | None = None
-    "Path of the surface model."
+    "Path of the surface model; from the index where it lies in the region."
 
 
 def write_localizer(index: str, localizer: Localizer) -> None:
@@ -51,7 +51,8 @@ def write_localizer(index: str, localizer: Localizer) -> None:
 
 
 def read_localizer(index: str) -> Localizer | None:
-    """What is noted beside an index; None where nothing is.
+    """What is noted beside an index, with its paths as this process names them; None where nothing
+    is.
 
     Raises InputError where the file is damaged.
     """
@@ -60,12 +61,13 @@ def read_localizer(index: str) -> Localizer | None:
         return None
     try:
         found = json_files.read_checksummed(path)
+        surface = found.get("surface")
         return Localizer(
-            checkpoint=str(found["checkpoint"]),
-            shards=str(found["shards"]),
-            surface=found.get("surface"),
+            checkpoint=storage.join(index, found["checkpoint"]),
+            shards=storage.join(index, found["shards"]),
+            surface=storage.join(index, surface) if surface and surface[0] == "." else surface,
         )
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{path} is damaged ({error}), expected what jobs/adapt.py writes; remove it and give "
             "--checkpoint and --shards"
@@ -82,9 +84,9 @@ def with_localizer(settings: S) -> S:
         return settings
     given = {"surface": settings.surface or usable_surface(settings.index, found.surface)}
     if settings.checkpoint == BUILTIN:
-        given["checkpoint"] = storage.join(settings.index, found.checkpoint)
+        given["checkpoint"] = found.checkpoint
     if settings.shards is None:
-        given["shards"] = storage.join(settings.index, found.shards)
+        given["shards"] = found.shards
     return replace(settings, **given)  # type: ignore[type-var]
 
 

@@ -8,6 +8,7 @@ ones are skipped.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from pathlib import Path
 
 from rich import box
 from rich.table import Table
@@ -151,7 +152,10 @@ def fit_confidence(region: Region, surface: str | None) -> None:
 
 
 def note_localizer(region: Region, surface: str | None) -> None:
-    """Say beside the index what belongs to it."""
+    """Say beside the index what belongs to it: what lies in the region, by its path from there, so
+    that the folder can be moved."""
+    if surface is not None and Path(surface).is_relative_to(region.out):
+        surface = f"../{Path(surface).relative_to(region.out)}"
     write_localizer(
         region.index,
         Localizer(checkpoint="../encoder.safetensors", shards="../tiles", surface=surface),

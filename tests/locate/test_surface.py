@@ -92,3 +92,16 @@ def test_localizer_names_the_surface_model_if_it_is_there(
     Path(surface).unlink()
     assert with_localizer(settings).surface is None
     assert "dsm.tif of" in capsys.readouterr().err
+
+
+def test_localizer_of_a_moved_region_finds_what_lies_in_it(surface: str, tmp_path: Path) -> None:
+    region = tmp_path / "region"
+    (region / "maps").mkdir(parents=True)
+    Path(surface).rename(region / "maps" / "dsm.tif")
+    noted = Localizer(checkpoint="../a", shards="../b", surface="../maps/dsm.tif")
+    write_localizer(str(region / "index"), noted)
+    index = region.rename(tmp_path / "moved") / "index"
+    settings = LocateSettings(photos=("a.jpg",), index=str(index), out="where.geojson")
+    found = with_localizer(settings).surface
+    assert found is not None
+    assert Path(found).resolve() == (tmp_path / "moved" / "maps" / "dsm.tif").resolve()
