@@ -50,15 +50,19 @@ def with_absolute_paths(settings: AdaptSettings) -> AdaptSettings:
     )
 
 
-def check_map(settings: AdaptSettings) -> None:
-    """Raises InputError where there is no map, or a folder that does not hold the sheets of one."""
+def check_map(settings: AdaptSettings) -> list[str]:
+    """The files of the map. Raises InputError where there is none, or a folder that does not hold
+    the sheets of one."""
     if not storage.exists(settings.mosaic):
         raise InputError(
             f"no map at {settings.mosaic}, expected a GeoTIFF, or a folder of its sheets; check "
             "--mosaic"
         )
-    if storage.is_folder(settings.mosaic):
-        describe_sheets([read_sheet(path) for path in find_sheets(settings.mosaic)])
+    if not storage.is_folder(settings.mosaic):
+        return [settings.mosaic]
+    files = find_sheets(settings.mosaic)
+    describe_sheets([read_sheet(path) for path in files])
+    return files
 
 
 def claim(region: Region, settings: AdaptSettings) -> None:
@@ -66,13 +70,10 @@ def claim(region: Region, settings: AdaptSettings) -> None:
 
     Raises InputError where it is of other settings or another map, or where there is no map.
     """
-    check_map(settings)
-    mosaic = settings.mosaic
-    files = find_sheets(mosaic) if storage.is_folder(mosaic) else [mosaic]
     about = (
         settings_record(settings, ("out", "extend", "camera"))
         | settings.lens
-        | {"mosaic_bytes": sum(map(storage.size, files))}
+        | {"mosaic_bytes": sum(map(storage.size, check_map(settings)))}
     )
     path = region.path("region.json")
     if not storage.exists(path):
