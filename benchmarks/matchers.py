@@ -210,6 +210,7 @@ def main() -> None:
     parser.add_argument("--tiles", required=True, help="shards of the map")
     parser.add_argument("--index", required=True, help="of these tiles")
     parser.add_argument("--flight", required=True, help="photos.csv of jobs/fly.py")
+    parser.add_argument("--surface", help="of the map: photos are matched with its heights")
     parser.add_argument("--photos", type=int, default=100)
     parser.add_argument("--features", nargs="+", default=["sift", "xfeat"])
     options = parser.parse_args()
@@ -222,7 +223,7 @@ def main() -> None:
     gallery = read_gallery_map(Index(options.index))
     for name in options.features:
         with features_by(name):
-            windows = open_map(options.tiles, gallery, options.index, whole_map=False)
+            windows = open_map(options.tiles, gallery, options.index, options.surface, False)
             if windows is None:
                 sys.exit(1)  # the message has been printed
             for posed in (True, False):
