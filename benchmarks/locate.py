@@ -49,6 +49,8 @@ from pipeline.locate.flight import apply_track, motion_for_gallery
 from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
 from pipeline.locate.locate import Answer, answers_from_hits
 from pipeline.locate.track import TRACK_CANDIDATES, TrackStart
+from pipeline.region.expectation import WITHIN_M as WITHIN
+from pipeline.region.expectation import Outcome, coverage, expect
 from pipeline.shards.pack import pack
 from pipeline.shards.settings import PackingSettings
 from pipeline.simulation.settings import SimulationSettings
@@ -56,6 +58,8 @@ from pipeline.simulation.simulate import simulate
 from pipeline.sources.university1652 import University1652
 
 SPEED_M_S, MAX_SPEED_M_S, WITHIN_M = 15.0, 25.0, 25.0
+PRECISION = 0.95
+"Of answers: the share of photos that is answered so is their coverage."
 START_M = 500.0
 "Radius of a track's rough start."
 
@@ -111,8 +115,8 @@ def group_photos(photos: LabelledImages, views: int) -> LabelledImages:
     )
 
 
-def is_within(answers: list[Answer], examples: list[CalibrationExample]) -> Doubles:
-    """1 for answers, known or not, within the tolerance, else 0."""
+def errors_of(answers: list[Answer], examples: list[CalibrationExample]) -> Doubles:
+    """Metres from each answer's position, known or not, to the photo's; infinite without one."""
     at_Q2 = np.array(
         [
             (answer.position.lat, answer.position.lon) if answer.position else (np.nan, np.nan)
@@ -120,7 +124,27 @@ def is_within(answers: list[Answer], examples: list[CalibrationExample]) -> Doub
         ]
     )
     true_Q2 = np.array([(example.lat, example.lon) for example in examples])
-    return np.asarray(haversine_m(at_Q2, true_Q2) <= WITHIN_M, np.float64)
+    return np.nan_to_num(haversine_m(at_Q2, true_Q2), nan=np.inf)
+
+
+def print_metres(name: str, answers: list[Answer], errors_Q: Doubles) -> None:
+    """Print how far off the answers are that are given; tiles tell no heading."""
+    outcomes = [
+        Outcome(
+            name=name, error_m=error_m, known=answer.known, probability=answer.probability,
+            within_m=WITHIN_M, refined=False, posed=False, height_m=0.0, pitch_deg=0.0,
+        )
+        for answer, error_m in zip(answers, errors_Q.tolist(), strict=True)
+    ]  # fmt: skip
+    found, given_Q = expect(name, outcomes), np.array([answer.known for answer in answers])
+    shares = (f"{at.value:.1%} within {m:g} m" for at, m in zip(found.within, WITHIN, strict=True))
+    far_m = np.percentile(errors_Q[given_Q], 90) if given_Q.any() else np.nan
+    print(
+        f"{name}: answered {found.answered.value:.1%}; {', '.join(shares)}; median "
+        f"{found.median_m:.1f} m, nine of ten within {far_m:.1f} m; more than {WITHIN[-1]:g} m off "
+        f"{found.wrong.value:.1%} of the answers; {coverage(outcomes, PRECISION, WITHIN_M):.1%} "
+        f"answered within {WITHIN_M:g} m with a precision of {PRECISION:.0%}"
+    )
 
 
 def print_calibration(
@@ -134,13 +158,15 @@ def print_calibration(
         answers_from_hits([getattr(example, side) for example in examples], 5, calibration)
         for side in ("inside", "outside")
     )
-    right_Q = is_within(inside, examples)
+    errors_Q = errors_of(inside, examples)
+    right_Q = (errors_Q <= WITHIN_M).astype(np.float64)
     probability_N = np.array([one.probability for one in [*inside, *outside]], np.float64)
     right_N = np.concatenate([right_Q, 0 * right_Q])
     bins = reliability_bins(probability_N, right_N, np.ones(len(probability_N)))
     known_Q = np.array([answer.known for answer in inside])
     unknown = np.mean([not answer.known for answer in outside])
     print(f"{name}: within {WITHIN_M:.0f} m {right_Q.mean():.1%} of {len(examples)}")
+    print_metres(name, inside, errors_Q)
     print(f"{name}: expected calibration error {expected_calibration_error(bins):.3f}")
     print(f"{name}: from outside the gallery, answered unknown {unknown:.1%}")
     print(f"{name}: right answers lost to unknown {1 - mean_of(known_Q[right_Q > 0]):.1%}")
@@ -220,7 +246,7 @@ def print_tracks(
             tracks += 2
             for name, answers in found.items():
                 known = [answer.known for answer in answers]
-                right = (is_within(answers, stops) > 0).tolist()
+                right = (errors_of(answers, stops) <= WITHIN_M).tolist()
                 rows[name] += zip(outside_T.tolist(), known, right, strict=True)
     for name, row in rows.items():
         outside_N, known_N, right_N = np.array(row).T

@@ -177,6 +177,7 @@ def test_every_script_has_a_case() -> None:
 def test_locate_compares_tracks_with_single_photos(trained: tuple[Path, str]) -> None:
     folder, output = trained
     assert re.search(r"ms per track of 3 photos, [\d.]+ x the time of their single", output), output
+    assert re.search(r"1 photo: answered .* within 1 m, .* with a precision of 95%", output), output
     assert (folder / "reliability.svg").stat().st_size > 0
 
 
