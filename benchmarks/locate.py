@@ -58,10 +58,8 @@ from pipeline.simulation.simulate import simulate
 from pipeline.sources.university1652 import University1652
 
 SPEED_M_S, MAX_SPEED_M_S, WITHIN_M = 15.0, 25.0, 25.0
-PRECISION = 0.95
-"Of answers: the share of photos that is answered so is their coverage."
-START_M = 500.0
-"Radius of a track's rough start."
+START_M, PRECISION = 500.0, 0.95
+"Radius of a track's rough start; of answers, whose share of the photos is then their coverage."
 
 
 def prepare(args: argparse.Namespace) -> None:
@@ -117,12 +115,8 @@ def group_photos(photos: LabelledImages, views: int) -> LabelledImages:
 
 def errors_of(answers: list[Answer], examples: list[CalibrationExample]) -> Doubles:
     """Metres from each answer's position, known or not, to the photo's; infinite without one."""
-    at_Q2 = np.array(
-        [
-            (answer.position.lat, answer.position.lon) if answer.position else (np.nan, np.nan)
-            for answer in answers
-        ]
-    )
+    places = [answer.position for answer in answers]
+    at_Q2 = np.array([(at.lat, at.lon) if at else (np.nan, np.nan) for at in places])
     true_Q2 = np.array([(example.lat, example.lon) for example in examples])
     return np.nan_to_num(haversine_m(at_Q2, true_Q2), nan=np.inf)
 
