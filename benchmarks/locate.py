@@ -49,8 +49,8 @@ from pipeline.locate.flight import apply_track, motion_for_gallery
 from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
 from pipeline.locate.locate import Answer, answers_from_hits
 from pipeline.locate.track import TRACK_CANDIDATES, TrackStart
+from pipeline.region.expectation import PRECISION, Outcome, coverage, expect
 from pipeline.region.expectation import WITHIN_M as WITHIN
-from pipeline.region.expectation import Outcome, coverage, expect
 from pipeline.shards.pack import pack
 from pipeline.shards.settings import PackingSettings
 from pipeline.simulation.settings import SimulationSettings
@@ -58,8 +58,8 @@ from pipeline.simulation.simulate import simulate
 from pipeline.sources.university1652 import University1652
 
 SPEED_M_S, MAX_SPEED_M_S, WITHIN_M = 15.0, 25.0, 25.0
-START_M, PRECISION = 500.0, 0.95
-"Radius of a track's rough start; of answers, whose share of the photos is then their coverage."
+START_M = 500.0
+"Radius of a track's rough start."
 
 
 def prepare(args: argparse.Namespace) -> None:

@@ -39,13 +39,18 @@ from pipeline.core import cluster
 from pipeline.core.geo import haversine_m
 from pipeline.core.records import GeoTag
 from pipeline.locate import refined
-from pipeline.region.expectation import WITHIN_M, Expectation, Outcome, coverage, expect
+from pipeline.region.expectation import (
+    PRECISION,
+    WITHIN_M,
+    Expectation,
+    Outcome,
+    coverage,
+    expect,
+)
 from pipeline.simulation.over_map.fly import TABLE, fly
 from pipeline.simulation.over_map.settings import MapFlightSettings, TownMapSettings
 from pipeline.simulation.over_map.town_map import ANOTHER_DAY, MAP, SURFACE, make_town_map
 
-PRECISION = 0.95
-"Of answers: the share of photos that is answered so is their coverage."
 Truth = dict[str, GeoTag]
 "Where and how photos were taken, by their paths."
 

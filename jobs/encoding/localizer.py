@@ -6,6 +6,7 @@ surface model of the index, where flags name none. `jobs/adapt.py` writes the fi
 """
 
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Protocol, TypeVar
 
 from model.weights.builtin import BUILTIN
@@ -35,19 +36,23 @@ S = TypeVar("S", bound=SearchSettings)
 
 @dataclass(frozen=True, kw_only=True)
 class Localizer:
-    """What belongs to an index."""
+    """What belongs to an index: paths. In the file, those of what lies in the folder around the
+    index are relative to it, so that this folder can be moved."""
 
     checkpoint: str
-    "Path from the index."
     shards: str
-    "Path from the index."
     surface: str | None = None
-    "Path of the surface model; from the index where it lies in the region."
 
 
 def write_localizer(index: str, localizer: Localizer) -> None:
     """Note beside an index what belongs to it."""
-    json_files.write_checksummed(storage.join(index, LOCALIZER_FILE), asdict(localizer))
+    region = Path(index).parent
+    relative = {
+        name: f"../{Path(path).relative_to(region)}"
+        for name, path in asdict(localizer).items()
+        if path and Path(path).is_relative_to(region)
+    }
+    json_files.write_checksummed(storage.join(index, LOCALIZER_FILE), asdict(localizer) | relative)
 
 
 def read_localizer(index: str) -> Localizer | None:
@@ -63,15 +68,19 @@ def read_localizer(index: str) -> Localizer | None:
         found = json_files.read_checksummed(path)
         surface = found.get("surface")
         return Localizer(
-            checkpoint=storage.join(index, found["checkpoint"]),
-            shards=storage.join(index, found["shards"]),
-            surface=storage.join(index, surface) if surface and surface[0] == "." else surface,
+            checkpoint=_path_from(index, found["checkpoint"]),
+            shards=_path_from(index, found["shards"]),
+            surface=surface and _path_from(index, surface),
         )
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, AttributeError) as error:
         raise InputError(
             f"{path} is damaged ({error}), expected what jobs/adapt.py writes; remove it and give "
             "--checkpoint and --shards"
         ) from None
+
+
+def _path_from(index: str, path: str) -> str:
+    return storage.absolute(storage.join(index, path)) if path.startswith("../") else path
 
 
 def with_localizer(settings: S) -> S:

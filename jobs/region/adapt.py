@@ -8,7 +8,6 @@ ones are skipped.
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 from rich import box
 from rich.table import Table
@@ -152,14 +151,9 @@ def fit_confidence(region: Region, surface: str | None) -> None:
 
 
 def note_localizer(region: Region, surface: str | None) -> None:
-    """Say beside the index what belongs to it: what lies in the region, by its path from there, so
-    that the folder can be moved."""
-    if surface is not None and Path(surface).is_relative_to(region.out):
-        surface = f"../{Path(surface).relative_to(region.out)}"
-    write_localizer(
-        region.index,
-        Localizer(checkpoint="../encoder.safetensors", shards="../tiles", surface=surface),
-    )
+    """Say beside the index what belongs to it."""
+    belongs = Localizer(checkpoint=region.encoder, shards=region.tiles, surface=surface)
+    write_localizer(region.index, belongs)
 
 
 def locate_command(region: Region) -> str:

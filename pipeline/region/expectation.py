@@ -14,6 +14,8 @@ import numpy as np
 
 WITHIN_M = (1.0, 5.0, 25.0)
 "Distances that shares are stated for, metres."
+PRECISION = 0.95
+"Of answers: the share of photos that is answered so is their coverage."
 WRONG_M = 25.0
 "An answer that is farther off is wrong."
 NORMAL_95 = 1.959964

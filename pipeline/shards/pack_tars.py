@@ -79,8 +79,8 @@ def pack_plans(
             for plan in todo
         )
         # One tar is one task: nothing runs beside it.
-        workers = cluster.workers_for(settings.workers, images * IMAGE_S)
-        workers = 0 if settings.workers is None and len(todo) <= 1 else workers
+        alone = settings.workers is None and len(todo) <= 1
+        workers = 0 if alone else cluster.workers_for(settings.workers, images * IMAGE_S)
         for done in write_shards(arguments, workers):
             packed[done.shard.name] = done
             refused += done.rejected
