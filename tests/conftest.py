@@ -26,6 +26,9 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("RAY_TRAIN_HEALTH_CHECK_INTERVAL_S", "0.5")
 # A process of its own per training, for nodes that a cloud takes back.
 os.environ.setdefault("RAY_TRAIN_ENABLE_PREEMPTION_WATCHER", "0")
+# Its agents look at every process, for a dashboard that nobody opens, and after their parent.
+os.environ.setdefault("REPORTER_UPDATE_INTERVAL_MS", "60000")
+os.environ.setdefault("RAY_enable_pipe_based_agent_to_parent_health_check", "1")
 # Never a cluster that someone, or another test, runs on this machine.
 os.environ["RAY_ADDRESS"] = "local"
 # Waiting threads yield their core: on a busy machine, a spinning thread takes it from the thread

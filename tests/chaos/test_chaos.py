@@ -27,13 +27,13 @@ FOUND = {
 "(stage, fault) that once did harm -> seed."
 SPREAD = {
     "simulate": ("driver killed",),
-    "pack": ("disk full", "input truncated"),
-    "embed": ("worker killed",),
+    "pack": ("disk full", "input truncated", "worker killed"),
     "index": ("read fails",),
 }
 """Stage -> other faults, so that each stage and each kind of fault comes up once at least. The long
 campaign has them all for every stage; workers of Ray Train are killed in
-tests/jobs/test_checkpoints.py, jobs are interrupted in tests/jobs/test_signals.py."""
+tests/jobs/test_checkpoints.py, those that embed in tests/features/test_embed_faults.py, jobs are
+interrupted in tests/jobs/test_signals.py."""
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 Where actors are no part of the matter, this process embeds, as in the undisturbed run.
 
-Random kills, of workers and of the stage, are in tests/chaos.
+Random kills, of workers and of the stage, are in the long campaign of tests/chaos (`make chaos`).
 """
 
 import errno
