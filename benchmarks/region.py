@@ -7,7 +7,8 @@ The map is a mosaic of overhead images, or a town with its surface model. Photos
 (over the town: of another day's sun, season and haze, with relief) are then located with the
 camera's tags (heading wrong by 3 degrees, pitch by 1, height by 3 %) and without: before (the
 built-in encoder, tiles alone, then matched, without any fitting) and after `adapt`; matched around
-the first candidate alone; with the ground taken for flat; and by plain SIFT over the whole map.
+the first candidate alone; with the ground taken for flat; by SIFT without dense features; and by
+plain SIFT over the whole map.
 Beside it: what `adapt` promised, photos of another map, and how often matching makes a right tile's
 answer worse.
 """
@@ -51,6 +52,7 @@ from pipeline.simulation.over_map.fly import TABLE, fly
 from pipeline.simulation.over_map.settings import MapFlightSettings, TownMapSettings
 from pipeline.simulation.over_map.town_map import ANOTHER_DAY, MAP, SURFACE, make_town_map
 
+TAGS = ("with tags", "without")
 Truth = dict[str, GeoTag]
 "Where and how photos were taken, by their paths."
 
@@ -178,14 +180,18 @@ def print_row(name: str, way: Way, baseline: float) -> float:
 
 def print_coverage(seen: dict[bool, list[Outcome]]) -> None:
     """The share of photos that can be answered with a precision of PRECISION."""
-    for posed, way in ((True, "with tags"), (False, "without")):
-        shares = [f"{coverage(seen[posed], PRECISION, m):.1%} within {m:g} m" for m in WITHIN_M]
-        print(f"answered with a precision of {PRECISION:.0%}, {way}: {', '.join(shares)}")
+    for posed, outcomes in seen.items():
+        shares = [f"{coverage(outcomes, PRECISION, m):.1%} within {m:g} m" for m in WITHIN_M]
+        print(
+            f"answered with a precision of {PRECISION:.0%}, {TAGS[not posed]}: {', '.join(shares)}"
+        )
 
 
 def print_promises(promised: Sequence[Expectation], seen: dict[bool, list[Outcome]]) -> None:
     """How near `what to expect` came to what was seen."""
     for way, posed in zip(promised[:2], (True, False), strict=True):
+        if posed not in seen:
+            continue
         found = expect("", seen[posed])
         for at, metres in ((1, 5), (2, 25)):
             told, kept = way.within[at].value, found.within[at].value
@@ -207,6 +213,7 @@ def main() -> None:
     parser.add_argument("--pitch", type=float, nargs=2, default=(-90.0, -45.0), help="degrees")
     parser.add_argument("--tile-m", type=float, nargs="+", default=[55.0], help="of each level")
     parser.add_argument("--only-after", action="store_true", help="leave out what was before adapt")
+    parser.add_argument("--tags", nargs="+", default=list(TAGS), choices=TAGS)
     options = parser.parse_args()
     out: Path = options.out
     cluster.connect()
@@ -239,7 +246,8 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     baseline, seen, by_tiles = 0.0, {}, {}
-    for posed, way in ((True, "with tags"), (False, "without")):
+    for way in options.tags:
+        posed = way == TAGS[0]
         ways = {
             "before, tiles": before,
             "before, matched by rule": replace(before, match=True),
@@ -259,6 +267,9 @@ def main() -> None:
         with windows_per_photo(1):
             first = locate_all(replace(after, match=True, pose=posed), truth)
         print_row(f"after, around the first candidate alone, {way}", first, baseline)
+        if posed:
+            alone = locate_all(replace(after, match=True, dense=False), truth)
+            print_row(f"after, without dense features, {way}", alone, baseline)
         if surface is not None:
             with flat_ground():
                 flat = locate_all(replace(after, match=True, pose=posed), truth)
@@ -272,7 +283,9 @@ def main() -> None:
     ]  # fmt: skip
     worse = sum(refined.error_m > max(tile.error_m, 5) for tile, refined in pairs)
     print(f"right tiles made worse by matching (and more than 5 m off): {worse} of {len(pairs)}")
-    for posed, way in ((True, "with tags"), (False, "without")):
+    for posed, way in zip((True, False), TAGS, strict=True):
+        if posed not in seen:
+            continue
         settings = replace(after, photos=tuple(strangers), match=True, pose=posed)
         given = sum(one.known for one in locate_all(settings, strangers).outcomes)
         print(f"photos of another map, {way}: {given} of {len(strangers)} answered")

@@ -35,6 +35,12 @@ CASES: dict[str, tuple[str, str]] = {
         "--rows 512 --depth 18 --repeats 1",
         r"a checkpoint loaded: [\d.]+ x the time without checks",
     ),
+    "dense_features": (
+        "--region {adapted}/region/tiles {adapted}/region/index "
+        "{adapted}/region/flights/check/photos.csv {adapted}/map/surface.tif --photos 2 --steps 1 "
+        "--out {out}/head.safetensors",
+        r"nearest is right: [\d.]+% by random weights, [\d.]+% trained, [\d.]+ x",
+    ),
     "embed": (
         f"{ONE_ROUND} --encoders folded --probes 2 --calibration 2 --batch-size 2",
         r"folded: [\d.]+ x the plain encoder's images per second",
@@ -82,8 +88,8 @@ CASES: dict[str, tuple[str, str]] = {
     ),
     "matchers": (
         "--tiles {adapted}/region/tiles --index {adapted}/region/index "
-        "--flight {adapted}/region/flights/check/photos.csv --photos 1 --features sift",
-        r"\| sift \| yes \| [\d.]+% .* 1.00 x \|(.|\n)*\| sift \| no \| .* [\d.]+ x \|"
+        "--flight {adapted}/region/flights/check/photos.csv --photos 1 --features sift dense",
+        r"\| sift \| yes \| [\d.]+% .* 1.00 x \|(.|\n)*\| dense \| yes \| .* [\d.]+ x \|"
         r"(.|\n)*whole map, no tags: [\d.]+%",
     ),
     "own_map": (

@@ -100,7 +100,9 @@ def _open_map(settings: LocateSettings, gallery: GalleryMap) -> MapWindows | Non
     if settings.shards is None or settings.together or not settings.match:
         return None
     whole_map = settings.whole_map and (settings.near is None or settings.track)
-    return open_map(settings.shards, gallery, settings.index, settings.surface, whole_map)
+    return open_map(
+        settings.shards, gallery, settings.index, settings.surface, whole_map, settings.dense
+    )
 
 
 def _view_maker(

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from rasterio.errors import RasterioError
 
+from jobs.encoding.dense_features import BuiltinDenseFinder
 from jobs.encoding.photo_encoder import decode_photo
 from jobs.encoding.queries import Query, ViewMaker, read_photo
 from pipeline.camera.framing import PhotoViews, views_of_photo
@@ -55,16 +56,20 @@ def open_map(
     index: str,
     surface: str | None = None,
     whole_map: bool = True,
+    dense: bool = True,
 ) -> MapWindows | None:
-    """The windows of a map, with the heights of a surface model, and with `whole_map` a search for
-    places by all of its features, which are kept beside the index. None, with a message, where its
-    tiles do not know their corners: these are in the record tables of jobs/make_shards.py, which
-    shards of others lack. Raises InputError for a surface model that cannot be read."""
+    """The windows of a map, with the heights of a surface model, with `whole_map` a search for
+    places by all of its features, which are kept beside the index, and with `dense` those features
+    too. None, with a message, where its tiles do not know their corners: these are in the record
+    tables of jobs/make_shards.py, which shards of others lack. Raises InputError for a surface
+    model that cannot be read."""
     reader = _open_tiles(shards)
     windows = None if reader is None else _windows_of(reader, gallery, surface)
     if windows is not None and whole_map:
         kept = _feature_file(shards, gallery, index)
         windows.search = MapSearch(kept.read, partial(kept.make, windows))
+    if windows is not None and dense:
+        windows.dense = BuiltinDenseFinder()
     if windows is None:
         console.print(
             f"the images of {shards} do not say which ground their corners show: photos are not "
@@ -74,7 +79,7 @@ def open_map(
 
 
 def open_photo_map(
-    shards: str, match: bool, index: str, surface: str | None, gallery: GalleryMap
+    shards: str, match: bool, dense: bool, index: str, surface: str | None, gallery: GalleryMap
 ) -> PhotoMap | None:
     """The pixels of a map for the service; None for shards of others. Places are searched by
     features of the whole map where they are kept beside the index: no request waits for them.
@@ -85,6 +90,8 @@ def open_photo_map(
     windows = _windows_of(reader, gallery, surface)
     if windows is not None and match:
         windows.search = MapSearch(_feature_file(shards, gallery, index).read, lambda: None)
+    if windows is not None and dense:
+        windows.dense = BuiltinDenseFinder()
     return PhotoMap(gallery, reader.fetch, windows, match)
 
 

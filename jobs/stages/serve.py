@@ -41,13 +41,18 @@ def load_predictor(
     shards: str | None,
     threads: int,
     match: bool = True,
+    dense: bool = True,
     surface: str | None = None,
 ) -> Predictor:
     """Load the encoder, the index and the map's pixels; called on each replica. Raises
     InputError."""
     torch.set_num_threads(threads)  # FAISS takes OMP_NUM_THREADS, which Ray sets to the cores
     cv2.setNumThreads(threads)
-    open_map = no_map if shards is None else partial(open_photo_map, shards, match, index, surface)
+    open_map = (
+        no_map
+        if shards is None
+        else (partial(open_photo_map, shards, match, dense, index, surface))
+    )
 
     def encoder_for(metadata: IndexMetadata) -> PhotoEncoder:
         try:
@@ -83,7 +88,14 @@ async def listen(settings: ServeSettings, token: str | None) -> None:
     checkpoint = absolute_checkpoint(settings.checkpoint)
     index = storage.absolute(settings.index)
     make_predictor = partial(
-        load_predictor, checkpoint, index, shards, placement.cpus, settings.match, surface
+        load_predictor,
+        checkpoint,
+        index,
+        shards,
+        placement.cpus,
+        settings.match,
+        settings.dense,
+        surface,
     )
     replicas = Replicas(f"pvda-{os.getpid()}", placement, make_predictor)
     runner = Service(settings, replicas, token, concurrency=placement.workers).runner()

@@ -122,6 +122,9 @@ class LocateSettings(FlightSettings, PoseSettings):
     """Search for a photo that no candidate's map matches by the features of the whole map too, up
     to some 12 square kilometres: made once, half a minute a square kilometre, and kept beside the
     index. Not within --near."""
+    dense: bool = True
+    """Match a photo that SIFT does not place by the built-in encoder's dense features too, where
+    tags tell its pose: some 0.5 s a window."""
 
     def __post_init__(self) -> None:
         FlightSettings.__post_init__(self)
@@ -182,6 +185,9 @@ class ServeSettings(ServiceSettings):
     match: bool = True
     """Match each photo with the map's pixels around its candidates, as jobs/locate.py does. Takes
     --shards whose tiles know their corners; --no-match answers with tiles."""
+    dense: bool = True
+    """Match a photo that SIFT does not place by the built-in encoder's dense features too, where
+    tags tell its pose: some 0.5 s a window."""
     surface: Annotated[str | None, SURFACE_FLAG] = None
     """A surface model of the map's ground (a GeoTIFF of heights): roofs and slopes are then placed
     where they stand. By default the one that jobs/adapt.py was given."""

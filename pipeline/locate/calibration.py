@@ -20,7 +20,7 @@ from pipeline.locate.consensus import Consensus
 from pipeline.matching.gate import GATE_FEATURES, Gate, gate_features
 from pipeline.matching.refine import Refinement
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 CALIBRATION_FILE = "calibration.json"
 FEATURE_NAMES = ("score", "margin", "depth", "share")
 

@@ -27,6 +27,7 @@ PROPERTIES = (
     "how",
     "heading_deg",
     "inliers",
+    "dense",
     "camera_lat",
     "camera_lon",
     "camera_height_m",
@@ -139,7 +140,7 @@ def _row(one: LocatedPhoto) -> dict[str, Any]:
         if position := answer.position:
             row |= {name: getattr(position, name) for name in ("lat", "lon", "radius_m", "how")}
         if found := answer.refinement:
-            row |= {"heading_deg": found.heading_deg, "inliers": found.inliers}
+            row |= {name: getattr(found, name) for name in ("heading_deg", "inliers", "dense")}
             if found.camera:
                 row |= dict(zip(CAMERA, found.camera, strict=True))
         if answer.candidates:

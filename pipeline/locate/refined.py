@@ -4,21 +4,23 @@ In: an answer with its candidates, and a photo's features with what is known of 
 answer at the place that matching finds, where that holds; else as it was.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from pipeline.core.geo import Circle
 from pipeline.locate.calibration import Calibration, confidence_features
 from pipeline.locate.locate import Answer, Position, consensus_of, consensus_scores
-from pipeline.matching.gate import holds
+from pipeline.matching.gate import beyond_chance, holds
 from pipeline.matching.map_windows import MapWindows
 from pipeline.matching.photo_features import MatchablePhoto
-from pipeline.matching.refine import Refinement, refine
+from pipeline.matching.refine import Refinement, refine, refine_densely
 
 MOST_WINDOWS = 3
 "Windows that a photo is matched with: around the answer, then around other candidates."
 VOTED_WINDOWS = 2
 "Where none of them holds: around places that features of the whole map vote for."
+DENSE_WINDOWS = 2
+"Where SIFT holds in none of these: around the answer and its candidates, by dense features."
 
 
 def refine_answer(
@@ -29,18 +31,35 @@ def refine_answer(
 ) -> Refinement | None:
     """The photo matched with the map around an answer and around its other candidates; where that
     does not hold by the rule for all maps, around the places that the features of the whole map
-    vote for, if these are searched (not within `away_from`). None where no view holds that a camera
-    can have."""
+    vote for, if these are searched (not within `away_from`); where that does not either, by dense
+    features around the answer and its candidates, if the map has them. None where no view holds
+    that a camera can have."""
     near = windows.around(_positions(answer), MOST_WINDOWS, photo.reach_m)
     found = refine(photo, near)
-    if windows.search is None or not answer.candidates or (found is not None and holds(found)):
+    if windows.search is not None and answer.candidates and not (found and holds(found)):
+        key = answer.candidates[0].key
+        voted = windows.search.places(photo, VOTED_WINDOWS, away_from)
+        places = [(lat, lon, key) for lat, lon in voted]
+        other = refine(photo, windows.around(places, VOTED_WINDOWS, photo.reach_m))
+        both = [one for one in (found, other) if one is not None]
+        found = max(both, key=lambda one: one.inliers, default=None)
+    return _or_densely(found, photo, windows, _positions(answer), DENSE_WINDOWS)
+
+
+def _or_densely(
+    found: Refinement | None,
+    photo: MatchablePhoto,
+    windows: MapWindows,
+    positions: Iterable[tuple[float, float, str]],
+    most: int,
+) -> Refinement | None:
+    """What SIFT found, if it holds by the rule for all maps; else what dense features find, if that
+    is more than chance."""
+    if windows.dense is None or photo.promised_33 is None or (found and holds(found)):
         return found
-    key = answer.candidates[0].key
-    voted = windows.search.places(photo, VOTED_WINDOWS, away_from)
-    places = [(lat, lon, key) for lat, lon in voted]
-    other = refine(photo, windows.around(places, VOTED_WINDOWS, photo.reach_m))
-    both = [one for one in (found, other) if one is not None]
-    return max(both, key=lambda one: one.inliers, default=None)
+    near = windows.around(positions, most, photo.reach_m, "dense")
+    dense = refine_densely(photo, near, windows.dense)
+    return dense if dense and beyond_chance(dense) else found
 
 
 def refine_at(answer: Answer, photo: MatchablePhoto, windows: MapWindows) -> Refinement | None:
@@ -51,7 +70,9 @@ def refine_at(answer: Answer, photo: MatchablePhoto, windows: MapWindows) -> Ref
     at = answer.position.lat, answer.position.lon
     keys = [hit.key for hit in answer.candidates if (hit.lat, hit.lon) == at]
     key = next(iter(keys), answer.candidates[0].key)
-    return refine(photo, windows.around([(*at, key)], 1, photo.reach_m))
+    place = [(*at, key)]
+    found = refine(photo, windows.around(place, 1, photo.reach_m))
+    return _or_densely(found, photo, windows, place, 1)
 
 
 def _positions(answer: Answer) -> Iterator[tuple[float, float, str]]:

@@ -15,7 +15,7 @@ from pipeline.confidence.cross_validation import (
 )
 from pipeline.confidence.logistic import fit_logistic
 from pipeline.core.arrays import Doubles, Mask, Strings
-from pipeline.matching.gate import CHANCE_INLIERS, Gate, gate_features
+from pipeline.matching.gate import Gate, beyond_chance, gate_features
 from pipeline.matching.refine import Refinement
 
 HELD = 0.95
@@ -74,7 +74,7 @@ def fit_gate(examples: GateExamples, within_m: float, place_m: float) -> FittedG
     place_p_N = cross_validated_probabilities(x_NF, yes_N, weight_N, locations_N)
     # Those of few inliers are never used. The only wrong one is sure of itself in cross-validation,
     # whose models are fitted without it, and no threshold would be high enough.
-    enough_N = np.array([one.inliers > CHANCE_INLIERS for one in examples.refinements])
+    enough_N = np.array([beyond_chance(one) for one in examples.refinements])
     threshold = wrong_share_threshold(
         place_p_N[enough_N], yes_N[enough_N], weight_N[enough_N], MOST_WRONG
     )

@@ -19,7 +19,12 @@ LEAST_INLIERS, MOST_ELLIPSE_M = 12, 5.0
 CHANCE_INLIERS = 8
 """Never enough, whatever a model says. Of 240 windows that did not show a photo's ground none gave
 a view that a camera can have; one wrong one of eight inliers was seen (docs/decisions.md)."""
-GATE_FEATURES = ("log inliers", "inlier share", "log ellipse", "log residual", "tilt", "promised")
+LEAST_DENSE_INLIERS, CHANCE_DENSE_INLIERS = 80, 40
+"""Of dense features instead, whose points lie close: of 60 windows that did not show a photo's
+ground none gave more than 28, of 110 by an earlier head none more than 40."""
+GATE_FEATURES = (
+    "log inliers", "inlier share", "log ellipse", "log residual", "tilt", "promised", "dense",
+)  # fmt: skip
 SMALLEST_M = 0.01
 "Ellipses and residuals below a centimetre are taken for one."
 
@@ -39,8 +44,15 @@ def gate_features(refinement: Refinement) -> Doubles:
             math.log(max(refinement.residual_m, SMALLEST_M)),
             math.log(side_4.max() / max(side_4.min(), 1e-12)),
             float(refinement.promised),
+            float(refinement.dense),
         ]
     )
+
+
+def beyond_chance(refinement: Refinement) -> bool:
+    """Whether it has more inliers than wrong views have."""
+    most = CHANCE_DENSE_INLIERS if refinement.dense else CHANCE_INLIERS
+    return refinement.inliers > most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +74,7 @@ class Gate:
     def admits(self, refinement: Refinement) -> bool:
         """Whether a refinement is used."""
         [place] = self.place_model.probabilities(gate_features(refinement)[None])
-        return bool(refinement.inliers > CHANCE_INLIERS and place >= self.threshold)
+        return beyond_chance(refinement) and bool(place >= self.threshold)
 
     def probability(self, refinement: Refinement) -> float:
         """Probability that the position of a refinement that is used is right."""
@@ -77,4 +89,5 @@ def holds(refinement: Refinement, gate: Gate | None = None) -> bool:
     """Whether a refinement is used: by its gate, else by the rule."""
     if gate is not None:
         return gate.admits(refinement)
-    return refinement.inliers >= LEAST_INLIERS and refinement.ellipse.major_m <= MOST_ELLIPSE_M
+    least = LEAST_DENSE_INLIERS if refinement.dense else LEAST_INLIERS
+    return refinement.inliers >= least and refinement.ellipse.major_m <= MOST_ELLIPSE_M

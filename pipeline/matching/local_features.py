@@ -2,11 +2,14 @@
 
 In: images. Out: points with descriptors, and pairs of them. SIFT is OpenCV's [Lowe 2004]; the
 descriptors' square roots are compared [RootSIFT, Arandjelovic and Zisserman 2012], and a pair holds
-where each is the other's nearest and clearly nearer than the second [Lowe 2004, section 7.1].
+where each is the other's nearest and clearly nearer than the second [Lowe 2004, section 7.1]. Dense
+features come from a network, given by the caller; a pair of them holds where each is the other's
+nearest.
 Shapes: N points, D = 128, M pairs.
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -19,7 +22,7 @@ LEAST_CONTRAST = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class LocalFeatures:
-    """Points of one image."""
+    """Points of one image. Dense features know no turn: `angles_N` is None."""
 
     points_N2: Doubles
     "Column and row, (0, 0) being the outer corner of the first pixel."
@@ -27,6 +30,14 @@ class LocalFeatures:
     "Of unit length."
     angles_N: Floats | None = None
     "How each point is turned, degrees clockwise; None where the features know no turn."
+
+
+class DenseFinder(Protocol):
+    """Describes points of an image on a grid, north up, that are told from their neighbours."""
+
+    def __call__(self, image_HW3: Pixels, step_px: int, mask_HW: Pixels) -> LocalFeatures:
+        """Of a point in each square of `step_px` pixels, where `mask_HW` is not 0."""
+        ...
 
 
 def find_features(image_HW3: Pixels, most: int, mask_HW: Pixels | None = None) -> LocalFeatures:
@@ -65,4 +76,15 @@ def match_features(one_ND: Floats, other_ND: Floats, ratio: float) -> Ints:
     # Down the columns of the few that are left: down all of them takes as long as all before.
     mutual_M = similarity_NM[:, nearest_N[clear]].argmax(axis=0) == clear
     kept = clear[mutual_M]
+    return np.stack([kept, nearest_N[kept]], axis=1)
+
+
+def match_mutually(one_ND: Floats, other_ND: Floats) -> Ints:
+    """Pairs (M, 2) of descriptors, numbers in `one` and `other`: each the other's nearest."""
+    if len(one_ND) == 0 or len(other_ND) == 0:
+        return np.zeros((0, 2), np.int64)
+    nearest_N = (one_ND @ other_ND.T).argmax(axis=1)
+    # Computed again for the nearest alone: columns of all similarities would take longer to gather.
+    back_N = (other_ND[nearest_N] @ one_ND.T).argmax(axis=1)
+    kept = np.flatnonzero(back_N == np.arange(len(one_ND)))
     return np.stack([kept, nearest_N[kept]], axis=1)

@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -21,8 +21,9 @@ from pipeline.core.geo import Circle
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.inspect import inspect
 from pipeline.images.thumbnails import ImageLoader
+from pipeline.matching.local_features import DenseFinder
 from pipeline.matching.photo_features import MatchablePhoto
-from pipeline.matching.refine import MatchableWindow, prepare_window
+from pipeline.matching.refine import MatchableWindow, prepare_dense_window, prepare_window
 from pipeline.matching.relief import Relief
 
 
@@ -69,6 +70,8 @@ TILES_ACROSS = 4.0
 "Side of a window in sides of a tile: photos see one to four."
 MOST_SIDE_PX = 1200
 "Of a window: more pixels than a photo of 640 can use."
+DENSE_WINDOW_PX = 640
+"Likewise, where its features are dense: a network sees all of them."
 WINDOWS_IN_MEMORY = 48
 "Some 8 MB each."
 GRID_STEPS = 4
@@ -79,6 +82,8 @@ SIDES_SAMPLE = 200
 "Tiles whose sizes are looked at."
 Place = tuple[float, int, int]
 "Half a window's side in metres, and the row and column of its grid."
+Kind = Literal["sift", "dense"]
+"Of a window's features."
 
 
 class MapWindows:
@@ -88,15 +93,21 @@ class MapWindows:
         self._gallery, self._fetch, self._footprints = gallery, fetch, footprints
         self.search: FeatureSearch | None = None
         "By the features of the whole map, if they are to be searched."
+        self.dense: DenseFinder | None = None
+        "Of dense features, if photos that SIFT does not place are matched by them."
         self.heights: HeightReader | None = None
         "Of the map's ground, where there is a surface model."
-        self._kept: OrderedDict[Place, MatchableWindow | None] = OrderedDict()
+        self._kept: OrderedDict[tuple[Kind, Place], MatchableWindow | None] = OrderedDict()
 
     def around(
-        self, positions: Iterable[tuple[float, float, str]], most: int, reach_m: float = 0.0
+        self,
+        positions: Iterable[tuple[float, float, str]],
+        most: int,
+        reach_m: float = 0.0,
+        kind: Kind = "sift",
     ) -> Iterator[MatchableWindow]:
         """The windows around positions (lat, lon, key of the tile there), each once, at most `most`
-        of them; `reach_m`: the least half of a window's side."""
+        of them; `reach_m`: the least half of a window's side. Dense ones need `dense`."""
         seen: set[Place] = set()
         for lat, lon, key in positions:
             half_m = self._half_side(key, reach_m)
@@ -108,7 +119,7 @@ class MapWindows:
             if len(seen) == most:
                 return
             seen.add(place)
-            window = self._window(place)
+            window = self._window(kind, place)
             if window is not None:
                 yield window
 
@@ -150,19 +161,24 @@ class MapWindows:
         lat = row * self._step_lat(half_m)
         return self._step_lat(half_m) / max(math.cos(math.radians(lat)), 0.01)
 
-    def _window(self, place: Place) -> MatchableWindow | None:
-        if place in self._kept:
-            self._kept.move_to_end(place)
+    def _window(self, kind: Kind, place: Place) -> MatchableWindow | None:
+        asked = kind, place
+        if asked in self._kept:
+            self._kept.move_to_end(asked)
         else:
-            self._kept[place] = self._make(place)
+            self._kept[asked] = self._make(kind, place)
             if len(self._kept) > WINDOWS_IN_MEMORY:
                 self._kept.popitem(last=False)
-        return self._kept[place]
+        return self._kept[asked]
 
-    def _make(self, place: Place) -> MatchableWindow | None:
+    def _make(self, kind: Kind, place: Place) -> MatchableWindow | None:
         half_m, row, column = place
         lat, lon = row * self._step_lat(half_m), column * self._step_lon(half_m, row)
-        window = self._features_at(lat, lon, half_m)
+        window = (
+            self._features_at(lat, lon, half_m)
+            if kind == "sift"
+            else self._dense_features_at(lat, lon, half_m)
+        )
         if window is None or self.heights is None:
             return window
         return replace(window, relief=self.heights(LocalPlane(lat=lat, lon=lon), half_m))
@@ -174,6 +190,12 @@ class MapWindows:
                 return known
         window = self.compose(lat, lon, half_m)
         return None if window is None else prepare_window(window)
+
+    def _dense_features_at(self, lat: float, lon: float, half_m: float) -> MatchableWindow | None:
+        window = self.compose(lat, lon, half_m, DENSE_WINDOW_PX)
+        if window is None or self.dense is None:
+            return None
+        return prepare_dense_window(window, self.dense)
 
     def cover(self, most: int) -> tuple[list[tuple[float, float]], float]:
         """The middles (lat, lon) of windows of the finest level that together show the map, side by

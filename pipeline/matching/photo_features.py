@@ -1,10 +1,12 @@
 """A photo's features, found once for all windows: on the photo as it lies on the ground, where its
 pose is known.
 
-In: pixels, and what is known of the camera. Out: a `MatchablePhoto`.
+In: pixels, and what is known of the camera. Out: a `MatchablePhoto`, of SIFT's features or of dense
+ones.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,24 +21,31 @@ from pipeline.camera.ground import (
 from pipeline.camera.pose import PartialPose
 from pipeline.camera.warp import north_up, warp
 from pipeline.core.arrays import Doubles, Pixels
-from pipeline.matching.local_features import LocalFeatures, find_features
+from pipeline.matching.local_features import DenseFinder, LocalFeatures, find_features
 
 PHOTO_PX = 640
 "Longest side of a photo when it is matched."
 PHOTO_FEATURES = 2000
+DENSE_PHOTO_STEP_PX = 8
+"Between its dense features."
 
 
 @dataclass(frozen=True, kw_only=True)
 class MatchablePhoto:
     """A photo with its features, found once for all windows."""
 
-    size: tuple[int, int]
-    "Width and height when matched."
+    pixels_HW3: Pixels
+    "As it is matched."
     features: LocalFeatures
     pose: PartialPose
     promised_33: Doubles | None
     """The homography to the ground, (east, north) in metres from below the camera, that its pose
     promises; None where that is not complete, or shows the horizon."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height when matched."""
+        return self.pixels_HW3.shape[1], self.pixels_HW3.shape[0]
 
     @property
     def reach_m(self) -> float:
@@ -58,9 +67,30 @@ def prepare_photo(photo_HW3: Pixels, pose: PartialPose | None = None) -> Matchab
     features = (
         find_features(small_HW3, PHOTO_FEATURES)
         if promised_33 is None
-        else _features_on_the_ground(small_HW3, promised_33)
+        else _features_on_the_ground(small_HW3, promised_33, None, _find_sift)
     )
-    return MatchablePhoto(size=size, features=features, pose=pose, promised_33=promised_33)
+    return MatchablePhoto(
+        pixels_HW3=small_HW3, features=features, pose=pose, promised_33=promised_33
+    )
+
+
+def with_dense_features(
+    photo: MatchablePhoto, find: DenseFinder, metres_per_pixel: float
+) -> MatchablePhoto:
+    """The photo with dense features of the ground that its pose promises, at a map's scale. Raises
+    ValueError where it promises none: dense features know no turn and no scale."""
+    if photo.promised_33 is None:
+        raise ValueError("the photo's pose promises no ground, expected a complete one")
+
+    def find_dense(flat_HW3: Pixels, mask_HW: Pixels) -> LocalFeatures:
+        return find(flat_HW3, DENSE_PHOTO_STEP_PX, mask_HW)
+
+    return replace(
+        photo,
+        features=_features_on_the_ground(
+            photo.pixels_HW3, photo.promised_33, metres_per_pixel, find_dense
+        ),
+    )
 
 
 def ground_extent(to_ground_33: Doubles, size: tuple[int, int]) -> Doubles:
@@ -80,16 +110,31 @@ def promised_ground(pose: PartialPose, size: tuple[int, int]) -> Doubles | None:
     return photo_to_ground(pose.over(), size)
 
 
-def _features_on_the_ground(photo_HW3: Pixels, to_ground_33: Doubles) -> LocalFeatures:
+def _find_sift(flat_HW3: Pixels, mask_HW: Pixels) -> LocalFeatures:
+    return find_features(flat_HW3, PHOTO_FEATURES, mask_HW)
+
+
+def _features_on_the_ground(
+    photo_HW3: Pixels,
+    to_ground_33: Doubles,
+    metres_per_pixel: float | None,
+    find: Callable[[Pixels, Pixels], LocalFeatures],
+) -> LocalFeatures:
     """Features, in the photo's own pixels, that are found on the photo as it lies on the ground:
-    north up, an oblique view no longer foreshortened."""
+    north up, an oblique view no longer foreshortened; PHOTO_PX wide, or at `metres_per_pixel`."""
     size = (photo_HW3.shape[1], photo_HW3.shape[0])
-    to_flat_33, flat_size = _flat_frame(apply_homography(to_ground_33, corners(size)), to_ground_33)
+    ground_42 = apply_homography(to_ground_33, corners(size))
+    scale = (
+        PHOTO_PX / float(np.ptp(ground_42, axis=0).max())
+        if metres_per_pixel is None
+        else 1 / metres_per_pixel
+    )
+    to_flat_33, flat_size = _flat_frame(ground_42, to_ground_33, scale)
     flat_HW3 = warp(photo_HW3, to_flat_33, flat_size)
     mask_HW = np.zeros(flat_size[::-1], np.uint8)
     outline_42 = apply_homography(to_flat_33, corners(size))
     cv2.fillConvexPoly(mask_HW, np.round(outline_42).astype(np.int32), 255)
-    found = find_features(flat_HW3, PHOTO_FEATURES, mask_HW)
+    found = find(flat_HW3, mask_HW)
     return LocalFeatures(
         points_N2=apply_homography(np.asarray(np.linalg.inv(to_flat_33)), found.points_N2),
         descriptors_ND=found.descriptors_ND,
@@ -97,10 +142,12 @@ def _features_on_the_ground(photo_HW3: Pixels, to_ground_33: Doubles) -> LocalFe
     )
 
 
-def _flat_frame(ground_42: Doubles, to_ground_33: Doubles) -> tuple[Doubles, tuple[int, int]]:
-    """The homography from a photo's pixels to a north-up picture of its ground, and its size."""
+def _flat_frame(
+    ground_42: Doubles, to_ground_33: Doubles, scale: float
+) -> tuple[Doubles, tuple[int, int]]:
+    """The homography from a photo's pixels to a north-up picture of its ground, of `scale` pixels a
+    metre, and its size."""
     least_2, most_2 = ground_42.min(axis=0), ground_42.max(axis=0)
-    scale = PHOTO_PX / float((most_2 - least_2).max())
     width, height = (max(1, round(side)) for side in ((most_2 - least_2) * scale).tolist())
     place_33 = north_up(scale, float(least_2[0]), float(most_2[1]))
     return place_33 @ to_ground_33, (width, height)

@@ -5,7 +5,7 @@ In: a photo's pixels, windows around candidate positions, and what is known of t
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,17 +27,29 @@ from pipeline.matching.ground_fit import (
     is_camera_view,
     turned_alike,
 )
-from pipeline.matching.local_features import LocalFeatures, find_features, match_features
-from pipeline.matching.photo_features import MatchablePhoto, ground_extent
+from pipeline.matching.local_features import (
+    DenseFinder,
+    LocalFeatures,
+    find_features,
+    match_features,
+    match_mutually,
+)
+from pipeline.matching.photo_features import (
+    MatchablePhoto,
+    ground_extent,
+    with_dense_features,
+)
 from pipeline.matching.relief import Relief, fit_relief
 
 WINDOW_FEATURES = 6000
+DENSE_WINDOW_STEP_PX = 4
+"Between its dense features: half that of the photo's."
 TOLERANCE_PX = 4.0
 "Of an inlier, in pixels of the window."
 ALONE_RATIO, PROMISED_RATIO = 0.85, 0.95
 """Of the distances of the nearest and the second nearest descriptor. Where a pose promises the
 ground, more doubtful pairs may come: it sorts them out."""
-ENOUGH_INLIERS = 60
+ENOUGH_INLIERS, ENOUGH_DENSE_INLIERS = 60, 200
 "A window with so many ends the search for a better one."
 MOST_SCALE = 4.0
 "Between a footprint's sides and those that the pose promises: height above take-off errs."
@@ -85,6 +97,8 @@ class Refinement:
     "Root mean square distance of the inliers on the ground."
     promised: bool
     "Whether the camera's pose promised the ground: doubtful matches come then too."
+    dense: bool = False
+    "Whether dense features carry it, of which even a wrong view has dozens of inliers."
     points: tuple[MatchedPoint, ...] = ()
     "Some of the inliers, at most 40."
 
@@ -116,6 +130,17 @@ def prepare_window(window: MapWindow) -> MatchableWindow:
     )
 
 
+def prepare_dense_window(window: MapWindow, find: DenseFinder) -> MatchableWindow:
+    """The dense features of a window."""
+    found = find(window.pixels_HW3, DENSE_WINDOW_STEP_PX, window.shown_HW)
+    return MatchableWindow(
+        plane=window.plane,
+        metres_per_pixel=window.metres_per_pixel,
+        ground_N2=apply_homography(window.to_ground_33, found.points_N2),
+        descriptors_ND=found.descriptors_ND,
+    )
+
+
 def refine(photo: MatchablePhoto, windows: Iterable[MatchableWindow]) -> Refinement | None:
     """The refinement of the most inliers among the windows; those after one of ENOUGH_INLIERS are
     not tried."""
@@ -129,10 +154,29 @@ def refine(photo: MatchablePhoto, windows: Iterable[MatchableWindow]) -> Refinem
     return best
 
 
+def refine_densely(
+    photo: MatchablePhoto, windows: Iterable[MatchableWindow], find: DenseFinder
+) -> Refinement | None:
+    """The refinement by dense features of the most inliers among the windows; those after one of
+    ENOUGH_DENSE_INLIERS are not tried. None where no view holds, or the photo's pose promises no
+    ground."""
+    best: Refinement | None = None
+    of_scale: dict[float, MatchablePhoto] = {}
+    for window in windows if photo.promised_33 is not None else ():
+        scale = window.metres_per_pixel
+        if scale not in of_scale:
+            of_scale[scale] = with_dense_features(photo, find, scale)
+        found = refine_in(of_scale[scale], window)
+        if found is not None and (best is None or found.inliers > best.inliers):
+            best = replace(found, dense=True)
+            if best.inliers >= ENOUGH_DENSE_INLIERS:
+                break
+    return best
+
+
 def refine_in(photo: MatchablePhoto, window: MatchableWindow) -> Refinement | None:
     """The refinement by one window; None where no homography holds, or no camera makes it."""
-    ratio = ALONE_RATIO if photo.promised_33 is None else PROMISED_RATIO
-    pairs_M2 = match_features(photo.features.descriptors_ND, window.descriptors_ND, ratio)
+    pairs_M2 = _pairs(photo, window)
     photo_M2 = photo.features.points_N2[pairs_M2[:, 0]]
     ground_M2 = window.ground_N2[pairs_M2[:, 1]]
     turn_M = _turns(photo.features, window, pairs_M2)
@@ -159,6 +203,16 @@ def refine_in(photo: MatchablePhoto, window: MatchableWindow) -> Refinement | No
     inliers = fit.inliers_M
     points = _points(photo_M2[inliers], ground_M2[inliers], photo.size, window)
     return _refinement(fit, photo, window, len(photo_M2), points)
+
+
+def _pairs(photo: MatchablePhoto, window: MatchableWindow) -> Ints:
+    """Numbers (M, 2) of points of the photo and of the window that look alike. Neighbouring dense
+    features show nearly the same, so that each other's nearest is enough."""
+    one_ND, other_ND = photo.features.descriptors_ND, window.descriptors_ND
+    if photo.features.angles_N is None:
+        return match_mutually(one_ND, other_ND)
+    ratio = ALONE_RATIO if photo.promised_33 is None else PROMISED_RATIO
+    return match_features(one_ND, other_ND, ratio)
 
 
 def _turns(features: LocalFeatures, window: MatchableWindow, pairs_M2: Ints) -> Floats | None:
