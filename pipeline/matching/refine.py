@@ -120,24 +120,21 @@ class MatchableWindow:
 
 def prepare_window(window: MapWindow) -> MatchableWindow:
     """The features of a window."""
-    found = find_features(window.pixels_HW3, WINDOW_FEATURES, window.shown_HW)
+    return _matchable(window, find_features(window.pixels_HW3, WINDOW_FEATURES, window.shown_HW))
+
+
+def prepare_dense_window(window: MapWindow, find: DenseFinder) -> MatchableWindow:
+    """The dense features of a window."""
+    return _matchable(window, find(window.pixels_HW3, DENSE_WINDOW_STEP_PX, window.shown_HW))
+
+
+def _matchable(window: MapWindow, found: LocalFeatures) -> MatchableWindow:
     return MatchableWindow(
         plane=window.plane,
         metres_per_pixel=window.metres_per_pixel,
         ground_N2=apply_homography(window.to_ground_33, found.points_N2),
         descriptors_ND=found.descriptors_ND,
         angles_N=found.angles_N,
-    )
-
-
-def prepare_dense_window(window: MapWindow, find: DenseFinder) -> MatchableWindow:
-    """The dense features of a window."""
-    found = find(window.pixels_HW3, DENSE_WINDOW_STEP_PX, window.shown_HW)
-    return MatchableWindow(
-        plane=window.plane,
-        metres_per_pixel=window.metres_per_pixel,
-        ground_N2=apply_homography(window.to_ground_33, found.points_N2),
-        descriptors_ND=found.descriptors_ND,
     )
 
 
