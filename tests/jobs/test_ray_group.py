@@ -5,23 +5,28 @@ dies meanwhile.
 """
 
 import os
+import queue
 import shutil
 import signal
 import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import ray
+import torch
 from ray.exceptions import RayActorError
 from ray.util.queue import Queue
 
+from jobs.training import ray_group
 from jobs.training.driver import train
 from jobs.training.ray_group import listen
 from model.checkpoint import loads
-from pipeline.core.errors import InputError
+from model.errors import CheckpointError
+from pipeline.core.errors import Incomplete, InputError
 from pipeline.core.progress import progress
 from tests.jobs.tiny_runs import settings, tiny
 
@@ -53,6 +58,25 @@ def test_train_two_ray_workers_end_at_damaged_input(
         train(settings(str(shards), run, recipe, workers=2, checkpoint_minutes=60.0))
     assert "lost a worker" not in capfd.readouterr().err
     assert loads((run / "last.pt").read_bytes()).history[0]["step"] == 1
+
+
+@pytest.mark.parametrize("kind", [Incomplete, InputError, CheckpointError])
+def test_ray_worker_hands_over_errors_of_the_run(
+    kind: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as that a training has diverged: every other group would meet it too."""
+    error, told = kind("training diverged in epoch 1"), queue.Queue[dict[str, Any]]()
+
+    def fail(*_: object) -> None:
+        raise error
+
+    alone = SimpleNamespace(get_world_rank=lambda: 0, get_world_size=lambda: 1)
+    monkeypatch.setattr(ray_group, "get_context", lambda: alone)
+    monkeypatch.setattr(ray_group, "get_device", lambda: torch.device("cpu"))
+    monkeypatch.setattr(ray_group, "train_worker", fail)
+    with pytest.raises(kind, match="diverged"):
+        ray_group.ray_worker({"run": None, "messages": told, "cpus": torch.get_num_threads()})
+    assert told.get_nowait() == {"refused": error}
 
 
 def test_queue_put_after_shutdown_raises(ray_cluster: None) -> None:
