@@ -23,21 +23,22 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from jobs.encoding.dense_features import grid_points
 from jobs.encoding.photo_encoder import decode_photo
 from jobs.stages.calibrate_flight import FlightPhoto, flight_of
 from jobs.stages.matching import open_map
 from model.dense import STRIDE, DenseEncoder, sample
-from pipeline.camera.ground import apply_homography, camera_axes, corners, focal_length_px
+from pipeline.camera.ground import apply_homography, camera_axes, focal_length_px
 from pipeline.camera.local_plane import LocalPlane
 from pipeline.camera.pose import Pose
-from pipeline.camera.warp import north_up, warp
+from pipeline.camera.warp import warp
 from pipeline.core import storage
 from pipeline.core.arrays import Doubles, Pixels
 from pipeline.index.searcher import Index
 from pipeline.locate.gallery_map import read_gallery_map
 from pipeline.locate.photo_files import read_photo_tags
 from pipeline.matching.map_windows import DENSE_WINDOW_PX, MapWindows
-from pipeline.matching.photo_features import promised_ground
+from pipeline.matching.photo_features import flat_frame, ground_extent, promised_ground
 from pipeline.matching.photo_pose import PoseSettings, pose_of_photo
 from pipeline.matching.relief import Relief
 
@@ -107,19 +108,14 @@ def pair_of(photo: FlightPhoto, windows: MapWindows, rng: np.random.Generator) -
         altitude_m=truth.altitude_m, heading_deg=truth.heading_deg, pitch_deg=truth.pitch_deg,
         fov_deg=told.fov_deg,
     )  # fmt: skip
-    ground_42 = apply_homography(promised_33, corners(size))
-    least_2, most_2 = ground_42.min(axis=0), ground_42.max(axis=0)
-    half_m = rng.uniform(*HALF_WINDOW) * float((most_2 - least_2).max())
+    half_m = rng.uniform(*HALF_WINDOW) * float(ground_extent(promised_33, size).max())
     here = LocalPlane(lat=truth.lat, lon=truth.lon)
     [[lat, lon]] = here.to_degrees(rng.uniform(-half_m / 4, half_m / 4, (1, 2))).tolist()
     window = windows.compose(lat, lon, half_m, DENSE_WINDOW_PX)
     if window is None:
         return None
-    scale = 1 / window.metres_per_pixel
-    to_flat_33 = north_up(scale, float(least_2[0]), float(most_2[1])) @ promised_33
-    width, height = (max(16, round(side)) for side in ((most_2 - least_2) * scale).tolist())
-    rows, columns = np.mgrid[STRIDE / 2 : height : STRIDE, STRIDE / 2 : width : STRIDE]
-    cells_N2 = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    to_flat_33, flat_size = flat_frame(promised_33, size, 1 / window.metres_per_pixel)
+    cells_N2 = grid_points(*flat_size, STRIDE)
     pixels_N2 = apply_homography(np.asarray(np.linalg.inv(to_flat_33)), cells_N2)
     inside_N = ((pixels_N2 > 0) & (pixels_N2 < size)).all(axis=1)
     cells_N2, pixels_N2 = cells_N2[inside_N], pixels_N2[inside_N]
@@ -136,7 +132,7 @@ def pair_of(photo: FlightPhoto, windows: MapWindows, rng: np.random.Generator) -
         return None
     seen = rng.permutation(seen)[:MOST_CELLS]
     return Pair(
-        photo_HW3=warp(image_HW3, to_flat_33, (width, height)), window_HW3=window.pixels_HW3,
+        photo_HW3=warp(image_HW3, to_flat_33, flat_size), window_HW3=window.pixels_HW3,
         cells_N2=cells_N2[seen], shown_N2=shown_N2[seen],
     )  # fmt: skip
 

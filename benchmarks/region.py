@@ -283,12 +283,10 @@ def main() -> None:
     ]  # fmt: skip
     worse = sum(refined.error_m > max(tile.error_m, 5) for tile, refined in pairs)
     print(f"right tiles made worse by matching (and more than 5 m off): {worse} of {len(pairs)}")
-    for posed, way in zip((True, False), TAGS, strict=True):
-        if posed not in seen:
-            continue
+    for posed in seen:
         settings = replace(after, photos=tuple(strangers), match=True, pose=posed)
         given = sum(one.known for one in locate_all(settings, strangers).outcomes)
-        print(f"photos of another map, {way}: {given} of {len(strangers)} answered")
+        print(f"photos of another map, {TAGS[not posed]}: {given} of {len(strangers)} answered")
     print(json.dumps({"minutes": options.minutes, "seed": options.seed, "photos": len(truth)}))
 
 

@@ -64,12 +64,10 @@ def open_map(
     tables of jobs/make_shards.py, which shards of others lack. Raises InputError for a surface
     model that cannot be read."""
     reader = _open_tiles(shards)
-    windows = None if reader is None else _windows_of(reader, gallery, surface)
+    windows = None if reader is None else _windows_of(reader, gallery, surface, dense)
     if windows is not None and whole_map:
         kept = _feature_file(shards, gallery, index)
         windows.search = MapSearch(kept.read, partial(kept.make, windows))
-    if windows is not None and dense:
-        windows.dense = BuiltinDenseFinder()
     if windows is None:
         console.print(
             f"the images of {shards} do not say which ground their corners show: photos are not "
@@ -87,11 +85,9 @@ def open_photo_map(
     reader = _open_tiles(shards)
     if reader is None:
         return None
-    windows = _windows_of(reader, gallery, surface)
+    windows = _windows_of(reader, gallery, surface, dense)
     if windows is not None and match:
         windows.search = MapSearch(_feature_file(shards, gallery, index).read, lambda: None)
-    if windows is not None and dense:
-        windows.dense = BuiltinDenseFinder()
     return PhotoMap(gallery, reader.fetch, windows, match)
 
 
@@ -108,11 +104,14 @@ def _open_tiles(shards: str) -> TileReader | None:
     return TileReader(open_shards(shards)) if storage.exists(manifest) else None
 
 
-def _windows_of(reader: TileReader, gallery: GalleryMap, surface: str | None) -> MapWindows | None:
+def _windows_of(
+    reader: TileReader, gallery: GalleryMap, surface: str | None, dense: bool
+) -> MapWindows | None:
     if not len(gallery.keys) or not reader.footprints([str(gallery.keys[0])]):
         return None
     windows = MapWindows(gallery, reader.fetch, reader.footprints)
     windows.heights = None if surface is None else height_reader(surface)
+    windows.dense = BuiltinDenseFinder() if dense else None
     return windows
 
 

@@ -49,9 +49,7 @@ def load_predictor(
     torch.set_num_threads(threads)  # FAISS takes OMP_NUM_THREADS, which Ray sets to the cores
     cv2.setNumThreads(threads)
     open_map = (
-        no_map
-        if shards is None
-        else (partial(open_photo_map, shards, match, dense, index, surface))
+        no_map if shards is None else partial(open_photo_map, shards, match, dense, index, surface)
     )
 
     def encoder_for(metadata: IndexMetadata) -> PhotoEncoder:

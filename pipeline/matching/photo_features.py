@@ -64,11 +64,11 @@ def prepare_photo(photo_HW3: Pixels, pose: PartialPose | None = None) -> Matchab
     small_HW3 = np.asarray(cv2.resize(photo_HW3, size, interpolation=cv2.INTER_AREA), np.uint8)
     pose = pose or PartialPose()
     promised_33 = promised_ground(pose, size)
-    features = (
-        find_features(small_HW3, PHOTO_FEATURES)
-        if promised_33 is None
-        else _features_on_the_ground(small_HW3, promised_33, None, _find_sift)
-    )
+    if promised_33 is None:
+        features = find_features(small_HW3, PHOTO_FEATURES)
+    else:
+        pixels_per_metre = PHOTO_PX / float(ground_extent(promised_33, size).max())
+        features = _features_on_the_ground(small_HW3, promised_33, pixels_per_metre, _find_sift)
     return MatchablePhoto(
         pixels_HW3=small_HW3, features=features, pose=pose, promised_33=promised_33
     )
@@ -88,7 +88,7 @@ def with_dense_features(
     return replace(
         photo,
         features=_features_on_the_ground(
-            photo.pixels_HW3, photo.promised_33, metres_per_pixel, find_dense
+            photo.pixels_HW3, photo.promised_33, 1 / metres_per_pixel, find_dense
         ),
     )
 
@@ -117,19 +117,13 @@ def _find_sift(flat_HW3: Pixels, mask_HW: Pixels) -> LocalFeatures:
 def _features_on_the_ground(
     photo_HW3: Pixels,
     to_ground_33: Doubles,
-    metres_per_pixel: float | None,
+    pixels_per_metre: float,
     find: Callable[[Pixels, Pixels], LocalFeatures],
 ) -> LocalFeatures:
     """Features, in the photo's own pixels, that are found on the photo as it lies on the ground:
-    north up, an oblique view no longer foreshortened; PHOTO_PX wide, or at `metres_per_pixel`."""
+    north up, an oblique view no longer foreshortened."""
     size = (photo_HW3.shape[1], photo_HW3.shape[0])
-    ground_42 = apply_homography(to_ground_33, corners(size))
-    scale = (
-        PHOTO_PX / float(np.ptp(ground_42, axis=0).max())
-        if metres_per_pixel is None
-        else 1 / metres_per_pixel
-    )
-    to_flat_33, flat_size = _flat_frame(ground_42, to_ground_33, scale)
+    to_flat_33, flat_size = flat_frame(to_ground_33, size, pixels_per_metre)
     flat_HW3 = warp(photo_HW3, to_flat_33, flat_size)
     mask_HW = np.zeros(flat_size[::-1], np.uint8)
     outline_42 = apply_homography(to_flat_33, corners(size))
@@ -142,12 +136,15 @@ def _features_on_the_ground(
     )
 
 
-def _flat_frame(
-    ground_42: Doubles, to_ground_33: Doubles, scale: float
+def flat_frame(
+    to_ground_33: Doubles, size: tuple[int, int], pixels_per_metre: float
 ) -> tuple[Doubles, tuple[int, int]]:
-    """The homography from a photo's pixels to a north-up picture of its ground, of `scale` pixels a
-    metre, and its size."""
+    """The homography from the pixels of a photo of `size` (width, height) to a north-up picture of
+    its ground, and the picture's size."""
+    ground_42 = apply_homography(to_ground_33, corners(size))
     least_2, most_2 = ground_42.min(axis=0), ground_42.max(axis=0)
-    width, height = (max(1, round(side)) for side in ((most_2 - least_2) * scale).tolist())
-    place_33 = north_up(scale, float(least_2[0]), float(most_2[1]))
+    width, height = (
+        max(1, round(side)) for side in ((most_2 - least_2) * pixels_per_metre).tolist()
+    )
+    place_33 = north_up(pixels_per_metre, float(least_2[0]), float(most_2[1]))
     return place_33 @ to_ground_33, (width, height)

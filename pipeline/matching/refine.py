@@ -6,6 +6,7 @@ In: a photo's pixels, windows around candidate positions, and what is known of t
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 
@@ -141,14 +142,7 @@ def _matchable(window: MapWindow, found: LocalFeatures) -> MatchableWindow:
 def refine(photo: MatchablePhoto, windows: Iterable[MatchableWindow]) -> Refinement | None:
     """The refinement of the most inliers among the windows; those after one of ENOUGH_INLIERS are
     not tried."""
-    best: Refinement | None = None
-    for window in windows:
-        found = refine_in(photo, window)
-        if found is not None and (best is None or found.inliers > best.inliers):
-            best = found
-            if best.inliers >= ENOUGH_INLIERS:
-                break
-    return best
+    return _most_inliers(((photo, window) for window in windows), ENOUGH_INLIERS)
 
 
 def refine_densely(
@@ -157,16 +151,23 @@ def refine_densely(
     """The refinement by dense features of the most inliers among the windows; those after one of
     ENOUGH_DENSE_INLIERS are not tried. None where no view holds, or the photo's pose promises no
     ground."""
+    if photo.promised_33 is None:
+        return None
+    at_scale = cache(partial(with_dense_features, photo, find))
+    pairs = ((at_scale(window.metres_per_pixel), window) for window in windows)
+    found = _most_inliers(pairs, ENOUGH_DENSE_INLIERS)
+    return found and replace(found, dense=True)
+
+
+def _most_inliers(
+    pairs: Iterable[tuple[MatchablePhoto, MatchableWindow]], enough: int
+) -> Refinement | None:
     best: Refinement | None = None
-    of_scale: dict[float, MatchablePhoto] = {}
-    for window in windows if photo.promised_33 is not None else ():
-        scale = window.metres_per_pixel
-        if scale not in of_scale:
-            of_scale[scale] = with_dense_features(photo, find, scale)
-        found = refine_in(of_scale[scale], window)
+    for photo, window in pairs:
+        found = refine_in(photo, window)
         if found is not None and (best is None or found.inliers > best.inliers):
-            best = replace(found, dense=True)
-            if best.inliers >= ENOUGH_DENSE_INLIERS:
+            best = found
+            if best.inliers >= enough:
                 break
     return best
 
