@@ -41,13 +41,13 @@ class LocalPlane:
         return np.stack([self.lat + north_N, lon_N], axis=1)
 
 
-def metres_per_degree_at(lat_N: Doubles) -> Doubles:
-    """Metres per degree of latitude and of longitude (N, 2) at latitudes (N,)."""
-    sine_N, cosine_N = np.sin(np.radians(lat_N)), np.cos(np.radians(lat_N))
-    bend_N = 1 - ECCENTRICITY_2 * sine_N**2
-    meridian_N = EQUATOR_M * (1 - ECCENTRICITY_2) / bend_N**1.5
-    parallel_N = EQUATOR_M / np.sqrt(bend_N) * cosine_N
-    return np.asarray(np.radians(np.stack([meridian_N, parallel_N], axis=1)))
+def metres_per_degree_at(lat_X: Doubles) -> Doubles:
+    """Metres per degree of latitude and of longitude (X, 2) at latitudes of any shape X."""
+    sine_X, cosine_X = np.sin(np.radians(lat_X)), np.cos(np.radians(lat_X))
+    bend_X = 1 - ECCENTRICITY_2 * sine_X**2
+    meridian_X = EQUATOR_M * (1 - ECCENTRICITY_2) / bend_X**1.5
+    parallel_X = EQUATOR_M / np.sqrt(bend_X) * cosine_X
+    return np.asarray(np.radians(np.stack([meridian_X, parallel_X], axis=-1)))
 
 
 def tile_side_m(footprint: npt.ArrayLike) -> float:

@@ -89,7 +89,8 @@ class Ends:
     ) -> "Ends":
         """The ends from places, and from how far each camera has travelled."""
         known_N = ~np.isnan(camera.positions_N2).any(axis=1)
-        between_N = _apart_m(ground.positions_N2, camera.positions_N2)
+        between_N2 = _displacement(ground.positions_N2, camera.positions_N2)
+        between_N = np.linalg.norm(between_N2, axis=1)
         gone = [one or Travelled(chain=-1) for one in travelled]
         return Ends(
             time_N=time_N,
@@ -165,8 +166,8 @@ def moves_between(some: Ends, others: Ends, max_speed: float, slack_m: float) ->
 def _odometry_density(some: Ends, others: Ends, cameras_MK: Mask) -> tuple[Doubles, Doubles]:
     """Log-density (M, K) of the measured displacements under a normal distribution around those of
     the candidates, and at its middle. Its covariance is that of the odometry and of both ends."""
-    ground_MK2 = _displacement(some.ground_N2, others.ground_N2)
-    camera_MK2 = _displacement(some.camera_N2, others.camera_N2)
+    ground_MK2 = _displacement(some.ground_N2[:, None], others.ground_N2[None])
+    camera_MK2 = _displacement(some.camera_N2[:, None], others.camera_N2[None])
     moved_MK2 = np.where(cameras_MK[..., None], camera_MK2, ground_MK2)
     # A camera that looks ahead in an unknown direction: half its square is the variance of a part.
     ahead_N22, ahead_K22 = (
@@ -192,21 +193,13 @@ def _odometry_density(some: Ends, others: Ends, cameras_MK: Mask) -> tuple[Doubl
     return np.asarray(peak_MK - np.nan_to_num(squared_MK, nan=np.inf) / 2), np.asarray(peak_MK)
 
 
-def _displacement(some_M2: Doubles, others_K2: Doubles) -> Doubles:
-    """(east, north) in metres (M, K, 2) from positions to others; longitudes wrap."""
-    north_MK = others_K2[None, :, 0] - some_M2[:, None, 0]
-    east_MK = (others_K2[None, :, 1] - some_M2[:, None, 1] + 180) % 360 - 180
-    scale_M2, scale_K2 = (metres_per_degree_at(one[:, 0]) for one in (some_M2, others_K2))
-    scale_MK2 = (scale_M2[:, None] + scale_K2[None]) / 2
-    return np.stack([east_MK, north_MK], axis=2) * scale_MK2[..., ::-1]
-
-
-def _apart_m(some_N2: Doubles, others_N2: Doubles) -> Doubles:
-    """Metres (N,) from each position to the other one of its row."""
-    north_N = others_N2[:, 0] - some_N2[:, 0]
-    east_N = (others_N2[:, 1] - some_N2[:, 1] + 180) % 360 - 180
-    metres_N2 = np.stack([north_N, east_N], axis=1) * metres_per_degree_at(some_N2[:, 0])
-    return np.asarray(np.linalg.norm(metres_N2, axis=1))
+def _displacement(some_X2: Doubles, others_X2: Doubles) -> Doubles:
+    """(east, north) in metres (X, 2) from positions to others; longitudes wrap. X: any shape of
+    either that NumPy broadcasts."""
+    north_X = others_X2[..., 0] - some_X2[..., 0]
+    east_X = (others_X2[..., 1] - some_X2[..., 1] + 180) % 360 - 180
+    scale_X2 = (metres_per_degree_at(some_X2[..., 0]) + metres_per_degree_at(others_X2[..., 0])) / 2
+    return np.stack([east_X, north_X], axis=-1) * scale_X2[..., ::-1]
 
 
 def within_reach(some_M3: Doubles, others_K3: Doubles, reach_MK: Doubles) -> Mask:

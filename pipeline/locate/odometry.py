@@ -5,14 +5,12 @@ displacement since the photo before, and the standard deviation of either part. 
 sums since the last gap, so that the displacement between any two photos is a difference.
 """
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.core import storage
 from pipeline.core.errors import InputError
+from pipeline.locate.photo_files import read_rows
 
 COLUMNS = ("photo", "east_m", "north_m", "error_m")
 
@@ -46,34 +44,16 @@ def read_odometry(path: str, photos: Sequence[str]) -> list[Travelled]:
     Raises InputError where it is not such a table, a number cannot be used, or its rows are in
     another order than the photos' times.
     """
-    if not storage.is_file(path):
-        raise InputError(
-            f"no table at {path}; expected a CSV file with the columns {', '.join(COLUMNS)}; check "
-            "--odometry"
-        )
-    text = storage.read_bytes(path).decode("utf-8-sig", "replace")
-    return travelled(parse_odometry(text, path), photos, path)
+    return travelled(odometry_rows(read_rows(path, COLUMNS, "--odometry"), path), photos, path)
 
 
-def parse_odometry(text: str, path: str) -> list[OdometryRow]:
-    """The rows of a table. Raises InputError where it is none, or has a number that is none."""
-    try:
-        rows = list(csv.DictReader(io.StringIO(text)))
-    except csv.Error as error:
-        raise InputError(
-            f"{path} cannot be read as CSV ({error}); expected the columns {', '.join(COLUMNS)}; "
-            "repair the file"
-        ) from None
-    if not rows or not set(COLUMNS) <= rows[0].keys():
-        raise InputError(
-            f"{path} has no rows with the columns {', '.join(COLUMNS)}; expected all four; write "
-            "its first line so"
-        )
+def odometry_rows(rows: Sequence[dict[str, str]], path: str) -> list[OdometryRow]:
+    """The rows of a table, checked. Raises InputError for a number that is none."""
     return [OdometryRow(photo=row["photo"], step=_step(row, path)) for row in rows]
 
 
 def _step(row: dict[str, str], path: str) -> tuple[float, float, float] | None:
-    cells = [(row[name] or "").strip() for name in COLUMNS[1:]]
+    cells = [row[name].strip() for name in COLUMNS[1:]]
     if not any(cells):
         return None
     try:

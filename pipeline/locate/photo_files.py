@@ -104,7 +104,7 @@ def read_times(path: str, photos: Sequence[str]) -> dict[str, str]:
 
     Raises InputError where it is not such a table, or has no valid time for one of the photos.
     """
-    by_name = _read_table(path)
+    by_name = {row["photo"]: row["time"] for row in read_rows(path, ("photo", "time"), "--times")}
     times = {}
     for photo in photos:
         time = by_name.get(photo, by_name.get(photo.rpartition("/")[2]))
@@ -123,23 +123,31 @@ def read_times(path: str, photos: Sequence[str]) -> dict[str, str]:
     return times
 
 
-def _read_table(path: str) -> dict[str, str]:
+def read_rows(path: str, columns: Sequence[str], flag: str) -> list[dict[str, str]]:
+    """The rows of a table of photos by column; `flag` has named it.
+
+    Raises InputError where there is none, or it is not CSV with these columns.
+    """
     if not storage.is_file(path):
         raise InputError(
-            f"no table at {path}; expected a CSV file with the columns photo and time; check "
-            "--times"
+            f"no table at {path}; expected a CSV file with the columns {', '.join(columns)}; check "
+            f"{flag}"
         )
-    text = storage.read_bytes(path).decode("utf-8-sig", "replace")
+    return parse_rows(storage.read_bytes(path).decode("utf-8-sig", "replace"), columns, path)
+
+
+def parse_rows(text: str, columns: Sequence[str], path: str) -> list[dict[str, str]]:
+    """The rows of a table's text; missing cells are empty. Raises InputError."""
     try:
-        rows = list(csv.DictReader(io.StringIO(text)))
+        rows = list(csv.DictReader(io.StringIO(text), restval=""))
     except csv.Error as error:
         raise InputError(
-            f"{path} cannot be read as CSV ({error}); expected the columns photo and time; repair "
-            "the file"
+            f"{path} cannot be read as CSV ({error}); expected the columns {', '.join(columns)}; "
+            "repair the file"
         ) from None
-    if not rows or not {"photo", "time"} <= rows[0].keys():
+    if not rows or not set(columns) <= rows[0].keys():
         raise InputError(
-            f"{path} has no rows with the columns photo and time; expected both; write its first "
-            "line so"
+            f"{path} has no rows with the columns {', '.join(columns)}; expected all of them; "
+            "write its first line so"
         )
-    return {row["photo"]: row["time"] or "" for row in rows}
+    return rows

@@ -5,13 +5,21 @@ from pathlib import Path
 import pytest
 
 from pipeline.core.errors import InputError
-from pipeline.locate.odometry import Travelled, parse_odometry, read_odometry, travelled
+from pipeline.locate.odometry import (
+    COLUMNS,
+    Travelled,
+    odometry_rows,
+    read_odometry,
+    travelled,
+)
+from pipeline.locate.photo_files import parse_rows
 
 HEADER = "photo,east_m,north_m,error_m\n"
 
 
 def ways(text: str, photos: list[str]) -> list[Travelled]:
-    return travelled(parse_odometry(HEADER + text, "way.csv"), photos, "way.csv")
+    rows = odometry_rows(parse_rows(HEADER + text, COLUMNS, "way.csv"), "way.csv")
+    return travelled(rows, photos, "way.csv")
 
 
 def test_odometry_sums_steps_and_variances() -> None:

@@ -76,7 +76,7 @@ def test_read_times_by_path_or_name(tmp_path: Path) -> None:
     ("text", "sentence"),
     [
         (None, "no table at"),
-        ("name,when\na.jpg,1\n", "no rows with the columns photo and time"),
+        ("name,when\na.jpg,1\n", "no rows with the columns photo, time"),
         ("photo,time\nb.jpg,1\n", "has no row for /x/a.jpg"),
         ("photo,time\na.jpg,noon\n", "has the time 'noon' for /x/a.jpg"),
     ],

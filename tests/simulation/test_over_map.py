@@ -17,7 +17,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.records import Split, View
 from pipeline.images.camera_tags import read_tags
 from pipeline.images.image_blocks import find_metadata
-from pipeline.locate.odometry import parse_odometry, travelled
+from pipeline.locate.odometry import read_odometry
 from pipeline.shards.pack import pack
 from pipeline.shards.settings import PackingSettings
 from pipeline.shards.shard_set import open_shards
@@ -90,9 +90,7 @@ def test_fly_survey_is_a_flight_with_times_and_odometry(tmp_path: Path) -> None:
     assert len({(row["altitude_m"], row["pitch_deg"]) for row in rows}) == 1
     headings = np.array([float(row["heading_deg"]) for row in rows])
     assert set(np.round((headings + 1) / 90).tolist()) == {1, 2, 3}  # forth, across, back
-    ways = travelled(
-        parse_odometry((out / ODOMETRY).read_text(), ""), [r["path"] for r in rows], ""
-    )
+    ways = read_odometry(str(out / ODOMETRY), [row["path"] for row in rows])
     cameras = np.array([camera_of_row(row) for row in rows])
     plane = LocalPlane(lat=float(cameras[0, 0]), lon=float(cameras[0, 1]))
     summed = [(way.east_m - ways[0].east_m, way.north_m - ways[0].north_m) for way in ways]
