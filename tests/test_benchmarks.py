@@ -97,6 +97,10 @@ CASES: dict[str, tuple[str, str]] = {
         r"built-in, matched, pose: [\d.]+% within 1 m, .* of 1 photos, [\d.]+ x ImageNet's tiles"
         r"(.|\n)*\| 18 to 24 \| no \| levels \|(.|\n)*levels, .* [\d.]+ x one level's photos",
     ),
+    "promise": (
+        "--out {adapted} --days 1 --photos 1 --height 60 80 --pitch -90 -75 --tags without",
+        r"\| day 1, without \| .* [\d.]+ x \|(.|\n)*within 25 m: promised .* points too much",
+    ),
     "region": (
         "--out {adapted} --side 400 --resolution 0.5 --minutes 0.01 --photos 1 --checks 20 "
         "--height 60 80 --pitch -90 -75 --tile-m 55 110",

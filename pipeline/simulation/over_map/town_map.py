@@ -42,16 +42,27 @@ def make_town_map(settings: TownMapSettings) -> Path:
         console.print(f"{root} is complete already; nothing to do")
         return root
     begin(root, about)
-    for_town, *for_days = np.random.default_rng(settings.seed).spawn(3)
-    world = build_town(for_town, CAMPUS_RADIUS_M, settings.side, settings.resolution)
+    world, for_days = town_and_days(settings, 2)
     for name, rng in zip((MAP, ANOTHER_DAY), for_days, strict=True):
-        _write(root / name, orthophoto(world, sample_day(rng), rng), world.metres_per_pixel)
+        write_day(world, rng, root / name)
     _write(root / SURFACE, world.height_HW[..., None], world.metres_per_pixel)
     json_files.write_checksummed(str(root / TOWN_FILE), about)
     storage.remove_folder(str(root / ".parts"))
     kilometres = settings.side / 1000
     console.print(f"{root}: a town of {kilometres:g} x {kilometres:g} km", markup=False)
     return root
+
+
+def town_and_days(settings: TownMapSettings, count: int) -> tuple[World, list[np.random.Generator]]:
+    """The town, and a generator for each of `count` days of it: the map's, another day's, and
+    more."""
+    for_town, *for_days = np.random.default_rng(settings.seed).spawn(1 + count)
+    return build_town(for_town, CAMPUS_RADIUS_M, settings.side, settings.resolution), for_days
+
+
+def write_day(world: World, rng: np.random.Generator, path: Path) -> None:
+    """The world from straight above on a random day, as GeoTIFF."""
+    _write(path, orthophoto(world, sample_day(rng), rng), world.metres_per_pixel)
 
 
 def orthophoto(world: World, day: Day, rng: np.random.Generator) -> ByteMap:
