@@ -57,6 +57,7 @@ def test_recipes_are_listed_by_their_names() -> None:
         "alpha_zero",
         "smoke",
         "builtin",
+        "best",
         "finetune",
         "pvda_unlabelled",
         "instance_loss",

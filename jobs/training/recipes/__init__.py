@@ -7,7 +7,7 @@ method and what was chosen stands in its file. Another method is one file here a
 
 from collections.abc import Callable
 
-from jobs.training.recipes.builtin import builtin, finetune
+from jobs.training.recipes.builtin import best, builtin, finetune
 from jobs.training.recipes.camp import camp
 from jobs.training.recipes.dac import dac
 from jobs.training.recipes.fsra import fsra, fsra_3
@@ -41,6 +41,7 @@ RECIPES: dict[str, Callable[[], Recipe]] = {
         alpha_zero,
         smoke,
         builtin,
+        best,
         finetune,
         pvda_unlabelled,
         instance_loss,
