@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from jobs.region.settings import AdaptSettings
 from pipeline.core import json_files, storage
@@ -11,9 +10,6 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import console
 from pipeline.simulation.resume import settings_record
 from pipeline.sources.maps.sheets import describe_sheets, find_sheets, read_sheet
-
-PATHS = ("mosaic", "surface", "photos")
-"Settings that name files."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,8 +68,7 @@ def check_map(settings: AdaptSettings) -> list[str]:
 def claim(region: Region, settings: AdaptSettings) -> None:
     """Note the region's settings in its folder.
 
-    A map is known again by its file's name and size. Raises InputError where the region is of other
-    settings or another map, or where there is no map.
+    Raises InputError where it is of other settings or another map, or where there is no map.
     """
     about = (
         settings_record(settings, ("out", "extend", "camera"))
@@ -97,19 +92,12 @@ def claim(region: Region, settings: AdaptSettings) -> None:
             f"{path} is damaged ({error}), expected the settings of a region; remove the folder "
             "and adapt again"
         ) from None
-    before, now = _without_folders(found), _without_folders(about)
-    differing = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
+    differing = sorted(name for name in {*found, *about} if found.get(name) != about.get(name))
     if differing:
         raise InputError(
             f"{region.out} was adapted with another {', '.join(differing)}, expected the same "
             "settings to resume; choose another --out or remove the folder"
         )
-
-
-def _without_folders(about: dict[str, Any]) -> dict[str, Any]:
-    """Settings with the names of map, surface model and photos alone: they may be moved."""
-    names = {name: str(about[name]).rpartition("/")[2] for name in PATHS if about.get(name)}
-    return about | names
 
 
 def print_command(name: str, **flags: object) -> None:
