@@ -4,7 +4,7 @@ In: the completed epochs of training. Out: alpha and the factor of every learnin
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 
@@ -41,6 +41,17 @@ class Schedule:
             )
         if self.alpha < 0:
             raise ValueError(f"alpha is {self.alpha}, expected 0 (no adversary) or more")
+
+    def scaled_to(self, epochs: int) -> "Schedule":
+        """The same shape over another number of epochs."""
+        share = epochs / self.epochs
+        return replace(
+            self,
+            epochs=epochs,
+            period=max(1, round(self.period * share)),
+            decay_epochs=tuple(round(epoch * share) for epoch in self.decay_epochs),
+            warmup_epochs=self.warmup_epochs * share,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

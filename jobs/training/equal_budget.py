@@ -31,19 +31,10 @@ def at_equal_budget(recipe: Recipe, epochs: int, seed: int) -> Recipe:
         with shapes_alone():
             channels = build_backbone(network.backbone, network.width).channels
         network = replace(network, part_dim=channels)
-    own = recipe.schedule
-    share = epochs / own.epochs
-    schedule = replace(
-        own,
-        epochs=epochs,
-        period=max(1, round(own.period * share)),
-        decay_epochs=tuple(round(epoch * share) for epoch in own.decay_epochs),
-        warmup_epochs=own.warmup_epochs * share,
-    )
     return replace(
         recipe,
         network=network,
-        schedule=schedule,
+        schedule=recipe.schedule.scaled_to(epochs),
         start=terms.start,
         optimization=terms.optimization,
         augmentation=terms.augmentation,

@@ -53,12 +53,9 @@ def best(epochs: int = 40) -> Recipe:
         name="best",
         network=replace(terms.network, ring_divisor="box", dropout=0.75),
         losses=LossWeights(contrastive_weight=1.0),
-        schedule=Schedule(
-            epochs=epochs, period=max(1, epochs // 4), alpha=0.0, alpha_step=0.0,
-            decay_epochs=(round(epochs * 60 / 560), round(epochs * 120 / 560)),
-        ),
+        schedule=Schedule(alpha=0.0, alpha_step=0.0).scaled_to(epochs),
         perspective="overhead",
-    )  # fmt: skip
+    )
 
 
 def finetune(epochs: int = 8) -> Recipe:
