@@ -11,7 +11,6 @@ over the days, whose standard error is that of days.
 
 import argparse
 import json
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from region import TAGS, locate_all, take_photos
 
 from jobs.encoding.localizer import with_localizer
 from jobs.stages.settings import LocateSettings
-from pipeline.core import cluster
+from pipeline.core import cluster, json_files
 from pipeline.region.expectation import WITHIN_M, expect, read_expectations
 from pipeline.simulation.over_map.settings import TownMapSettings
 from pipeline.simulation.over_map.town_map import (
@@ -29,14 +28,10 @@ from pipeline.simulation.over_map.town_map import (
     write_day,
 )
 
-METRES = WITHIN_M[1:]
-
 
 def other_days(town: Path, count: int) -> list[Path]:
     """Maps of so many days that are not the map's; made where they are missing."""
-    written = json.loads((town / TOWN_FILE).read_text())
-    known = {field.name: written[field.name] for field in fields(TownMapSettings)
-             if field.name in written}  # fmt: skip
+    known = json_files.read_checksummed(str(town / TOWN_FILE))
     world, [_, *days] = town_and_days(TownMapSettings(out=str(town), **known), 1 + count)
     paths = [town / f"day-{number}.tif" for number in range(1, count + 1)]
     for path, rng in zip(paths, days, strict=True):
@@ -88,7 +83,7 @@ def main() -> None:
     for tags, days in seen.items():
         days_D2 = np.array(days)
         error_2 = days_D2.std(axis=0, ddof=1) / len(days) ** 0.5 if len(days) > 1 else [0.0, 0.0]
-        for at, metres in enumerate(METRES):
+        for at, metres in enumerate(WITHIN_M[1:]):
             told = promised[tags].within[1 + at].value
             mean = days_D2[:, at].mean()
             print(
