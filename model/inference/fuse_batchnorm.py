@@ -14,13 +14,12 @@ from model.pvda import FeatureEncoder
 
 def fuse_batchnorm(encoder: FeatureEncoder) -> FeatureEncoder:
     """A copy of `encoder` whose BatchNorms are folded into convolutions and linear layers, without
-    gradients.
+    gradients. One that follows neither, as USAM's, stays.
 
     Its embeddings differ from the encoder's by float32's rounding only. `encoder` itself is
     unchanged.
 
-    Raises ValueError when the encoder is in training mode, or when a BatchNorm does not follow a
-    convolution or a linear layer.
+    Raises ValueError when the encoder is in training mode.
     """
     if any(
         isinstance(module, nn.modules.batchnorm._BatchNorm) and module.training
@@ -33,17 +32,6 @@ def fuse_batchnorm(encoder: FeatureEncoder) -> FeatureEncoder:
     folded = copy.deepcopy(encoder).requires_grad_(False)
     for parent in list(folded.modules()):
         _fuse_children(parent)
-    left = [
-        name
-        for name, module in folded.named_modules()
-        if isinstance(module, nn.modules.batchnorm._BatchNorm)
-    ]
-    if left:
-        raise ValueError(
-            f"{', '.join(left)} cannot be folded; expected each BatchNorm straight after its "
-            "convolution or linear layer; "
-            "register the two in this order"
-        )
     return folded
 
 

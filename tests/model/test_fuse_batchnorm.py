@@ -62,17 +62,21 @@ def test_fuse_leaves_the_encoder_unchanged(lively_encoder: FeatureEncoder) -> No
     assert all(parameter.requires_grad for parameter in lively_encoder.parameters())
 
 
-def test_fuse_rejects_training_mode_and_lone_norms(
-    lively_encoder: FeatureEncoder,
-) -> None:
+def test_fuse_rejects_training_mode(lively_encoder: FeatureEncoder) -> None:
     with pytest.raises(ValueError, match=r"is in training mode, .*; call eval\(\)"):
         fuse_batchnorm(lively_encoder.train())
-    lively_encoder.eval().backbone.maxpool = nn.Sequential(nn.BatchNorm2d(16).eval())
-    with pytest.raises(
-        ValueError,
-        match=r"backbone\.maxpool\.0 cannot be folded; expected each BatchNorm straight after",
-    ):
-        fuse_batchnorm(lively_encoder)
+
+
+@torch.no_grad()
+def test_fuse_leaves_a_norm_that_follows_no_layer() -> None:
+    """USAM's is of the difference to the mean of the neighbours."""
+    encoder = FeatureEncoder(
+        PVDAConfig(backbone="resnet18_usam", width=0.25, image_size=64, parts=2, part_dim=8)
+    ).eval()
+    folded = fuse_batchnorm(encoder)
+    left = [name for name, module in folded.named_modules() if isinstance(module, nn.BatchNorm2d)]
+    assert left == ["backbone.usam_1.norm", "backbone.usam_2.norm"]
+    torch.testing.assert_close(folded(images(4))[1], encoder(images(4))[1], rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize(
