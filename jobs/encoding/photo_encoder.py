@@ -53,8 +53,10 @@ class PhotoEncoder:
         fingerprint: str,
         encoding: EncodingConfig | None,
         shards: str | None = None,
+        images: int | None = None,
     ) -> None:
         """`checkpoint`: the bytes of the file `name`. `fingerprint`, `encoding`: of the index.
+        `images`: that it will encode, about; a compiler is asked where it pays for so many.
 
         `shards` are those that the index was made of: needed only where it was encoded in int8,
         which their images calibrated. Raises CheckpointError when the bytes are no checkpoint,
@@ -89,7 +91,7 @@ class PhotoEncoder:
             batch_size=FORWARD_BATCH,
             precision=encoding.precision,
             mirror=encoding.mirror,
-            compiled=False,  # compiling takes longer than some hundred photos
+            images=images,
             calibration_B3HW=None
             if calibration_B3HW is None
             else torch.from_numpy(calibration_B3HW),

@@ -61,6 +61,7 @@ def locate_photos(
         index.metadata.fingerprint,
         index.metadata.encoding,
         settings.shards,
+        images=len(photos),
     )
     gallery = read_gallery_map(index)
     windows = _open_map(settings, gallery)

@@ -34,6 +34,10 @@ from pipeline.service.photo_map import no_map
 from pipeline.service.predictor import Predictor
 from pipeline.service.replicas import Replicas
 
+WORTH_A_SECOND = 2000
+"""Photos that the encoder is made for: OpenVINO's second pays, and torch.compile's half a minute
+would delay the start."""
+
 
 def load_predictor(
     checkpoint: str,
@@ -55,7 +59,9 @@ def load_predictor(
     def encoder_for(metadata: IndexMetadata) -> PhotoEncoder:
         try:
             data = read_checkpoint_bytes(checkpoint)
-            return PhotoEncoder(data, checkpoint, metadata.fingerprint, metadata.encoding, shards)
+            return PhotoEncoder(
+                data, checkpoint, metadata.fingerprint, metadata.encoding, shards, WORTH_A_SECOND
+            )
         except CheckpointError as error:
             raise InputError(str(error)) from None
 

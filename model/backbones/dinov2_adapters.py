@@ -6,6 +6,7 @@ tokens. Names are those of DINOv2's own files. Shapes: B images, N tokens with t
 first, D numbers of a token, h x w cells.
 """
 
+import math
 import re
 from typing import ClassVar, Self
 
@@ -28,11 +29,12 @@ def resample_bicubic(positions_1ND: Tensor, height: int, width: int) -> Tensor:
     """Positions of a square grid, the class token's first, for another grid: bicubic by a factor
     of (cells + 0.1) / side, as DINOv2's code; the same where the grid is.
     """
-    side = round((positions_1ND.shape[1] - 1) ** 0.5)
+    side = math.isqrt(positions_1ND.shape[1] - 1)
     if (height, width) == (side, side):
         return positions_1ND
     grid_1Dhw = positions_1ND[:, 1:].reshape(1, side, side, -1).permute(0, 3, 1, 2)
-    factors = ((height + 0.1) / side, (width + 0.1) / side)  # without the .1 a cell may be lost
+    # Without the .1 a cell may be lost. Python's numbers, also where the network is traced.
+    factors = ((int(height) + 0.1) / side, (int(width) + 0.1) / side)
     resized_1Dhw = F.interpolate(grid_1Dhw, scale_factor=factors, mode="bicubic")
     return torch.cat([positions_1ND[:, :1], resized_1Dhw.flatten(2).transpose(1, 2)], dim=1)
 

@@ -7,6 +7,7 @@ and the class token. From the public code (Dmmm1997/FSRA). Other transformers ar
 Shapes: B images, N tokens with the class token first, D numbers of a token, h x w cells.
 """
 
+import math
 from typing import ClassVar, Self
 
 import torch
@@ -44,7 +45,7 @@ def resample_positions(positions_1ND: Tensor, height: int, width: int) -> Tensor
     """Positions of a square grid, the class token's first, for another grid: bilinear, as FSRA's
     code; the same where the grid is.
     """
-    side = round((positions_1ND.shape[1] - 1) ** 0.5)
+    side = math.isqrt(positions_1ND.shape[1] - 1)
     if (height, width) == (side, side):
         return positions_1ND
     grid_1Dhw = positions_1ND[:, 1:].reshape(1, side, side, -1).permute(0, 3, 1, 2)

@@ -16,7 +16,9 @@ from torch import Tensor, nn
 from model.inference.precision import EffectivePrecision
 from model.pvda import FeatureEncoder
 
-EncoderKind = Literal["plain", "folded", "compiled"]
+CompiledKind = Literal["compiled", "openvino"]
+"By torch, or by OpenVINO."
+EncoderKind = Literal["plain", "folded"] | CompiledKind
 
 
 def unit_embedding(g_BPD: Tensor) -> Tensor:
@@ -57,8 +59,8 @@ class MirroredEncoder(nn.Module):
             g_BPD: Tensor = self.encoder(both_B3HW)[1]
         g_BPD = g_BPD.float()
         if self.mirror:
-            count = len(images_B3HW)
-            g_BPD = g_BPD[:count] + g_BPD[count:]
+            of_images_BPD, of_mirrored_BPD = g_BPD.chunk(2)  # by no number: a trace would keep it
+            g_BPD = of_images_BPD + of_mirrored_BPD
         return unit_embedding(g_BPD)
 
 
@@ -94,10 +96,9 @@ class FastEncoder:
         """A batch in new memory, whose strides are always the same; padded with black images for
         the compiled encoder.
         """
-        count, rows = (
-            len(images_B3HW),
-            self.batch_size if self.kind == "compiled" else len(images_B3HW),
-        )
+        count = len(images_B3HW)
+        # At least one: OpenVINO takes no empty batch.
+        rows = self.batch_size if self.kind == "compiled" else max(1, count)
         shape = (rows, *images_B3HW.shape[1:])
         batch_B3HW = torch.empty(
             shape, dtype=torch.uint8, device=self.device, memory_format=torch.channels_last

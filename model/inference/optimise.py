@@ -5,6 +5,7 @@ BatchNorm fused, channels last, image and mirror image in one batch, compiled wh
 bfloat16 or 8-bit integers on request. Shapes: B images, E numbers of an embedding.
 """
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from model.inference.compile import NotCompiled, compile_frozen
-from model.inference.embed import EncoderKind, FastEncoder, MirroredEncoder, embed
+from model.inference.embed import CompiledKind, EncoderKind, FastEncoder, MirroredEncoder, embed
 from model.inference.fuse_batchnorm import fuse_batchnorm
 from model.inference.fuse_padding import fuse_padding
 from model.inference.int8 import (
@@ -25,16 +26,17 @@ from model.inference.int8 import (
     require_int8,
     require_quantizable,
 )
+from model.inference.openvino_runtime import compile_openvino
 from model.inference.precision import EffectivePrecision, Precision, effective_precision
 from model.pvda import FeatureEncoder
 
 MIN_COSINE: dict[EffectivePrecision, float] = {"float32": 0.9999, "bfloat16": 0.999, "int8": 0.99}
 """Required cosine between the fast and the plain embedding of a probe image: of the worst image,
 for int8 of their mean."""
-COMPILE_BREAK_EVEN_S = 120.0
-"""Seconds that the folded encoder would need for all images. Compiling ResNet-50 for 256 px took 13
-to 25 s on two busy cores and saved a quarter of each image's time, so from two minutes on it has
-paid; slower machines compile slower, too."""
+COMPILE_BREAK_EVEN_S: dict[CompiledKind, float] = {"compiled": 120.0, "openvino": 4.0}
+"""Seconds that the folded encoder would need for all images. torch took 13 to 25 s for ResNet-50 at
+256 px on two busy cores and saved a quarter of each image's time, so from two minutes on it has
+paid; OpenVINO takes one or two and saves half. Slower machines compile slower, too."""
 Log = Callable[[str], None]
 
 
@@ -99,10 +101,9 @@ def optimise_encoder(
                 f"{fast.agreement:.4f}, expected at least "
                 f"{MIN_COSINE[wanted]}; choose --precision float32"
             )
-    elif compiled is True or (
-        compiled == "auto" and images is not None and _compiling_pays(fast, probe_B3HW, images)
-    ):
-        fast = _compile(module, check, fast, log)
+    elif compiled:
+        seconds = math.inf if compiled is True else _seconds(fast, probe_B3HW, images or 0)
+        fast = _compile_if_it_pays(seconds, module, check, log) or fast
     log(f"{fast.kind} encoder in {wanted}: {check.describe(fast)}")
     return fast
 
@@ -142,27 +143,45 @@ class _AgreementCheck:
         return black_B3HW.to(memory_format=torch.channels_last)
 
 
+def _compile_if_it_pays(
+    seconds: float, module: MirroredEncoder, check: _AgreementCheck, log: Log
+) -> FastEncoder | None:
+    """`module`, which would need so many seconds folded, by the first compiler that pays and is
+    able to.
+    """
+    kinds: list[CompiledKind] = ["compiled"]
+    if check.device.type == "cpu" and check.precision == "float32":
+        kinds.insert(0, "openvino")
+    for kind in kinds:
+        if seconds >= COMPILE_BREAK_EVEN_S[kind] and (fast := _compile(kind, module, check, log)):
+            return fast
+    return None
+
+
 def _compile(
-    module: MirroredEncoder, check: _AgreementCheck, folded: FastEncoder, log: Log
-) -> FastEncoder:
-    """`module` compiled; or `folded`, its uncompiled form, with the reason logged."""
-    log(
-        f"compiling the encoder for batches of {check.batch_size}: this takes a while, less where "
-        "it was done before"
-    )
+    kind: CompiledKind, module: MirroredEncoder, check: _AgreementCheck, log: Log
+) -> FastEncoder | None:
+    """`module` compiled; None with the reason logged where it cannot be, or disagrees."""
+    if kind == "compiled":
+        log(
+            f"compiling the encoder for batches of {check.batch_size}: this takes a while, less "
+            "where it was done before"
+        )
     start = time.perf_counter()
+    compile_module = compile_openvino if kind == "openvino" else compile_frozen
+    by = "OpenVINO" if kind == "openvino" else "torch"
     try:
-        fast = check.measure("compiled", compile_frozen(module, check.batch()))
+        fast = check.measure(kind, compile_module(module, check.batch()))
     except NotCompiled as error:
-        log(f"the encoder cannot be compiled here ({error}); continuing uncompiled")
-        return folded
-    log(f"compiled in {time.perf_counter() - start:.0f} s")
+        log(f"the encoder cannot be compiled by {by} here ({error}); continuing without")
+        return None
     if not fast.agreement >= MIN_COSINE[check.precision]:
         log(
-            f"the compiled encoder disagrees with the plain one ({check.describe(fast)}); "
-            "continuing uncompiled"
+            f"the encoder compiled by {by} disagrees with the plain one "
+            f"({check.describe(fast)}); continuing without"
         )
-        return folded
+        return None
+    log(f"compiled by {by} in {time.perf_counter() - start:.0f} s")
     return fast
 
 
@@ -203,13 +222,11 @@ def _int8(
     return fast
 
 
-def _compiling_pays(fast: FastEncoder, probe_B3HW: Tensor, images: int) -> bool:
-    """Whether `images` images would take `fast` long enough for compiling to pay. The check has
-    warmed it up.
-    """
+def _seconds(fast: FastEncoder, probe_B3HW: Tensor, images: int) -> float:
+    """That `fast` needs for so many images. The check has warmed it up."""
     start = time.perf_counter()
     fast(probe_B3HW).cpu()  # waits for the device
-    return (time.perf_counter() - start) / len(probe_B3HW) * images >= COMPILE_BREAK_EVEN_S
+    return (time.perf_counter() - start) / len(probe_B3HW) * images
 
 
 def _embed_plain(

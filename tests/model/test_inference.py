@@ -48,19 +48,21 @@ def rolled() -> Callable[[MirroredEncoder, Tensor], Tensor]:
     return lambda self, images_B3HW: forward(self, images_B3HW).roll(1, dims=1)
 
 
+@pytest.mark.parametrize("kind", ["folded", "openvino"])
 @pytest.mark.parametrize("mirror", [True, False])
-def test_folded_encoder_equals_plain(lively_encoder: FeatureEncoder, mirror: bool) -> None:
+def test_fast_encoder_equals_plain(lively_encoder: FeatureEncoder, mirror: bool, kind: str) -> None:
     """With `mirror` this is one batch of images and mirror images against two passes; 6 images are
     a batch and a half.
     """
-    encoder, said = fast(lively_encoder, mirror=mirror)
-    assert (encoder.kind, encoder.precision) == ("folded", "float32")
+    encoder, said = fast(lively_encoder, mirror=mirror, compiled=kind == "openvino")
+    assert (encoder.kind, encoder.precision) == (kind, "float32")
     assert encoder.agreement > 1 - 1e-5
-    assert said == [
-        "folded encoder in float32: cosine with the plain one 1.000000 in the mean, 1.000000 at "
+    assert said[-1] == (
+        f"{kind} encoder in float32: cosine with the plain one 1.000000 in the mean, 1.000000 at "
         "worst, over 6 images"
-    ]
-    found_BE = encoder(images(7, seed=5))
+    )
+    with torch.inference_mode():  # whatever the caller is in
+        found_BE = encoder(images(7, seed=5))
     assert found_BE.dtype == torch.float32
     torch.testing.assert_close(
         found_BE, embed(lively_encoder, images(7, seed=5), mirror), rtol=0, atol=1e-5
@@ -84,19 +86,21 @@ def test_optimise_falls_back_to_plain_encoder(
     )
 
 
-def test_optimise_falls_back_from_wrong_compiled_encoder(
+def test_optimise_falls_back_from_wrong_compiled_encoders(
     lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def wrong(module: MirroredEncoder, batch_B3HW: Tensor) -> Callable[[Tensor], Tensor]:
         return lambda images_B3HW: torch.full((len(images_B3HW), 32), torch.nan)
 
+    monkeypatch.setattr(optimise, "compile_openvino", wrong)
     monkeypatch.setattr(optimise, "compile_frozen", wrong)
     encoder, said = fast(lively_encoder, compiled=True)
     assert encoder.kind == "folded"
-    assert (
-        "the compiled encoder disagrees with the plain one (cosine with the plain one nan in the "
-        "mean" in said[2]
-    )
+    for line, compiler in ((said[0], "OpenVINO"), (said[2], "torch")):
+        assert line.startswith(
+            f"the encoder compiled by {compiler} disagrees with the plain one (cosine with the "
+            "plain one nan in the mean"
+        )
 
 
 @pytest.mark.parametrize(
@@ -126,25 +130,44 @@ def test_compile_is_skipped_where_it_does_not_pay(
         raise RuntimeError("no C++ compiler\nand a long story")
 
     monkeypatch.setattr(torch, "compile", lambda *_, **__: fail)
+    monkeypatch.setattr(torch.jit, "trace", fail)
     for count in (None, 100):
         assert len(fast(lively_encoder, compiled="auto", images=count)[1]) == 1
     for compiled, count in (("auto", 10**9), (True, None)):
         encoder, said = fast(lively_encoder, compiled=compiled, images=count)
         assert encoder.kind == "folded"
-        assert said[0].startswith("compiling the encoder for batches of 4")
-        assert (
-            said[1] == "the encoder cannot be compiled here (RuntimeError: no C++ compiler); "
-            "continuing uncompiled"
-        )
+        assert said[1].startswith("compiling the encoder for batches of 4")
+        for line, compiler in ((said[0], "OpenVINO"), (said[2], "torch")):
+            assert line == (
+                f"the encoder cannot be compiled by {compiler} here (RuntimeError: no C++ "
+                "compiler); continuing without"
+            )
+
+
+def test_openvino_pays_for_fewer_images_than_torch(
+    lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(optimise, "_seconds", lambda *_: 10.0)
+    encoder, said = fast(lively_encoder, compiled="auto", images=9)
+    assert encoder.kind == "openvino"
+    assert [line.split(" ")[0] for line in said] == ["compiled", "openvino"]
+    in_one_batch_BE = encoder(images(4))
+    assert torch.equal(encoder(images(4)[2:3]), in_one_batch_BE[2:3])  # to the bit
 
 
 @pytest.mark.slow
 @needs_compiler
-def test_compiled_encoder_equals_plain(lively_encoder: FeatureEncoder) -> None:
+def test_compiled_encoder_equals_plain(
+    lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise NotCompiled("an operation that it does not know")
+
+    monkeypatch.setattr(optimise, "compile_openvino", fail)
     encoder, said = fast(lively_encoder, compiled=True)
     assert (encoder.kind, encoder.precision) == ("compiled", "float32")
     assert encoder.agreement > 1 - 1e-5
-    assert [line.split(" ")[0] for line in said] == ["compiling", "compiled", "compiled"]
+    assert [line.split(" ")[0] for line in said[1:]] == ["compiling", "compiled", "compiled"]
     with (
         torch.inference_mode(),
         torch._dynamo.config.patch(error_on_recompile=True),
