@@ -53,12 +53,8 @@ SLOW_FIXTURES = RAY_FIXTURES | {"prepared", "browser"}
 does with tests/fuzz, and with tests and files that are marked."""
 STARTS = re.compile(r"\b(ray_session|ray_cluster|ray_address|prepared|adapted_region)\b")
 "In a file of tests: it needs the session's Ray, or the process that starts jobs."
-RAY_UNITS = {
-    "training": ("tests/jobs/",),
-    "regions and benchmarks": ("tests/region/", "tests/test_benchmarks.py"),
-    "other stages": ("tests/",),
-}
-"""Beginnings of such files' names: of several test processes (pytest -n), one runs a unit to its
+RAY_UNITS = {"training": "tests/jobs/", "other stages": "tests/"}
+"""Beginning of such files' names: of several test processes (pytest -n), one runs a unit to its
 end, with a Ray and a launcher of its own. Of the others, each file is a unit."""
 
 
@@ -67,7 +63,7 @@ def unit_of(file: str) -> str:
     """The name of a file's unit."""
     if not STARTS.search((ROOT / file).read_text()):
         return file
-    return next(unit for unit, begins in RAY_UNITS.items() if file.startswith(begins))
+    return next(unit for unit, begin in RAY_UNITS.items() if file.startswith(begin))
 
 
 def pytest_collection_finish() -> None:

@@ -103,7 +103,7 @@ CASES: dict[str, tuple[str, str]] = {
     ),
     "region": (
         "--out {adapted} --side 400 --resolution 0.5 --minutes 0.01 --photos 1 --checks 20 "
-        "--height 60 80 --pitch -90 -75 --tile-m 55 110",
+        "--height 60 80 --pitch -90 -75 --tile-m 55 110 --tags without",
         r"\| after, without \| [\d.]+% \|.* [\d.]+ x \|(.|\n)*"
         r"\| plain SIFT over the whole map, without .* [\d.]+ x \|",
     ),

@@ -4,11 +4,9 @@ worker's death.
 
 import json
 import os
-import random
 import signal
 import threading
 import time
-from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -19,50 +17,23 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from jobs.training.checkpoints import CheckpointWriter, list_archived
 from jobs.training.driver import train
-from jobs.training.recipes.pvda import smoke
-from jobs.training.recipes.recipe import Recipe
 from jobs.training.settings import TrainSettings
 from model.checkpoint import Checkpoint, loads
 from model.training import Training
 from pipeline.core import cluster
 from pipeline.core.errors import Incomplete
-from tests.launcher import Launcher, RunningJob
+from tests.jobs.tiny_runs import settings as tiny_settings
+from tests.jobs.tiny_runs import tiny
 from tests.processes import command_line, descendants, send_signal
 
 pytestmark = pytest.mark.slow
 
 TIMES = {"seconds", "images_per_second"}
-FLAGS = (
-    "--epochs",
-    3,
-    "--batch-size",
-    2,
-    "--part-dim",
-    16,
-    "--discriminator-channels",
-    16,
-    "--dropout",
-    0.5,
-)
-
-
-def tiny(epochs: int = 3) -> Recipe:
-    """Three steps an epoch on the tiny world's six satellite images."""
-    recipe = smoke(epochs)
-    network = replace(recipe.network, part_dim=16, discriminator_channels=16, dropout=0.5)
-    return replace(recipe, network=network, batch_size=2)
 
 
 def settings(shards: str, out: Path, **changes: Any) -> TrainSettings:
-    """Every step leaves a checkpoint."""
-    given: dict[str, Any] = {
-        "recipe": tiny(),
-        "shards": shards,
-        "out": str(out),
-        "workers": 0,
-        "checkpoint_minutes": 0.0,
-    }
-    return TrainSettings(**(given | changes))
+    """Three epochs, where nothing else is said."""
+    return tiny_settings(shards, out, **({"recipe": tiny(3)} | changes))
 
 
 def rows(out: Path) -> list[dict[str, Any]]:
@@ -123,34 +94,6 @@ def test_train_killed_resumes_to_the_same_bits(
     ]
     train(settings(tiny_shards, tmp_path, **changes))
     assert_same_run(tmp_path, undisturbed)
-
-
-def test_train_killed_at_random_resumes_to_the_same_end(
-    tiny_shards: str, tmp_path: Path, undisturbed: Path, prepared: Launcher
-) -> None:
-    def begin(out: Path) -> RunningJob:
-        flags = (
-            "--shards",
-            tiny_shards,
-            "--out",
-            out,
-            "--workers",
-            0,
-            "--checkpoint-minutes",
-            0,
-            *FLAGS,
-        )
-        return prepared.start("train", ["smoke", *map(str, flags)])
-
-    job = begin(tmp_path / "killed")
-    while not (tmp_path / "killed" / "last.pt").exists():
-        assert job.code is None
-        time.sleep(0.01)
-    job.end(job.seconds + random.uniform(0, 1.5))
-    time.sleep(1)  # TensorBoard orders a run's files by the second in which each was begun
-    assert begin(tmp_path / "killed").end().code == 0
-    assert_same_run(tmp_path / "killed", undisturbed)
-    assert on_board(tmp_path / "killed") == [1, 2, 3]
 
 
 @pytest.mark.parametrize("written", [False, True])
