@@ -7,16 +7,20 @@ encoders alternate, so that other work on the machine slows all of them. Prints 
 import argparse
 import time
 from collections.abc import Callable
-from pathlib import Path
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from unittest.mock import patch
 
 import torch
 from embedding_worker import recipe_of, soft_noise
 from torch import Tensor, nn
 
-from jobs.encoding.encoder import trained_on_mirrors
+from jobs.encoding.encoder import read_checkpoint_bytes, trained_on_mirrors
 from model.backbones import BACKBONES
 from model.checkpoint import build_encoder, loads
 from model.config import PVDAConfig
+from model.inference import optimise
+from model.inference.compile import NotCompiled
 from model.inference.embed import FastEncoder, embed
 from model.inference.int8 import PrecisionError
 from model.inference.optimise import MIN_COSINE, optimise_encoder
@@ -25,11 +29,12 @@ from model.pvda import FeatureEncoder
 
 CHOICES: dict[str, tuple[Precision, bool]] = {
     "folded": ("float32", False),
+    "openvino": ("float32", True),
     "compiled": ("float32", True),
     "bfloat16": ("bfloat16", True),
     "int8": ("int8", True),
 }
-"Name -> precision, and whether it is compiled."
+"Name -> precision, and whether it is compiled; `compiled` by torch, also where OpenVINO could."
 
 
 @torch.no_grad()
@@ -50,6 +55,12 @@ def random_encoder(config: PVDAConfig) -> FeatureEncoder:
             module.bias.normal_(0, 0.3)
     encoder(soft_noise(16, config.image_size, seed=1))
     return encoder.eval()
+
+
+def by_torch() -> AbstractContextManager[object]:
+    """Within it, OpenVINO compiles nothing."""
+    left_out = NotCompiled("left out, to compare")
+    return patch.object(optimise, "compile_openvino", side_effect=left_out)
 
 
 def pass_seconds(encode: Callable[[Tensor], Tensor], images_B3HW: Tensor, device: str) -> float:
@@ -80,16 +91,17 @@ def compare_encoders(
         precision, compiled = CHOICES[name]
         begin = time.perf_counter()
         try:
-            optimised[name] = encoders[name] = optimise_encoder(
-                plain,
-                precision=precision,
-                mirror=mirror,
-                compiled=compiled,
-                batch_size=batch,
-                probe_B3HW=probe_B3HW,
-                calibration_B3HW=soft_noise(args.calibration, size, seed=4),
-                log=lambda message: None,
-            )
+            with by_torch() if name == "compiled" else nullcontext():
+                optimised[name] = encoders[name] = optimise_encoder(
+                    plain,
+                    precision=precision,
+                    mirror=mirror,
+                    compiled=compiled,
+                    batch_size=batch,
+                    probe_B3HW=probe_B3HW,
+                    calibration_B3HW=soft_noise(args.calibration, size, seed=4),
+                    log=lambda message: None,
+                )
         except PrecisionError as error:
             print(f"{name}: not available here: {error}")
         else:
@@ -119,11 +131,11 @@ def compare_encoders(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     add = parser.add_argument
-    add("--checkpoint", help="a last.pt; by default random weights")
+    add("--checkpoint", help="builtin, or a last.pt; by default random weights")
     add("--backbone", default="resnet50", choices=BACKBONES, help="with its recipe's rings")
     add("--width", type=float, default=1.0, help="its channels, as a multiple")
-    add("--size", type=int, default=256, help="side of its images, pixels")
-    add("--encoders", nargs="*", choices=CHOICES, default=["folded", "compiled", "int8"])
+    add("--size", type=int, help="side of its images, pixels; by default its recipe's, or 256")
+    add("--encoders", nargs="*", choices=CHOICES, default=["folded", "openvino", "compiled"])
     add("--batch-size", type=int, default=16)
     add("--rounds", type=int, default=3, help="alternating rounds, of which the best counts")
     add("--probes", type=int, default=16, help="images that the agreement is measured on")
@@ -132,11 +144,12 @@ def main() -> None:
     args = parser.parse_args()
     args.device = "cuda" if torch.cuda.is_available() else "cpu"
     if args.checkpoint:
-        checkpoint = loads(Path(args.checkpoint).read_bytes(), args.checkpoint)
-        config, encoder = checkpoint.network, build_encoder(checkpoint)
+        checkpoint = loads(read_checkpoint_bytes(args.checkpoint), args.checkpoint)
+        encoder = build_encoder(checkpoint)
+        config = replace(checkpoint.network, image_size=args.size or checkpoint.network.image_size)
         mirror = trained_on_mirrors(checkpoint)
     else:
-        recipe = recipe_of(args.backbone, args.width, args.size)
+        recipe = recipe_of(args.backbone, args.width, args.size or 256)
         config, encoder = recipe.network, random_encoder(recipe.network)
         mirror = recipe.augmentation.mirror
     print(f"{args.device}, torch {torch.__version__}, {torch.get_num_threads()} threads")

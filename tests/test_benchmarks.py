@@ -42,8 +42,8 @@ CASES: dict[str, tuple[str, str]] = {
         r"nearest is right: [\d.]+% by random weights, [\d.]+% trained, [\d.]+ x",
     ),
     "embed": (
-        f"{ONE_ROUND} --encoders folded --probes 2 --calibration 2 --batch-size 2",
-        r"folded: [\d.]+ x the plain encoder's images per second",
+        f"{ONE_ROUND} --encoders folded openvino --probes 2 --calibration 2 --batch-size 2",
+        r"openvino: [\d.]+ x the plain encoder's images per second",
     ),
     "embed_pipeline": (
         f"{ONE_ROUND} --distinct 4 --seconds 0.1 --few 0",
