@@ -115,7 +115,7 @@ def compare_encoders(
     print(f"plain: {batch / baseline:.2f} images/s")
     for name, seconds in best.items():
         fast = optimised[name]
-        agreement = fast.mean_agreement if fast.precision == "int8" else fast.agreement
+        agreement = fast.agreement if fast.precision == "float32" else fast.mean_agreement
         refused = ", which a job would refuse" * (agreement < required[fast.precision])
         print(
             f"{name}: {baseline / seconds:.2f} x the plain encoder's images per second "

@@ -78,8 +78,8 @@ def hits(
     `searched` (Q,), and the photos' places. `size`: side of the images, the network's where None.
     """
     shards = open_shards(shards_folder)
-    queries, _ = embed_view(shards, asked, View.DRONE, checkpoint, size)
-    gallery, _ = embed_view(shards, searched, View.SATELLITE, checkpoint, size)
+    queries = embed_view(shards, asked, View.DRONE, checkpoint, size).rows
+    gallery = embed_view(shards, searched, View.SATELLITE, checkpoint, size).rows
     return hits_at(1, rank(queries, gallery, top=1).first_rank_Q), queries.locations
 
 

@@ -60,7 +60,7 @@ CASES: dict[str, tuple[str, str]] = {
     ),
     "encoders": (
         "--shards {trained}/shards {trained}/run/last.pt builtin",
-        r"builtin: R@1 .* [\d.]+ x the first encoder's",
+        r"builtin, float32: R@1 .* [\d.]+ x the first encoder's",
     ),
     "evaluate": ("--scale 0.01", r"satellite->drone .* [\d.]+ x the float32 products"),
     "gpu": (

@@ -89,7 +89,7 @@ def test_optimise_falls_back_to_plain_encoder(
 def test_optimise_falls_back_from_wrong_compiled_encoders(
     lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def wrong(module: MirroredEncoder, batch_B3HW: Tensor) -> Callable[[Tensor], Tensor]:
+    def wrong(*_: object) -> Callable[[Tensor], Tensor]:
         return lambda images_B3HW: torch.full((len(images_B3HW), 32), torch.nan)
 
     monkeypatch.setattr(optimise, "compile_openvino", wrong)
@@ -104,7 +104,7 @@ def test_optimise_falls_back_from_wrong_compiled_encoders(
 
 
 @pytest.mark.parametrize(
-    ("least", "error"), [(0.999, None), (1.1, "bfloat16 embeddings agree .* by a cosine of")]
+    ("least", "error"), [(0.999, None), (1.1, "bfloat16 embeddings agree .* by a mean cosine of")]
 )
 def test_bfloat16_never_falls_back_to_float32(
     lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch, least: float, error: str | None
@@ -149,10 +149,12 @@ def test_openvino_pays_for_fewer_images_than_torch(
 ) -> None:
     monkeypatch.setattr(optimise, "_seconds", lambda *_: 10.0)
     encoder, said = fast(lively_encoder, compiled="auto", images=9)
-    assert encoder.kind == "openvino"
+    assert (encoder.kind, encoder.precision) == ("openvino", "float32")
     assert [line.split(" ")[0] for line in said] == ["compiled", "openvino"]
     in_one_batch_BE = encoder(images(4))
     assert torch.equal(encoder(images(4)[2:3]), in_one_batch_BE[2:3])  # to the bit
+    rounded, _ = fast(lively_encoder, compiled="auto", images=9, precision="bfloat16")
+    assert (rounded.kind, rounded.precision) == ("openvino", "bfloat16")
 
 
 @pytest.mark.slow
