@@ -33,6 +33,9 @@ class Schedule:
     "Whether the rates return to their start when alpha grows [paper: warm restart]."
     warmup_epochs: float = 0.0
     "Linear growth of the rates from zero at the start of training [paper: none]."
+    cool_down_epochs: float = 0.0
+    """The last of all epochs, in which the rates fall to zero by a cosine: restarts keep them high
+    to the end [paper: none]."""
 
     def __post_init__(self) -> None:
         if self.epochs < 1 or self.period < 1:
@@ -51,6 +54,7 @@ class Schedule:
             period=max(1, round(self.period * share)),
             decay_epochs=tuple(round(epoch * share) for epoch in self.decay_epochs),
             warmup_epochs=self.warmup_epochs * share,
+            cool_down_epochs=self.cool_down_epochs * share,
         )
 
 
@@ -64,18 +68,26 @@ class ScheduleState:
 
 
 def schedule_at(schedule: Schedule, epoch: float) -> ScheduleState:
-    """Alpha and learning-rate scale after `epoch` passes; fractions of an epoch matter to warm-up
-    and cosine only.
+    """Alpha and learning-rate scale after `epoch` passes; fractions of an epoch matter to warm-up,
+    cool-down and cosine only.
     """
     completed = math.floor(epoch)
     periods, within = divmod(completed, schedule.period)
     alpha = schedule.alpha + periods * schedule.alpha_step
     if schedule.lr_schedule == "cosine":
-        scale = 0.5 * (1 + math.cos(math.pi * min(1.0, epoch / schedule.epochs)))
+        scale = _cosine(min(1.0, epoch / schedule.epochs))
     else:
         counted = within if schedule.restart else completed
         scale = schedule.decay ** sum(counted >= at for at in schedule.decay_epochs)
     if epoch < schedule.warmup_epochs:
         scale *= epoch / schedule.warmup_epochs
+    left = schedule.epochs - epoch
+    if left < schedule.cool_down_epochs:
+        scale *= _cosine(1 - left / schedule.cool_down_epochs)
     # Ten digits, so that 0.9 + 2 * 0.1 prints and compares as 1.1.
     return ScheduleState(alpha=round(alpha, 10), lr_scale=scale)
+
+
+def _cosine(share: float) -> float:
+    """From 1 at 0 to 0 at 1."""
+    return 0.5 * (1 + math.cos(math.pi * share))

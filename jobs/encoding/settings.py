@@ -30,5 +30,5 @@ class EncoderSettings:
     """float32; bfloat16; int8, for CPUs that multiply 8-bit integers fast, calibrated by images of
     the shards; auto: bfloat16 on GPUs, else float32."""
     compiling: Compiling = "auto"
-    """Whether the encoder is compiled, on CPUs by OpenVINO (int8: by torch), on GPUs by torch; auto:
-    where that saves more time than it takes."""
+    """Whether the encoder is compiled, on CPUs by OpenVINO (int8: by torch), on GPUs by torch;
+    auto: where that saves more time than it takes."""

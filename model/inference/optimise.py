@@ -89,13 +89,13 @@ def optimise_encoder(
     if wanted == "int8":
         return _int8(module, check, calibration_B3HW, log)
     fast = check.measure("folded", module)
-    if not agrees(fast):
+    if not _agrees(fast):
         log(
             f"the folded encoder disagrees with the plain one ({check.describe(fast)}); "
             "the plain one is used"
         )
         fast = check.measure("plain", partial(_embed_plain, encoder, mirror, wanted == "bfloat16"))
-        if wanted != "float32" and not agrees(fast):
+        if wanted != "float32" and not _agrees(fast):
             raise PrecisionError(
                 f"{wanted} embeddings agree with the float32 ones by a mean cosine of "
                 f"{fast.mean_agreement:.4f}, expected at least "
@@ -108,7 +108,7 @@ def optimise_encoder(
     return fast
 
 
-def agrees(fast: FastEncoder) -> bool:
+def _agrees(fast: FastEncoder) -> bool:
     """Whether it agrees with the plain encoder as its precision has to; NaN agrees with nothing."""
     found = fast.agreement if fast.precision == "float32" else fast.mean_agreement
     return found >= MIN_COSINE[fast.precision]
@@ -185,7 +185,7 @@ def _compile(
     except NotCompiled as error:
         log(f"the encoder cannot be compiled by {by} here ({error}); continuing without")
         return None
-    if not agrees(fast):
+    if not _agrees(fast):
         log(
             f"the encoder compiled by {by} disagrees with the plain one "
             f"({check.describe(fast)}); continuing without"
@@ -222,7 +222,7 @@ def _int8(
             "--precision float32"
         ) from error
     log(f"int8 encoder, made in {time.perf_counter() - start:.0f} s: {check.describe(fast)}")
-    if not agrees(fast):
+    if not _agrees(fast):
         raise PrecisionError(
             "int8 embeddings agree with the float32 ones by a mean cosine of "
             f"{fast.mean_agreement:.4f}, expected at least "

@@ -78,6 +78,14 @@ def test_schedule_warm_up_grows_by_steps() -> None:
     assert schedule_at(warm, 100) == schedule_at(cold, 100)
 
 
+def test_schedule_cool_down_ends_at_zero() -> None:
+    cooled = Schedule(epochs=300, cool_down_epochs=20)
+    assert schedule_at(cooled, 279.5) == schedule_at(Schedule(epochs=300), 279.5)
+    scales = [schedule_at(cooled, epoch).lr_scale for epoch in (280, 290, 300)]
+    assert scales == pytest.approx([1, 0.5, 0])  # a period begins at 280
+    assert cooled.scaled_to(30).cool_down_epochs == 2
+
+
 @settings(max_examples=50)
 @given(
     schedule=st.builds(
@@ -89,6 +97,7 @@ def test_schedule_warm_up_grows_by_steps() -> None:
         lr_schedule=st.sampled_from(["step", "cosine"]),
         restart=st.booleans(),
         warmup_epochs=st.floats(0, 10),
+        cool_down_epochs=st.floats(0, 10),
     ),
     share=st.floats(0, 1),
 )
