@@ -115,8 +115,8 @@ def compare_encoders(
     print(f"plain: {batch / baseline:.2f} images/s")
     for name, seconds in best.items():
         fast = optimised[name]
-        agreement = fast.agreement if fast.precision == "float32" else fast.mean_agreement
-        refused = ", which a job would refuse" * (agreement < required[fast.precision])
+        is_refused = fast.judged_agreement < required[fast.precision]
+        refused = ", which a job would refuse" * is_refused
         print(
             f"{name}: {baseline / seconds:.2f} x the plain encoder's images per second "
             f"({batch / seconds:.2f} images/s; {fast.kind}; cosine with the plain one "

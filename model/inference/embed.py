@@ -84,6 +84,13 @@ class FastEncoder:
     run: Callable[[Tensor], Tensor]
     "Embeds one batch."
 
+    @property
+    def judged_agreement(self) -> float:
+        """The cosine that it is judged by: of the worst image in float32, else the mean, for which
+        image is rounded badly is a matter of chance.
+        """
+        return self.agreement if self.precision == "float32" else self.mean_agreement
+
     def __call__(self, images_B3HW: Tensor) -> Tensor:
         # Never in inference mode, even within a caller's: the compiler treats such tensors as other
         # inputs and compiles again.

@@ -15,8 +15,8 @@ from model.inference.compile import EmbedBatch, NotCompiled
 from model.inference.precision import EffectivePrecision
 
 PRECISIONS: dict[EffectivePrecision, str] = {"float32": "f32", "bfloat16": "bf16"}
-"That it is asked for, and OpenVINO's names of them. Where a CPU does not multiply bfloat16 it "
-"computes in float32."
+"""That it is asked for, and OpenVINO's names of them. Where a CPU does not multiply bfloat16 it
+computes in float32."""
 SETTINGS = {
     "PERFORMANCE_HINT": "LATENCY",  # one batch at a time, on all threads
     "ENABLE_CPU_PINNING": False,  # other processes and decoding threads share the cores

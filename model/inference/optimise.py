@@ -31,8 +31,8 @@ from model.inference.precision import EffectivePrecision, Precision, effective_p
 from model.pvda import FeatureEncoder
 
 MIN_COSINE: dict[EffectivePrecision, float] = {"float32": 0.9999, "bfloat16": 0.99, "int8": 0.99}
-"""Required cosine between the fast and the plain embedding of a probe image: of the worst image in
-float32, of their mean in the other precisions."""
+"""Required cosine between the fast and the plain embedding of a probe image:
+`FastEncoder.judged_agreement`."""
 COMPILE_BREAK_EVEN_S: dict[CompiledKind, float] = {"compiled": 120.0, "openvino": 4.0}
 """Seconds that the folded encoder would need for all images. torch took 13 to 25 s for ResNet-50 at
 256 px on two busy cores and saved a quarter of each image's time, so from two minutes on it has
@@ -110,8 +110,7 @@ def optimise_encoder(
 
 def _agrees(fast: FastEncoder) -> bool:
     """Whether it agrees with the plain encoder as its precision has to; NaN agrees with nothing."""
-    found = fast.agreement if fast.precision == "float32" else fast.mean_agreement
-    return found >= MIN_COSINE[fast.precision]
+    return fast.judged_agreement >= MIN_COSINE[fast.precision]
 
 
 @dataclass(frozen=True, kw_only=True)
