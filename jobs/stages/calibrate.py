@@ -65,7 +65,6 @@ def calibrate_index(settings: CalibrateSettings) -> Calibration:
         index.metadata.fingerprint,
         index.metadata.encoding,
         settings.shards,
-        images=settings.photos,
     )
     gallery = read_gallery_map(index)
     context = CalibrationContext(

@@ -33,10 +33,13 @@ from model.pvda import FeatureEncoder
 MIN_COSINE: dict[EffectivePrecision, float] = {"float32": 0.9999, "bfloat16": 0.99, "int8": 0.99}
 """Required cosine between the fast and the plain embedding of a probe image:
 `FastEncoder.judged_agreement`."""
-COMPILE_BREAK_EVEN_S: dict[CompiledKind, float] = {"compiled": 120.0, "openvino": 4.0}
-"""Seconds that the folded encoder would need for all images. torch took 13 to 25 s for ResNet-50 at
-256 px on two busy cores and saved a quarter of each image's time, so from two minutes on it has
-paid; OpenVINO takes one or two and saves half. Slower machines compile slower, too."""
+COMPILE_BREAK_EVEN_S = 120.0
+"""Seconds that the folded encoder would need for all images. Compiling ResNet-50 for 256 px took
+torch 13 to 25 s on two busy cores and saved a quarter of each image's time, so from two minutes on
+it has paid; slower machines compile slower, too."""
+OPENVINO_PAYS_FROM = 256
+"""Images: it takes a second or two and saves half of 6 to 200 ms. By their number and not by their
+time, so that the same images have the same bits each time."""
 Log = Callable[[str], None]
 
 
@@ -102,8 +105,8 @@ def optimise_encoder(
                 f"{MIN_COSINE[wanted]}; choose --precision float32"
             )
     elif compiled:
-        seconds = math.inf if compiled is True else _seconds(fast, probe_B3HW, images or 0)
-        fast = _compile_if_it_pays(seconds, module, check, log) or fast
+        count = math.inf if compiled is True else images or 0
+        fast = _compile_if_it_pays(count, module, check, fast, log) or fast
     log(f"{fast.kind} encoder in {wanted}: {check.describe(fast)}")
     return fast
 
@@ -149,17 +152,16 @@ class _AgreementCheck:
 
 
 def _compile_if_it_pays(
-    seconds: float, module: MirroredEncoder, check: _AgreementCheck, log: Log
+    images: float, module: MirroredEncoder, check: _AgreementCheck, folded: FastEncoder, log: Log
 ) -> FastEncoder | None:
-    """`module`, which would need so many seconds folded, by the first compiler that pays and is
-    able to.
-    """
-    kinds: list[CompiledKind] = ["compiled"]
-    if check.device.type == "cpu" and check.precision in PRECISIONS:
-        kinds.insert(0, "openvino")
-    for kind in kinds:
-        if seconds >= COMPILE_BREAK_EVEN_S[kind] and (fast := _compile(kind, module, check, log)):
+    """`module` compiled for so many images by the first compiler that pays and is able to."""
+    in_openvino = check.device.type == "cpu" and check.precision in PRECISIONS
+    if in_openvino and images >= OPENVINO_PAYS_FROM:
+        fast = _compile("openvino", module, check, log)
+        if fast is not None:
             return fast
+    if _seconds(folded, check.probe_B3HW) * images >= COMPILE_BREAK_EVEN_S:
+        return _compile("compiled", module, check, log)
     return None
 
 
@@ -231,11 +233,11 @@ def _int8(
     return fast
 
 
-def _seconds(fast: FastEncoder, probe_B3HW: Tensor, images: int) -> float:
-    """That `fast` needs for so many images. The check has warmed it up."""
+def _seconds(fast: FastEncoder, probe_B3HW: Tensor) -> float:
+    """That `fast` needs for an image. The check has warmed it up."""
     start = time.perf_counter()
     fast(probe_B3HW).cpu()  # waits for the device
-    return (time.perf_counter() - start) / len(probe_B3HW) * images
+    return (time.perf_counter() - start) / len(probe_B3HW)
 
 
 def _embed_plain(

@@ -147,13 +147,14 @@ def test_compile_is_skipped_where_it_does_not_pay(
 def test_openvino_pays_for_fewer_images_than_torch(
     lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(optimise, "_seconds", lambda *_: 10.0)
-    encoder, said = fast(lively_encoder, compiled="auto", images=9)
+    monkeypatch.setattr(optimise, "_seconds", lambda *_: 0.1)
+    assert fast(lively_encoder, compiled="auto", images=255)[0].kind == "folded"
+    encoder, said = fast(lively_encoder, compiled="auto", images=256)
     assert (encoder.kind, encoder.precision) == ("openvino", "float32")
     assert [line.split(" ")[0] for line in said] == ["compiled", "openvino"]
     in_one_batch_BE = encoder(images(4))
     assert torch.equal(encoder(images(4)[2:3]), in_one_batch_BE[2:3])  # to the bit
-    rounded, _ = fast(lively_encoder, compiled="auto", images=9, precision="bfloat16")
+    rounded, _ = fast(lively_encoder, compiled="auto", images=256, precision="bfloat16")
     assert (rounded.kind, rounded.precision) == ("openvino", "bfloat16")
 
 
