@@ -37,7 +37,9 @@ class Embedding(nn.Module):
         """(B, 3, H, W) -> (B, N, D)."""
         cells_BDhw = self.proj(images_B3HW)
         patches_BND = cells_BDhw.flatten(2).transpose(1, 2)
-        tokens_BND = torch.cat([self.cls_token.expand(len(patches_BND), -1, -1), patches_BND], 1)
+        tokens_BND = torch.cat(
+            [self.cls_token.expand(patches_BND.shape[0], -1, -1), patches_BND], 1
+        )
         return tokens_BND + resample_positions(self.pos_embed, *cells_BDhw.shape[2:])
 
 

@@ -46,7 +46,8 @@ def compile_openvino(
 def _trace(module: nn.Module, images_B3HW: Tensor) -> torch.jit.ScriptModule:
     with warnings.catch_warnings(), torch.no_grad():
         # Sizes of images become constants, as they may.
-        warnings.filterwarnings("ignore", "Converting a tensor to a Python")
+        tracers: type[Warning] = torch.jit.TracerWarning  # type: ignore[attr-defined]
+        warnings.filterwarnings("ignore", category=tracers)
         warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
         traced: torch.jit.ScriptModule = torch.jit.trace(  # type: ignore[no-untyped-call]
             module, images_B3HW, check_trace=False

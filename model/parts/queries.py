@@ -108,7 +108,7 @@ class Queries(PartPooling):
         fused_BEHW = self.fusion(
             (mixed_BNE + cells_BNE).transpose(1, 2).unflatten(2, (height, width))
         )
-        start_BQE = self.queries.expand(len(maps_BCHW), -1, -1)
+        start_BQE = self.queries.expand(maps_BCHW.shape[0], -1, -1)
         query_BQE = self._added("queries_self", start_BQE, start_BQE)
         drawn_BQE = self.norm["queries_cells"](self._attend("queries_cells", query_BQE, mixed_BNE))
         drawn_BQE = self.norm["before_fused"](drawn_BQE)
