@@ -116,7 +116,7 @@ def measure_embedding(
         fast = embedder.fast
     cosine_B = (found_BE.double() * expected_BE.double()).sum(1)
     worst, mean = float(cosine_B.min()), float(cosine_B.mean())
-    judged = worst if fast.precision == "float32" else mean
+    judged = replace(fast, agreement=worst, mean_agreement=mean).judged_agreement
     return {
         "how": f"{fast.precision}, {fast.kind}, batches of {batch} at {size} px",
         "images_per_second": max(stage),

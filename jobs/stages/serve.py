@@ -60,8 +60,9 @@ def load_predictor(
         try:
             data = read_checkpoint_bytes(checkpoint)
             return PhotoEncoder(
-                data, checkpoint, metadata.fingerprint, metadata.encoding, shards, WORTH_A_SECOND
-            )
+                data, checkpoint, metadata.fingerprint, metadata.encoding, shards,
+                images=WORTH_A_SECOND,
+            )  # fmt: skip
         except CheckpointError as error:
             raise InputError(str(error)) from None
 

@@ -160,7 +160,7 @@ def _compile_if_it_pays(
         fast = _compile("openvino", module, check, log)
         if fast is not None:
             return fast
-    if _seconds(folded, check.probe_B3HW) * images >= COMPILE_BREAK_EVEN_S:
+    if images and _seconds(folded, check.probe_B3HW) * images >= COMPILE_BREAK_EVEN_S:
         return _compile("compiled", module, check, log)
     return None
 

@@ -48,14 +48,14 @@ def rolled() -> Callable[[MirroredEncoder, Tensor], Tensor]:
     return lambda self, images_B3HW: forward(self, images_B3HW).roll(1, dims=1)
 
 
-@pytest.mark.parametrize("kind", ["folded", "openvino"])
+@pytest.mark.parametrize(("kind", "messages"), [("folded", 1), ("openvino", 2)])
 @pytest.mark.parametrize("mirror", [True, False])
-def test_fast_encoder_equals_plain(lively_encoder: FeatureEncoder, mirror: bool, kind: str) -> None:
-    """With `mirror` this is one batch of images and mirror images against two passes; 6 images are
-    a batch and a half.
-    """
+def test_fast_encoder_equals_plain(
+    lively_encoder: FeatureEncoder, mirror: bool, kind: str, messages: int
+) -> None:
+    """With `mirror` one batch of both against two passes; 6 images are a batch and a half."""
     encoder, said = fast(lively_encoder, mirror=mirror, compiled=kind == "openvino")
-    assert (encoder.kind, encoder.precision) == (kind, "float32")
+    assert (encoder.kind, encoder.precision, len(said)) == (kind, "float32", messages)
     assert encoder.agreement > 1 - 1e-5
     assert said[-1] == (
         f"{kind} encoder in float32: cosine with the plain one 1.000000 in the mean, 1.000000 at "

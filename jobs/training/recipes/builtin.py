@@ -29,8 +29,8 @@ def builtin(epochs: int = 46) -> Recipe:
             optimizer="adamw", backbone_lr=3e-4, head_lr=1e-3, classifier_lr=1e-3,
             discriminator_lr=1e-3, weight_decay=0.01, frozen_stages=4,
         ),
-        schedule=replace(
-            Schedule(alpha=0.0, alpha_step=0.0).scaled_to(40), epochs=46, cool_down_epochs=6
+        schedule=Schedule(
+            epochs=46, alpha=0.0, alpha_step=0.0, period=10, decay_epochs=(4, 9), cool_down_epochs=6
         ).scaled_to(epochs),
         augmentation=Augmentation(
             pad=0, rotation=180, mirror=False, affine=True, drone_rotation=10, scale=0.2,
