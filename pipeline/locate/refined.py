@@ -10,7 +10,7 @@ from dataclasses import replace
 from pipeline.core.geo import Circle
 from pipeline.locate.calibration import Calibration, confidence_features
 from pipeline.locate.locate import Answer, Position, consensus_of, consensus_scores
-from pipeline.matching.gate import beyond_chance, holds
+from pipeline.matching.gate import LEAST_PROBABILITY, beyond_chance, holds
 from pipeline.matching.map_windows import MapWindows
 from pipeline.matching.photo_features import MatchablePhoto
 from pipeline.matching.refine import Refinement, refine, refine_densely
@@ -94,9 +94,9 @@ def with_refinement(
     """The answer at the refined place, if the refinement holds.
 
     Its probability is that of the calibration's gate, and null where the calibration knows nothing
-    of matching. Where the refinement does not hold, that speaks against the tile too: its
-    probability becomes that of such photos; not so if the answer is `of_flight`, which knows more
-    than this photo.
+    of matching; below LEAST_PROBABILITY the answer is unknown. Where the refinement does not hold,
+    that speaks against the tile too: its probability becomes that of such photos. Neither is so if
+    the answer is `of_flight`, which knows more than this photo.
     """
     matching = calibration.matching if calibration else None
     gate = matching.gate if matching else None
@@ -109,12 +109,13 @@ def with_refinement(
             how="refined",
             ellipse=ellipse,
         )
+        p = gate.probability(refinement) if gate else None
         return replace(
             answer,
             position=position,
-            probability=gate.probability(refinement) if gate else None,
+            probability=p,
             within_m=gate.within_m if gate else None,
-            known=True,
+            known=of_flight or p is None or p >= LEAST_PROBABILITY,
             refinement=refinement,
         )
     if calibration is None or matching is None or not answer.candidates or of_flight:

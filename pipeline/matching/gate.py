@@ -22,6 +22,9 @@ a view that a camera can have; one wrong one of eight inliers was seen (docs/dec
 LEAST_DENSE_INLIERS, CHANCE_DENSE_INLIERS = 80, 40
 """Of dense features instead, whose points lie close: of 60 windows that did not show a photo's
 ground none gave more than 28, of 110 by an earlier head none more than 40."""
+LEAST_PROBABILITY = 0.1
+"""A refined answer that is less probably right is `unknown`, though the gate lets it pass: it tells
+whoever reads it that it is wrong (docs/decisions.md)."""
 GATE_FEATURES = (
     "log inliers", "inlier share", "log ellipse", "log residual", "tilt", "promised", "dense",
 )  # fmt: skip

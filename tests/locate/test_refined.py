@@ -14,6 +14,7 @@ from pipeline.locate.fitting.calibrate import CalibrationExample
 from pipeline.locate.fitting.fit_matching import MatchedExample, fit_matching
 from pipeline.locate.locate import answers_from_hits
 from pipeline.locate.refined import with_refinement
+from pipeline.matching.gate import LEAST_PROBABILITY
 from tests.locate.calibrations import make_calibration
 from tests.matching.refinements import METRE_LAT, make_refinement
 
@@ -75,6 +76,22 @@ def test_refined_answer_has_the_gate_s_probability(calibration: Calibration) -> 
     assert (refined.within_m, refined.known) == (5.0, True)
     assert refined.position is not None
     assert refined.position.radius_m == pytest.approx(np.hypot(1.0, gate.floor_m))
+
+
+def test_refined_answer_that_is_hardly_right_is_unknown(calibration: Calibration) -> None:
+    """The gate lets it pass, and says itself that its position is wrong; a flight knows more."""
+    assert calibration.matching is not None
+    gate = calibration.matching.gate
+    doubtful = replace(gate, model=replace(gate.model, intercept=-9.0))
+    unsure = replace(calibration, matching=replace(calibration.matching, gate=doubtful))
+    [answer] = answers_from_hits([hits(True, np.random.default_rng(2))], 10, calibration)
+    refinement = make_refinement(inliers=60)
+    refined = with_refinement(answer, refinement, unsure)
+    assert refined.refinement is refinement
+    assert refined.probability is not None
+    assert refined.probability < LEAST_PROBABILITY
+    assert not refined.known
+    assert with_refinement(answer, refinement, unsure, of_flight=True).known
 
 
 def test_tile_of_a_photo_that_no_match_holds_for(calibration: Calibration) -> None:

@@ -24,6 +24,7 @@ from pipeline.locate.calibration import Calibration, MatchingCalibration, confid
 from pipeline.locate.fitting.calibrate import CalibrationExample, example_weights, is_correct
 from pipeline.locate.locate import consensus_of, consensus_scores
 from pipeline.matching.fit_gate import LEAST_RIGHT, GateExamples, error_of, fit_gate
+from pipeline.matching.gate import LEAST_PROBABILITY
 from pipeline.matching.refine import Refinement
 
 
@@ -81,7 +82,7 @@ def fit_matching(
         # These photos found no place of their own on the map: rather unknown than wrong.
         tile_threshold = max(youden_threshold(p_N[tiles_N], *rest[1:]), UNDECIDED)
     bins = reliability_bins(p_N, right_N, weight_N)
-    known_N: Mask = ~tiles_N | (p_N >= tile_threshold)
+    known_N: Mask = p_N >= np.where(tiles_N, tile_threshold, LEAST_PROBABILITY)
     inside_N = np.array([inside for _, inside in both])
     return MatchingCalibration(
         gate=gate,
