@@ -26,11 +26,6 @@ class FeatureEncoder(nn.Module):
         super().__init__()
         self.backbone = build_backbone(config.backbone, config.width)
         self.pooling = build_pooling(config, self.backbone.channels)
-        if self.pooling.needs_token and not self.backbone.has_token:
-            raise ValueError(
-                f"pooling {config.pooling} takes a class token, which {config.backbone} does not "
-                "have, expected a vision transformer; set --backbone or --pooling"
-            )
         self.with_token = self.backbone.has_token
         least = max(self.pooling.least_cells, 4) * self.backbone.stride  # D halves the maps twice
         if config.image_size < least:

@@ -8,10 +8,10 @@ from pipeline.core.errors import InputError, require
 
 METHODS = (
     "alpha_zero", "paper", "constant_alpha", "no_restart", "instance_loss", "lpn", "pcl_style",
-    "msba_style", "fsra", "mccg", "sample4geo", "dac", "camp", "best",
+    "msba_style", "fsra", "mccg", "sample4geo", "dac", "camp", "qdfl", "usam", "usam_lpn", "best",
 )  # fmt: skip
-"""The control first: differences are to it. Rows at published sizes only: USAM is a part of ResNet,
-QDFL takes a transformer's class token, and LCM differs in augmentation and epochs."""
+"""The control first: differences are to it. A row at published sizes only: LCM, which differs from
+`instance_loss` in augmentation and epochs."""
 
 
 @dataclass(frozen=True, kw_only=True)

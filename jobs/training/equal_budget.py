@@ -1,14 +1,15 @@
 """A method at a budget of images that two cores can bear, on one backbone, beside all others.
 
-In: a method's recipe. Out: a recipe with the method's parts, neck, losses, sampler, adversary and
-the shape of its schedule; backbone, start, optimizer, rates, batch and augmentation are the same
-for every method. What is compared is then the ingredients and not what each was tuned with.
+In: a method's recipe. Out: a recipe with the method's parts, neck, losses, sampler, adversary, USAM
+and the shape of its schedule; backbone, start, optimizer, rates, batch and augmentation are the
+same for every method. What is compared is then the ingredients and not what each was tuned with.
 """
 
 from dataclasses import replace
 
 from jobs.training.recipes.builtin import builtin
 from jobs.training.recipes.recipe import Recipe
+from model.backbones import usam
 from model.backbones.base import build_backbone
 from model.shapes_alone import shapes_alone
 
@@ -19,9 +20,10 @@ PART_DIM, DISCRIMINATOR_CHANNELS = 256, 256
 def at_equal_budget(recipe: Recipe, epochs: int, seed: int) -> Recipe:
     """The method's recipe on the built-in encoder's terms, its schedule shrunk to `epochs`."""
     terms = builtin()
+    attention = usam.SUFFIX if recipe.network.backbone.endswith(usam.SUFFIX) else ""
     network = replace(
         recipe.network,
-        backbone=terms.network.backbone,
+        backbone=terms.network.backbone + attention,
         width=terms.network.width,
         image_size=terms.network.image_size,
         part_dim=PART_DIM,

@@ -15,6 +15,7 @@ BACKBONES: dict[str, str] = {
     "resnet50_usam": "model.backbones.usam:ResNetUSAM",
     "efficientnet_lite0": "model.backbones.efficientnet_lite:EfficientNetLite",
     "efficientnet_lite2": "model.backbones.efficientnet_lite:EfficientNetLite",
+    "efficientnet_lite0_usam": "model.backbones.usam:EfficientNetLiteUSAM",
     "vit_small": "model.backbones.huggingface:ViT",
     "vit_base": "model.backbones.huggingface:ViT",
     "dinov2_small": "model.backbones.huggingface:DINOv2",

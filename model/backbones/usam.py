@@ -1,4 +1,5 @@
-"""ResNet with USAM, attention to where the maps change: four numbers are learnt [RK-Net].
+"""ResNet and EfficientNet-Lite with USAM, attention to where the maps change: four numbers are
+learnt [RK-Net].
 
 In: normalised images (B, 3, H, W). Out: feature maps (B, C, H/16, W/16). Shapes: B images, C
 channels, H x W cells.
@@ -9,6 +10,7 @@ from typing import Self
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model.backbones.efficientnet_lite import EfficientNetLite
 from model.backbones.resnet import ResNet
 
 SUFFIX = "_usam"
@@ -53,8 +55,7 @@ class ResNetUSAM(ResNet):
     @classmethod
     def infer(cls, state: dict[str, Tensor]) -> tuple[str, float]:
         """Name and width of a state dict that has the modules. Raises ValueError for another."""
-        if not any(key.startswith("usam_") for key in state):
-            raise ValueError("it has no usam_1")
+        require_modules(state)
         name, width = super().infer(state)
         return name + SUFFIX, width
 
@@ -62,3 +63,32 @@ class ResNetUSAM(ResNet):
         """The stem, and layer1 to layer4."""
         stem, first, *others = super().stages()
         return [[*stem[:-1], self.usam_1, stem[-1]], [*first, self.usam_2], *others]
+
+
+class EfficientNetLiteUSAM(EfficientNetLite):
+    """An EfficientNet-Lite with USAM where its maps have ResNet's sizes: after the stem, and after
+    the last block at a quarter of the image's side [chosen]."""
+
+    added = ("usam_",)
+
+    def __init__(self, name: str, width: float) -> None:
+        super().__init__(name.removesuffix(SUFFIX), width)
+        self.usam_1, self.usam_2 = USAM(), USAM()
+
+    @classmethod
+    def infer(cls, state: dict[str, Tensor]) -> tuple[str, float]:
+        """As ResNetUSAM's."""
+        require_modules(state)
+        name, width = super().infer(state)
+        return name + SUFFIX, width
+
+    def stages(self) -> list[list[nn.Module]]:
+        """The stem, the seven runs of blocks, the head."""
+        stem, first, second, *others = super().stages()
+        return [[*stem, self.usam_1], first, [*second, self.usam_2], *others]
+
+
+def require_modules(state: dict[str, Tensor]) -> None:
+    """Raise ValueError for a state dict without USAM."""
+    if not any(key.startswith("usam_") for key in state):
+        raise ValueError("it has no usam_1")

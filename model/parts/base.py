@@ -5,7 +5,6 @@ channels, H x W cells, P parts, Ci numbers of part i.
 """
 
 from importlib import import_module
-from typing import ClassVar
 
 from torch import Tensor, nn
 
@@ -16,8 +15,6 @@ from model.parts import POOLINGS
 class PartPooling(nn.Module):
     """Maps (B, C, H, W), and the class token (B, C) where there is one -> P vectors (B, Ci)."""
 
-    needs_token: ClassVar[bool] = False
-    "It takes the backbone's class token, which only some transformers have."
     channels: tuple[int, ...]
     "Ci of each part, in the order of the embedding."
     least_cells: int = 1

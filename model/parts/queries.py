@@ -70,10 +70,8 @@ class FeatureFusion(nn.Module):
 
 class Queries(PartPooling):
     """Four parts: two vectors of queries (B, E), the class token (B, C), a generalised mean (B, E)
-    of length 1.
+    of length 1. For a backbone without a class token, the mean of the maps in its place [chosen].
     """
-
-    needs_token = True
 
     def __init__(self, config: PVDAConfig, channels: int) -> None:
         super().__init__(config, channels)
@@ -98,10 +96,10 @@ class Queries(PartPooling):
     def forward(self, maps_BCHW: Tensor, token_BC: Tensor | None) -> list[Tensor]:
         """Two vectors, token, generalised mean. Raises ValueError for maps that are not square."""
         height, width = maps_BCHW.shape[2:]
-        if height != width or token_BC is None:
+        if height != width:
             raise ValueError(
-                f"maps have {height} x {width} cells and {'no' if token_BC is None else 'a'} class "
-                "token, expected square maps with one for pooling queries; use square images"
+                f"maps have {height} x {width} cells, expected square ones for pooling queries; "
+                "use square images"
             )
         cells_BNE = self.reduce(maps_BCHW).flatten(2).transpose(1, 2)
         mixed_BNE = self._added("cells", cells_BNE, cells_BNE)
@@ -115,7 +113,8 @@ class Queries(PartPooling):
         drawn_BQE = self._added("queries_fused", drawn_BQE, fused_BEHW.flatten(2).transpose(1, 2))
         vectors_BE2 = self.combine(drawn_BQE.transpose(1, 2))
         mean_BE = F.normalize(generalised_mean(fused_BEHW, self.power, LEAST), dim=1)
-        return [*vectors_BE2.unbind(2), token_BC, mean_BE]
+        whole_BC = maps_BCHW.mean((2, 3)) if token_BC is None else token_BC
+        return [*vectors_BE2.unbind(2), whole_BC, mean_BE]
 
     def _attend(self, name: str, query_BQE: Tensor, cells_BNE: Tensor) -> Tensor:
         found: Tensor = self.attention[name](query_BQE, cells_BNE, cells_BNE, need_weights=False)[0]

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model.backbones.base import build_backbone
 from model.backbones.usam import USAM
 from model.backbones.vit import FSRAViT, resample_positions
 from model.config import PVDAConfig
@@ -152,10 +153,22 @@ def test_usam_is_nine_times_the_difference_to_the_mean() -> None:
     assert torch.allclose(module(maps_BCHW), expected, atol=1e-4)
 
 
+@pytest.mark.parametrize("name", ["resnet18_usam", "efficientnet_lite0_usam"])
+def test_usam_stands_at_half_and_a_quarter_of_the_image(name: str) -> None:
+    """In either family; nothing else of the backbone differs from the one without."""
+    backbone, sides = build_backbone(name, 0.25).eval(), list[int]()
+    for module in backbone.modules():
+        if isinstance(module, USAM):
+            module.register_forward_hook(lambda _, __, maps: sides.append(maps.shape[2]))
+    assert backbone(torch.randn(1, 3, 64, 64)).shape[2:] == (4, 4)
+    assert sides == [32, 16]
+    plain = build_backbone(name.removesuffix("_usam"), 0.25)
+    added = set(backbone.state_dict()) - set(plain.state_dict())
+    assert {key.split(".")[0] for key in added} == {"usam_1", "usam_2"}
+
+
 @pytest.mark.slow
-def test_token_pooling_needs_a_backbone_with_token() -> None:
-    with pytest.raises(ValueError, match=r"pooling queries takes a class token.*set --backbone"):
-        FeatureEncoder(replace(TINY, pooling="queries"))
+def test_fsra_backbone_has_a_token_beside_its_maps() -> None:
     maps_BCHW, token_BC = FSRAViT().eval().features(torch.zeros(1, 3, 32, 48))
     assert maps_BCHW.shape == (1, 768, 2, 3)
     assert token_BC is not None

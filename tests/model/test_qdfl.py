@@ -210,11 +210,12 @@ def test_queries_compute_as_their_twin() -> None:
     maps_BCHW, token_BC = torch.randn(2, 24, 4, 4), torch.randn(2, 24)
     one, two, token, mean = pooling(maps_BCHW, token_BC)
     assert token is token_BC
+    assert torch.equal(pooling(maps_BCHW, None)[2], maps_BCHW.mean((2, 3)))
     state = {key: tensor.detach() for key, tensor in pooling.state_dict().items()}
     expected = twin_queries(state, maps_BCHW, pooling.fusion)
     for found, wanted in zip((one, two, mean), expected, strict=True):
         assert torch.allclose(found, wanted, atol=1e-4)
-    with pytest.raises(ValueError, match="maps have 4 x 3 cells and a class token, expected squa"):
+    with pytest.raises(ValueError, match="maps have 4 x 3 cells, expected square ones"):
         pooling(maps_BCHW[..., :3], token_BC)
 
 
