@@ -19,6 +19,9 @@ from types import CodeType, FrameType
 SECONDS_TO_REPEAT = 0.25
 LOCKING = frozenset(str(module.__file__) for module in (_base, queue, thread, threading))
 "Files of the standard library whose functions take locks, most of them for a moment."
+IMPORT_SYSTEM = "<frozen importlib._bootstrap>"
+"""The file of the frames of Python's import system, among them callbacks of weak references, where
+an exception is printed and lost."""
 
 
 @contextmanager
@@ -75,7 +78,10 @@ def _is_raising() -> bool:
 
 
 def _locking_at(frame: FrameType | None) -> tuple[CodeType, int] | None:
-    """The instruction of the standard library that may be taking a lock just now."""
+    """The instruction of the standard library that may be taking a lock just now, or of the import
+    system itself (a module that it is executing may be interrupted)."""
+    if frame is not None and frame.f_code.co_filename == IMPORT_SYSTEM:
+        return frame.f_code, frame.f_lasti
     while frame is not None and frame.f_code.co_filename not in LOCKING:
         frame = frame.f_back
     return None if frame is None else (frame.f_code, frame.f_lasti)

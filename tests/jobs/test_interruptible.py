@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from jobs.command_line.signals import LOCKING, SECONDS_TO_REPEAT, interruptible
+from jobs.command_line.signals import IMPORT_SYSTEM, LOCKING, SECONDS_TO_REPEAT, interruptible
 
 
 @pytest.fixture(autouse=True)
@@ -60,6 +60,17 @@ def test_alarm_at_the_end_does_not_set_the_timer_again(
     left = set_timer(signal.ITIMER_REAL, 0)  # else it would end the tests
     assert left == (0, 0)
     assert signal.getsignal(signal.SIGALRM) is before
+
+
+def test_signal_within_the_import_system_waits_for_its_end() -> None:
+    """Its callbacks would print the exception and lose it."""
+    reached = list[str]()
+    raising = "signal.raise_signal(signal.SIGTERM)\nreached.append('end')"
+    with pytest.raises(KeyboardInterrupt), interruptible() as received:  # noqa: PT012
+        exec(compile(raising, IMPORT_SYSTEM, "exec"), {"signal": signal, "reached": reached})
+        time.sleep(20)
+    assert reached == ["end"]
+    assert received == [signal.SIGTERM]
 
 
 def test_signal_within_an_executor_leaves_no_lock_taken(monkeypatch: pytest.MonkeyPatch) -> None:
