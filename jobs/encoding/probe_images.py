@@ -20,6 +20,8 @@ from pipeline.shards.shard_set import ShardSet
 
 PROBE_IMAGES, CALIBRATION_IMAGES = 16, 128
 "Images by which the fast encoder is checked, and by which int8 is calibrated."
+CLOUD_SIDES = (4, 8, 16, 32)
+"Cells a side of the synthetic ones: few, for the check may take longer than a photo's answer."
 ImageBytes = npt.NDArray[np.uint8]
 
 
@@ -72,10 +74,9 @@ def usable_pixels(shards: ShardSet, sample: Sample, image: Pixels | DecodeError)
 
 
 def synthetic_images(size: int) -> ImageBytes:
-    """Images (PROBE_IMAGES, 3, size, size) where no shards are at hand: clouds of colour, the same
-    every time.
+    """Images (4, 3, size, size) where no shards are at hand: clouds of colour of CLOUD_SIDES, the
+    same every time.
     """
     rng = np.random.default_rng(0)
-    sides = [4 << number % 4 for number in range(PROBE_IMAGES)]
-    noise = (rng.integers(0, 256, size=(side, side, 3), dtype=np.uint8) for side in sides)
+    noise = (rng.integers(0, 256, size=(side, side, 3), dtype=np.uint8) for side in CLOUD_SIDES)
     return stack([resize(image_HW3, size) for image_HW3 in noise])
