@@ -120,7 +120,7 @@ def train_and_judge(
 def cost_of(checkpoint: str) -> Cost:
     """What a trained encoder costs: its own size and work, and its training's."""
     trained = loads(read_checkpoint_bytes(checkpoint), checkpoint)
-    encoder = build_encoder(trained)
+    encoder = build_encoder(trained).requires_grad_(False)  # the counter hooks on what asks for it
     side = trained.network.image_size
     counter = FlopCounterMode(display=False)
     with counter, torch.inference_mode():

@@ -50,6 +50,8 @@ class Backbone(nn.Module):
     "C, the channels of the maps."
     frozen_stages = 0
     "How many of the first stages keep their weights in training; set by `freeze`."
+    _without_gradient = 0
+    "Leading layers that nothing learns in; set by `freeze`."
 
     @classmethod
     def build(cls, name: str, width: float) -> Self:
@@ -88,19 +90,20 @@ class Backbone(nn.Module):
     def forward(self, images_B3HW: Tensor) -> Tensor:
         """Normalised images (B, 3, H, W) -> maps (B, C, H/stride, W/stride).
 
-        Frozen stages run without gradients.
+        Frozen stages run without gradients, up to the first layer in them that learns.
         """
-        stages = self.stages()
+        layers = [layer for stage in self.stages() for layer in stage]
         with torch.no_grad():
-            maps_BCHW = _run(stages[: self.frozen_stages], images_B3HW)
-        return _run(stages[self.frozen_stages :], maps_BCHW)
+            maps_BCHW = _run(layers[: self._without_gradient], images_B3HW)
+        return _run(layers[self._without_gradient :], maps_BCHW)
 
     def features(self, images_B3HW: Tensor) -> Features:
         """Normalised images (B, 3, H, W) -> maps, and the class token where there is one."""
         return Features(self(images_B3HW), None)
 
     def freeze(self, count: int) -> None:
-        """Keep the weights and BatchNorm statistics of the first `count` stages in training.
+        """Keep the weights and BatchNorm statistics of the first `count` stages in training; what
+        is `added` among them has no public ones to keep, and learns.
 
         Raises ValueError where there are not so many.
         """
@@ -111,20 +114,29 @@ class Backbone(nn.Module):
                 "backbone"
             )
         self.frozen_stages = count
-        for layer in (layer for stage in stages[:count] for layer in stage):
+        layers, frozen = [layer for stage in stages for layer in stage], self._frozen_layers()
+        for layer in frozen:
             layer.requires_grad_(False)
+        learning = (number for number, layer in enumerate(layers) if layer not in frozen)
+        self._without_gradient = next(learning, len(layers))
         self.train(self.training)
 
     def train(self, mode: bool = True) -> Self:
         """As every module's, but frozen stages stay in evaluation mode."""
         super().train(mode)
-        for layer in (layer for stage in self.stages()[: self.frozen_stages] for layer in stage):
+        for layer in self._frozen_layers():
             layer.eval()
         return self
 
+    def _frozen_layers(self) -> list[nn.Module]:
+        """The layers of the frozen stages, but for `added` ones."""
+        own = [module for name, module in self.named_children() if name.startswith(self.added)]
+        frozen = self.stages()[: self.frozen_stages]
+        return [layer for stage in frozen for layer in stage if layer not in own]
 
-def _run(stages: Sequence[Sequence[nn.Module]], x: Tensor) -> Tensor:
-    for layer in (layer for stage in stages for layer in stage):
+
+def _run(layers: Sequence[nn.Module], x: Tensor) -> Tensor:
+    for layer in layers:
         x = layer(x)
     return x
 

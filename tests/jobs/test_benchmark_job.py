@@ -1,16 +1,18 @@
 """The benchmark of methods: equal terms for all, a leaderboard that resumes."""
 
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
 
-from jobs.stages.benchmark import benchmark
+from jobs.stages.benchmark import benchmark, cost_of
 from jobs.stages.benchmark_settings import METHODS, BenchmarkSettings
 from jobs.training.equal_budget import at_equal_budget
 from jobs.training.recipes import RECIPES
 from jobs.training.recipes.recipe import Recipe
+from model.checkpoint import Checkpoint, dumps
+from model.pvda import FeatureEncoder
 from pipeline.core.errors import InputError
 
 pytestmark = pytest.mark.slow
@@ -38,6 +40,21 @@ def test_equal_budget_keeps_ingredients_and_no_more() -> None:
     assert shrunk["paper"].schedule.period == 5
     assert shrunk["lpn"].schedule.decay_epochs == (13,)
     assert shrunk["sample4geo"].network.part_dim == 1280
+
+
+@pytest.mark.parametrize("method", ["qdfl", "usam"])
+def test_cost_of_encoders_with_attention(method: str, tmp_path: Path) -> None:
+    """Learnt queries ask for gradients, which torch's counter of operations stumbles over."""
+    network = replace(at_equal_budget(RECIPES[method](), 1, 0).network, image_size=64)
+    encoder = FeatureEncoder(network)
+    made = Checkpoint(
+        network=network, recipe={}, locations=[], epoch=0, history=[],
+        state={"modules": {"encoder": encoder.state_dict()}},
+    )  # fmt: skip
+    (tmp_path / "last.pt").write_bytes(dumps(made))
+    cost = cost_of(str(tmp_path / "last.pt"))
+    assert cost.parameters == sum(parameter.numel() for parameter in encoder.parameters())
+    assert 0.01 < cost.gmac < 1
 
 
 @pytest.mark.parametrize("methods", [("lpn",), ("lpn", "lpn"), ("lpn", "street")])

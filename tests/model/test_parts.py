@@ -167,6 +167,19 @@ def test_usam_stands_at_half_and_a_quarter_of_the_image(name: str) -> None:
     assert {key.split(".")[0] for key in added} == {"usam_1", "usam_2"}
 
 
+def test_usam_within_frozen_stages_learns_alone() -> None:
+    """No public weights know it: kept as it starts, it would multiply the maps by any number."""
+    backbone = build_backbone("efficientnet_lite0_usam", 0.25)
+    backbone.freeze(len(backbone.stages()))
+    backbone.train()
+    before = {name: tensor.clone() for name, tensor in backbone.state_dict().items()}
+    backbone(torch.rand(2, 3, 64, 64)).square().mean().backward()
+    moved = {n for n, tensor in backbone.state_dict().items() if not torch.equal(tensor, before[n])}
+    assert {name.split(".")[0] for name in moved} == {"usam_1", "usam_2"}
+    learning = {name for name, one in backbone.named_parameters() if one.grad is not None}
+    assert learning == {f"usam_{at}.norm.{what}" for at in (1, 2) for what in ("weight", "bias")}
+
+
 @pytest.mark.slow
 def test_fsra_backbone_has_a_token_beside_its_maps() -> None:
     maps_BCHW, token_BC = FSRAViT().eval().features(torch.zeros(1, 3, 32, 48))
