@@ -102,8 +102,8 @@ class Backbone(nn.Module):
         return Features(self(images_B3HW), None)
 
     def freeze(self, count: int) -> None:
-        """Keep the weights and BatchNorm statistics of the first `count` stages in training; what
-        is `added` among them has no public ones to keep, and learns.
+        """Keep the weights and BatchNorm statistics of the first `count` stages in training; a
+        layer of them that is `added` has no public ones to keep, and learns.
 
         Raises ValueError where there are not so many.
         """

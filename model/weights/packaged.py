@@ -38,8 +38,8 @@ PACKAGED = {
         sha256="9656183eaeafe8cbf0cf560089305d34668787f6a26377ccbe5be192ed3f855d",
     ),
 }
-PACKAGED["efficientnet_lite0_usam"] = PACKAGED["efficientnet_lite0"]
 "By the backbone's name: converted from TensorFlow's by the package's author, Apache-2.0."
+PACKAGED["efficientnet_lite0_usam"] = PACKAGED["efficientnet_lite0"]
 
 
 def imagenet_weights(backbone: str) -> dict[str, Tensor]:

@@ -65,6 +65,20 @@ def test_matching_calibration_figures(calibration: Calibration) -> None:
     assert matching.photos == LOCATIONS
 
 
+def test_matching_calibration_counts_hardly_right_ones_as_unknown() -> None:
+    """The right place, 8 m off: the gate lets it pass, and knows it by its residual."""
+    off = [
+        replace(one, inside=make_refinement(residual_m=3.0, lat=46.0 + 9 * METRE_LAT))
+        if n % 3 == 1
+        else one
+        for n, one in enumerate(matched())
+    ]
+    found = fit_matching(off, make_calibration(), within_m=5.0)
+    assert found.gate.admits(make_refinement(residual_m=3.0))
+    assert found.known == pytest.approx(2 / 3)
+    assert found.known_right == 1
+
+
 def test_refined_answer_has_the_gate_s_probability(calibration: Calibration) -> None:
     [answer] = answers_from_hits([hits(True, np.random.default_rng(2))], 10, calibration)
     assert (answer.within_m, answer.refinement) == (25.0, None)
