@@ -90,6 +90,7 @@ def locate_photos(
         calibration=calibration,
         fingerprint=encoder.fingerprint,
         track=settings.track,
+        matched=windows is not None,
         true_positions=true_positions or {},
     )
     write_answers(located, settings, context)
@@ -179,13 +180,13 @@ def write_answers(
     located: Sequence[LocatedPhoto], settings: LocateSettings, context: PageContext
 ) -> None:
     """Write the GeoJSON, and the CSV and the page where they were asked for."""
-    calibration = context.calibration
-    threshold = TRACK_THRESHOLD if settings.track else calibration and calibration.threshold
+    calibration, matching = context.calibration, context.matching
+    of_tiles = matching.tile_threshold if matching else calibration and calibration.threshold
     about = {
         "index": settings.index,
         "fingerprint": context.fingerprint,
         "together": settings.together,
-        "threshold": threshold,
+        "threshold": TRACK_THRESHOLD if settings.track else of_tiles,
     }
     storage.write_bytes(settings.out, to_geojson(located, about, settings.track))
     if settings.csv:

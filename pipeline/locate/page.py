@@ -26,7 +26,7 @@ from pipeline.images.thumbnails import (
     thumbnail,
 )
 from pipeline.index.searcher import Hit
-from pipeline.locate.calibration import Calibration
+from pipeline.locate.calibration import Calibration, MatchingCalibration
 from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.geojson import LocatedPhoto
 from pipeline.locate.locate import Answer
@@ -40,6 +40,7 @@ from pipeline.locate.page_map import (
     photo_box,
     position_map,
 )
+from pipeline.matching.gate import LEAST_PROBABILITY
 
 MAX_SHOWN = 60
 "Answers on the page at most, evenly spaced: 100 to 150 kB each."
@@ -63,11 +64,18 @@ class PageContext:
     calibration: Calibration | None
     fingerprint: str
     track: bool = False
+    matched: bool = False
+    "Photos were matched with the map, by which other probabilities make an answer unknown."
     footprints: Callable[[Iterable[str]], Mapping[str, Footprint]] = lambda keys: {}
     """Corners of gallery images by key, where known; the others are drawn as squares as wide as the
     spacing."""
     true_positions: Mapping[str, LatLon] = field(default_factory=dict)
     "Where photos were taken, by name, where known."
+
+    @property
+    def matching(self) -> MatchingCalibration | None:
+        """What the calibration knows of matched photos, if they were matched."""
+        return self.calibration.matching if self.calibration and self.matched else None
 
 
 def render_page(
@@ -95,6 +103,8 @@ def render_page(
         title=context.title,
         fingerprint=context.fingerprint,
         calibration=context.calibration,
+        matching=context.matching,
+        least_probability=LEAST_PROBABILITY,
         photos=len(located),
         known=sum(answer.known for _, answer in named),
         damaged=sum(len(one.rejected) for one in located),

@@ -4,6 +4,7 @@ names."""
 import io
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from PIL import Image
 from pipeline.core.geo import haversine_m
 from pipeline.core.records import Rejection, View
 from pipeline.index.searcher import Hit
+from pipeline.locate.fitting.fit_matching import fit_matching
 from pipeline.locate.gallery_map import GalleryMap
 from pipeline.locate.geojson import LocatedPhoto
 from pipeline.locate.locate import Answer, Position
@@ -35,6 +37,8 @@ from pipeline.locate.page_map import (
     square_footprint,
     svg_matrix,
 )
+from tests.locate.calibrations import make_calibration
+from tests.locate.test_refined import matched
 
 CHROMIUM = next(
     (found for name in ("chromium", "chromium-browser") if (found := shutil.which(name))), None
@@ -106,6 +110,19 @@ def page(located: list[LocatedPhoto] = LOCATED, **changes: Any) -> str:
         lambda names: {},
         lambda keys: dict.fromkeys(keys, picture()),
     )
+
+
+def test_page_says_below_what_probability_it_is_unknown() -> None:
+    plain = make_calibration()
+    assert "is right is below 40 %:" in page(calibration=plain)
+    assert "is right is below 40 %:" in page(calibration=plain, matched=True)
+    matching = replace(fit_matching(matched(), plain, within_m=5.0), tile_threshold=0.55)
+    of_matches = replace(plain, matching=matching)
+    text = page(calibration=of_matches, matched=True)
+    assert "is right is below 10 % for a photo" in text
+    assert "below 55 % for another" in text
+    assert "this answered 100 % of the photos, 100 % of these" in text
+    assert "is right is below 40 %:" in page(calibration=of_matches)  # tiles alone
 
 
 def test_page_shows_known_unknown_and_damaged() -> None:

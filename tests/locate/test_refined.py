@@ -65,7 +65,7 @@ def test_matching_calibration_figures(calibration: Calibration) -> None:
     assert matching.photos == LOCATIONS
 
 
-def test_matching_calibration_counts_hardly_right_ones_as_unknown() -> None:
+def test_matching_calibration_counts_hardly_right_as_unknown() -> None:
     """The right place, 8 m off: the gate lets it pass, and knows it by its residual."""
     off = [
         replace(one, inside=make_refinement(residual_m=3.0, lat=46.0 + 9 * METRE_LAT))
