@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import ClassVar, NamedTuple, Self
 
-import torch
 from torch import Tensor, nn
 
 from model.backbones import BACKBONES
@@ -50,8 +49,6 @@ class Backbone(nn.Module):
     "C, the channels of the maps."
     frozen_stages = 0
     "How many of the first stages keep their weights in training; set by `freeze`."
-    _without_gradient = 0
-    "Leading layers that nothing learns in; set by `freeze`."
 
     @classmethod
     def build(cls, name: str, width: float) -> Self:
@@ -90,12 +87,13 @@ class Backbone(nn.Module):
     def forward(self, images_B3HW: Tensor) -> Tensor:
         """Normalised images (B, 3, H, W) -> maps (B, C, H/stride, W/stride).
 
-        Frozen stages run without gradients, up to the first layer in them that learns.
+        No gradient reaches frozen stages, up to the first layer in them that learns: nothing before
+        it asks for one.
         """
-        layers = [layer for stage in self.stages() for layer in stage]
-        with torch.no_grad():
-            maps_BCHW = _run(layers[: self._without_gradient], images_B3HW)
-        return _run(layers[self._without_gradient :], maps_BCHW)
+        x = images_B3HW
+        for layer in (layer for stage in self.stages() for layer in stage):
+            x = layer(x)
+        return x
 
     def features(self, images_B3HW: Tensor) -> Features:
         """Normalised images (B, 3, H, W) -> maps, and the class token where there is one."""
@@ -114,11 +112,8 @@ class Backbone(nn.Module):
                 "backbone"
             )
         self.frozen_stages = count
-        layers, frozen = [layer for stage in stages for layer in stage], self._frozen_layers()
-        for layer in frozen:
+        for layer in self._frozen_layers():
             layer.requires_grad_(False)
-        learning = (number for number, layer in enumerate(layers) if layer not in frozen)
-        self._without_gradient = next(learning, len(layers))
         self.train(self.training)
 
     def train(self, mode: bool = True) -> Self:
@@ -133,12 +128,6 @@ class Backbone(nn.Module):
         own = [module for name, module in self.named_children() if name.startswith(self.added)]
         frozen = self.stages()[: self.frozen_stages]
         return [layer for stage in frozen for layer in stage if layer not in own]
-
-
-def _run(layers: Sequence[nn.Module], x: Tensor) -> Tensor:
-    for layer in layers:
-        x = layer(x)
-    return x
 
 
 def backbone_class(name: str) -> type[Backbone]:

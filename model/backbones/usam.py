@@ -10,6 +10,7 @@ from typing import Self
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model.backbones.base import Backbone
 from model.backbones.efficientnet_lite import EfficientNetLite
 from model.backbones.resnet import ResNet
 
@@ -37,14 +38,27 @@ class USAM(nn.Module):
         return F.pad(responses_B1HW[:, :, 1:-1, 1:-1], (1, 1, 1, 1))
 
 
-class ResNetUSAM(ResNet):
-    """A ResNet with one USAM before the stem's pooling and one after layer1."""
+class WithUSAM(Backbone):
+    """What a family of backbones with two USAMs adds to the family; stands before it among the
+    bases."""
 
     added = ("usam_",)
 
     def __init__(self, name: str, width: float) -> None:
         super().__init__(name.removesuffix(SUFFIX), width)
         self.usam_1, self.usam_2 = USAM(), USAM()
+
+    @classmethod
+    def infer(cls, state: dict[str, Tensor]) -> tuple[str, float]:
+        """Name and width of a state dict that has the modules. Raises ValueError for another."""
+        if not any(key.startswith("usam_") for key in state):
+            raise ValueError("it has no usam_1")
+        name, width = super().infer(state)
+        return name + SUFFIX, width
+
+
+class ResNetUSAM(WithUSAM, ResNet):
+    """A ResNet with one USAM before the stem's pooling and one after layer1."""
 
     @classmethod
     def build(cls, name: str, width: float) -> Self:
@@ -52,43 +66,17 @@ class ResNetUSAM(ResNet):
         cls.require_width(name.removesuffix(SUFFIX), width)
         return cls(name, width)
 
-    @classmethod
-    def infer(cls, state: dict[str, Tensor]) -> tuple[str, float]:
-        """Name and width of a state dict that has the modules. Raises ValueError for another."""
-        require_modules(state)
-        name, width = super().infer(state)
-        return name + SUFFIX, width
-
     def stages(self) -> list[list[nn.Module]]:
         """The stem, and layer1 to layer4."""
         stem, first, *others = super().stages()
         return [[*stem[:-1], self.usam_1, stem[-1]], [*first, self.usam_2], *others]
 
 
-class EfficientNetLiteUSAM(EfficientNetLite):
+class EfficientNetLiteUSAM(WithUSAM, EfficientNetLite):
     """An EfficientNet-Lite with USAM where its maps have ResNet's sizes: after the stem, and after
     the last block at a quarter of the image's side [chosen]."""
-
-    added = ("usam_",)
-
-    def __init__(self, name: str, width: float) -> None:
-        super().__init__(name.removesuffix(SUFFIX), width)
-        self.usam_1, self.usam_2 = USAM(), USAM()
-
-    @classmethod
-    def infer(cls, state: dict[str, Tensor]) -> tuple[str, float]:
-        """As ResNetUSAM's."""
-        require_modules(state)
-        name, width = super().infer(state)
-        return name + SUFFIX, width
 
     def stages(self) -> list[list[nn.Module]]:
         """The stem, the seven runs of blocks, the head."""
         stem, first, second, *others = super().stages()
         return [[*stem, self.usam_1], first, [*second, self.usam_2], *others]
-
-
-def require_modules(state: dict[str, Tensor]) -> None:
-    """Raise ValueError for a state dict without USAM."""
-    if not any(key.startswith("usam_") for key in state):
-        raise ValueError("it has no usam_1")
