@@ -13,6 +13,7 @@ import io
 import json
 import re
 import zipfile
+from functools import lru_cache
 from typing import Any
 
 import safetensors.torch
@@ -21,7 +22,7 @@ import torch
 from model.config import PVDAConfig
 from model.errors import CheckpointError, MissingLibrary
 from model.pvda import FeatureEncoder
-from model.shapes_alone import shapes_alone
+from model.shapes_alone import shapes_alone, weights_follow
 from model.weights import torch_files
 
 FORMAT = 2
@@ -224,19 +225,23 @@ def _check_fields(checkpoint: Checkpoint) -> None:
     )
     if not plain:
         raise ValueError("a field of another type")
-    with shapes_alone():
-        expected = {
-            name: tensor.shape
-            for name, tensor in FeatureEncoder(checkpoint.network).state_dict().items()
-        }
     found = {name: tensor.shape for name, tensor in checkpoint.encoder_weights.items()}
-    if found != expected:
+    if found != _weight_shapes(checkpoint.network):
         raise ValueError("weights of another network")
+
+
+@lru_cache(maxsize=4)
+def _weight_shapes(network: PVDAConfig) -> dict[str, torch.Size]:
+    """The shapes of an encoder's weights by name."""
+    with shapes_alone():
+        weights = FeatureEncoder(network).state_dict()
+    return {name: tensor.shape for name, tensor in weights.items()}
 
 
 def build_encoder(checkpoint: Checkpoint) -> FeatureEncoder:
     """The encoder with the checkpoint's weights, in evaluation mode."""
-    encoder = FeatureEncoder(checkpoint.network)
+    with weights_follow():
+        encoder = FeatureEncoder(checkpoint.network)
     encoder.load_state_dict(checkpoint.encoder_weights)
     return encoder.eval()
 

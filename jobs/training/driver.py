@@ -16,7 +16,7 @@ from jobs.training.settings import RECIPE, RUN_CONFIG_FILE, RunConfig, TrainSett
 from jobs.training.state import WorkerContext, open_stream
 from jobs.training.worker import train_worker
 from model.pvda import FeatureEncoder
-from model.shapes_alone import shapes_alone
+from model.shapes_alone import shapes_alone, weights_follow
 from model.weights.start import load_start
 from pipeline.core import storage
 from pipeline.core.errors import InputError
@@ -80,7 +80,8 @@ def check_input(settings: TrainSettings, run: RunConfig, resumes: bool) -> int:
         shards.require_tars(shards.manifest.of(Split.TRAIN))
     steps = open_stream(run, WorkerContext(world_size=max(1, settings.workers))).steps
     if not resumes and (run.weights is not None or run.recipe.start != "random"):
-        encoder = FeatureEncoder(run.recipe.network)
+        with weights_follow():
+            encoder = FeatureEncoder(run.recipe.network)
         load_start(encoder, run.recipe.network.backbone, run.recipe.start, run.weights)
     return steps
 
