@@ -183,6 +183,7 @@ def adapted_region(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) 
     from jobs.region import flights
     from jobs.region.adapt import adapt
     from jobs.region.settings import AdaptSettings
+    from pipeline.matching import map_windows, photo_features
     from pipeline.simulation.over_map.settings import TownMapSettings
     from pipeline.simulation.over_map.town_map import MAP, SURFACE, make_town_map
 
@@ -197,6 +198,9 @@ def adapted_region(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) 
         patch.setattr(flights, "TESTED_PLACES", 2)
         patch.setattr(flights, "VIEWS", 1)
         patch.setattr(flights, "CHECK_PX", 256)
+        # The town has a pixel each half metre: windows of no more than twice as many.
+        patch.setattr(map_windows, "MOST_SIDE_PX", 600)
+        patch.setattr(photo_features, "PHOTO_PX", 320)
         adapt(settings)
     return settings
 

@@ -216,11 +216,11 @@ class MapWindows:
         return sorted(middles), half_m
 
     def compose(
-        self, lat: float, lon: float, half_m: float, most_px: int = MOST_SIDE_PX
+        self, lat: float, lon: float, half_m: float, most_px: int | None = None
     ) -> MapWindow | None:
         """The map within `half_m` metres of a position, of the tiles of one level: the one of which
-        TILES_ACROSS come nearest to filling it; at most `most_px` pixels wide. None where no tile
-        shows it."""
+        TILES_ACROSS come nearest to filling it; at most `most_px` pixels wide (MOST_SIDE_PX). None
+        where no tile shows it."""
         plane = LocalPlane(lat=lat, lon=lon)
         side_m = self._level_for(half_m)
         keys = self._keys_within(plane, half_m, side_m)
@@ -238,7 +238,8 @@ class MapWindows:
         if not tiles:
             return None
         finest_m = min(tile.metres_per_pixel for tile in tiles)
-        return compose_window(plane, tiles, half_m, max(finest_m, 2 * half_m / most_px))
+        least_m = 2 * half_m / (most_px or MOST_SIDE_PX)
+        return compose_window(plane, tiles, half_m, max(finest_m, least_m))
 
     def _level_for(self, half_m: float) -> float | None:
         """The side of the tiles that a window is put together from; None where none is known."""
