@@ -82,8 +82,8 @@ CASES: dict[str, tuple[str, str]] = {
         r"\| 0.5 \| 1,000 \| IVF16,SQ8 \| [\d.]+ \|.* [\d.]+ x \|",
     ),
     "ingredients": (
-        "--shards {trained}/shards --held places={trained}/shards --out {out} --epochs 1 "
-        "--batch-size 2 --only without_turns",
+        "--shards {tiny} --held places={tiny} --out {out} --epochs 1 --batch-size 2 "
+        "--only without_turns",
         r"without_turns \| [\d.]+% \[.*\] \| [+-][\d.]+% \[",
     ),
     "matchers": (
@@ -93,7 +93,8 @@ CASES: dict[str, tuple[str, str]] = {
         r"(.|\n)*whole map, no tags: [\d.]+%",
     ),
     "own_map": (
-        "--imagery {images} --out {out} --tiles 3 --photos 1 --height 12 16 --higher 1.5",
+        "--imagery {images} --out {out} --tiles 3 --photos 1 --height 12 16 --higher 1.5 "
+        "--levels 55 110",
         r"built-in, matched, pose: [\d.]+% within 1 m, .* of 1 photos, [\d.]+ x ImageNet's tiles"
         r"(.|\n)*\| 18 to 24 \| no \| levels \|(.|\n)*levels, .* [\d.]+ x one level's photos",
     ),

@@ -217,9 +217,9 @@ def full_disk() -> Callable[[], None]:
         def limited(path: str) -> Iterator[str]:
             with atomic_file(path) as local:
                 yield local
-                if not left[0]:
+                if left[0] <= 0:
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-                left[0] -= 1
+            left[0] -= 1  # the file is there, whatever the next one meets
 
         # By its name, for mypy accepts no other value for a module's function.
         setattr(storage, "atomic_file", limited)  # noqa: B010

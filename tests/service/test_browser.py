@@ -201,12 +201,21 @@ def map_photo() -> Pixels:
     return photo_of(window_of(made_map(0)))
 
 
-@pytest.mark.parametrize("width", [390, 1280])
-def test_page_lays_photo_over_map_where_it_belongs(browser: Any, width: int) -> None:
-    """With the photo laid over it, the map looks as it does without it."""
+@pytest.fixture
+def matching() -> Iterator[Served]:
+    """A service that matches photos with the map."""
     service = Served(engine=MatchingEngine())
+    yield service
+    service.stop()
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_page_lays_photo_over_map_where_it_belongs(
+    browser: Any, matching: Served, width: int
+) -> None:
+    """With the photo laid over it, the map looks as it does without it."""
     page = browser.new_page(viewport={"width": width, "height": 900})
-    page.goto(service.address)
+    page.goto(matching.address)
     stream = io.BytesIO()
     Image.fromarray(map_photo()).save(stream, "PNG")
     give(page, DROP, stream.getvalue(), "photo.png", "image/png")
@@ -228,7 +237,6 @@ def test_page_lays_photo_over_map_where_it_belongs(browser: Any, width: int) -> 
     assert changed_HW.mean() > 0.1
     alike = np.corrcoef(shots[0][changed_HW], shots[1][changed_HW])[0, 1]
     page.close()
-    service.stop()
     assert alike > 0.9
 
 

@@ -45,7 +45,11 @@ async function ask() {
     const response = await fetch("/locate", { method: "POST", body: form, headers: authorization() });
     const body = await response.json();
     if (number !== latest) return;
-    if (response.ok) return show(body);
+    if (response.ok) {
+      await $("preview").decode().catch(() => {}); // it is laid over the map
+      if (number === latest) show(body);
+      return;
+    }
     if (response.status === 401) {
       $("token-field").hidden = false;
       $("token").focus();
