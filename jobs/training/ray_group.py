@@ -30,6 +30,9 @@ from pipeline.core.progress import Meter
 NOT_NEEDED = ("DatasetsCallback", "PlacementGroupCleanerCallback")
 """Of Ray Train, each with a process that takes seconds to start: one hands out data sets of Ray
 Data, of which a run has none; one frees what a dead controller leaves, as the job's end does."""
+NOT_ASKED = ("_send_resource_request", "_maybe_send_resource_request", "_cancel_resource_request")
+"""Of Ray Train's scaling policy: it starts one more such process to ask an autoscaler for workers,
+which their placement group asks for anyway while it waits."""
 QUEUE_POLL_S = 1.0
 "Timeout of one poll of the queue that carries the workers' messages."
 
@@ -112,7 +115,7 @@ def stop_listener(messages: Queue, listener: threading.Thread) -> None:
 
 class _Trainer(TorchTrainer):
     """Ray Train's, without its handler of Ctrl-C: that one ends the process with code 1 from within
-    a call, and stays installed. And without NOT_NEEDED.
+    a call, and stays installed. And without NOT_NEEDED and NOT_ASKED.
     """
 
     def _register_sigint_handler(self, controller: Any) -> None:
@@ -121,6 +124,11 @@ class _Trainer(TorchTrainer):
     def _create_default_callbacks(self) -> list[Any]:
         every: list[Any] = super()._create_default_callbacks()  # type: ignore[misc]
         return [one for one in every if type(one).__name__ not in NOT_NEEDED]
+
+    def _initialize_and_run_controller(self, **parts: Any) -> Any:
+        for name in NOT_ASKED:
+            setattr(parts["scaling_policy"], name, lambda *_: None)
+        return super()._initialize_and_run_controller(**parts)  # type: ignore[misc]
 
 
 def ray_worker(config: dict[str, Any]) -> None:
