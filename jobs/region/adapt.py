@@ -7,7 +7,8 @@ ones are skipped.
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import partial
 
 from rich import box
 from rich.table import Table
@@ -65,7 +66,7 @@ def adapt(settings: AdaptSettings) -> list[Expectation]:
         raise InputError(
             f"--out is {settings.out}, expected a local or mounted folder; make it there and copy"
         )
-    claim(region, settings)
+    claim(region, settings, partial(is_finished, region, settings))
     figures = region.path("expect", FIGURES)
     if storage.exists(figures):
         found = read_expectations(storage.read_json(figures)["expectations"])
@@ -92,13 +93,23 @@ def adapt(settings: AdaptSettings) -> list[Expectation]:
         real = real_photos(region, of_files.surface, settings.photos)
         found = expectations(outcomes)
     note_localizer(region, of_files.surface)
-    maps = [identify_map(settings.mosaic)]
+    maps = [identify_map(settings.mosaic, settings.surface)]
     write_page(region, settings, seconds, found, outcomes, real, maps, [EXPECT])
     results.print(expectation_table([*found, *([real] if real else [])]))
     results.print(
         f"what to expect: {region.path(PAGE)}\nnow: {locate_command(region)}", soft_wrap=True
     )
     return found
+
+
+def is_finished(region: Region, settings: AdaptSettings) -> bool:
+    """Whether the region was made to its end, of this map and surface model by their bytes."""
+    path = region.path("expect", FIGURES)
+    known = storage.read_json(path).get("maps", [None])[0] if storage.exists(path) else None
+    if not isinstance(known, dict):  # not finished, or by a release that noted no maps
+        return False
+    found = identify_map(settings.mosaic, settings.surface)
+    return replace(found, name=known["name"]) == RegionMap(**known)
 
 
 def camera_ranges(settings: AdaptSettings) -> CameraRanges:

@@ -43,7 +43,8 @@ def extend_region(settings: AdaptSettings) -> list[Expectation]:
     region = Region(out=settings.out)
     figures = _figures(region)
     check_map(settings)
-    known, more = [RegionMap(**one) for one in figures["maps"]], identify_map(settings.mosaic)
+    known = [RegionMap(**one) for one in figures["maps"]]
+    more = identify_map(settings.mosaic, settings.surface)
     if more.sha256 in {one.sha256 for one in known}:
         found = read_expectations(figures["expectations"])
         results.print(expectation_table(found))

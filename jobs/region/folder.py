@@ -1,5 +1,6 @@
 """The folder of a region: what lies where, and the command that makes each part alone."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,6 +11,9 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import console
 from pipeline.simulation.resume import settings_record
 from pipeline.sources.maps.sheets import describe_sheets, find_sheets, read_sheet
+
+PATHS = {"mosaic", "surface"}
+"Settings whose files may have been moved since."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,8 +69,9 @@ def check_map(settings: AdaptSettings) -> list[str]:
     return files
 
 
-def claim(region: Region, settings: AdaptSettings) -> None:
-    """Note the region's settings in its folder.
+def claim(region: Region, settings: AdaptSettings, is_finished: Callable[[], bool]) -> None:
+    """Note the region's settings in its folder. `is_finished`: of the same map, wherever that lies
+    now; asked only where a path is another one.
 
     Raises InputError where it is of other settings or another map, or where there is no map.
     """
@@ -93,7 +98,7 @@ def claim(region: Region, settings: AdaptSettings) -> None:
             "and adapt again"
         ) from None
     differing = sorted(name for name in {*found, *about} if found.get(name) != about.get(name))
-    if differing:
+    if differing and not (PATHS.issuperset(differing) and is_finished()):
         raise InputError(
             f"{region.out} was adapted with another {', '.join(differing)}, expected the same "
             "settings to resume; choose another --out or remove the folder"

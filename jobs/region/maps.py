@@ -26,6 +26,8 @@ class RegionMap:
     "Of its file or folder, after that of the folder above."
     sha256: str
     "Of its bytes; of a folder of the bytes of its sheets."
+    surface_sha256: str | None = None
+    "Likewise of its surface model, if any. Regions from before have none noted."
 
     @property
     def stem(self) -> str:
@@ -33,13 +35,20 @@ class RegionMap:
         return self.name.rpartition("/")[2].rsplit(".", 1)[0]
 
 
-def identify_map(mosaic: str) -> RegionMap:
-    """The map at an absolute path; reads all of it."""
-    name = "/".join(mosaic.rstrip("/").split("/")[-2:])
-    if not storage.is_folder(mosaic):
-        return RegionMap(name=name, sha256=checksum_file(mosaic).sha256)
-    sheets = [checksum_file(sheet).sha256 for sheet in find_sheets(mosaic)]
-    return RegionMap(name=name, sha256=hashlib.sha256("".join(sheets).encode()).hexdigest())
+def identify_map(mosaic: str, surface: str | None = None) -> RegionMap:
+    """The map, and its surface model, at absolute paths; reads all of both."""
+    return RegionMap(
+        name="/".join(mosaic.rstrip("/").split("/")[-2:]),
+        sha256=_digest(mosaic),
+        surface_sha256=None if surface is None else _digest(surface),
+    )
+
+
+def _digest(path: str) -> str:
+    if not storage.is_folder(path):
+        return checksum_file(path).sha256
+    sheets = [checksum_file(sheet).sha256 for sheet in find_sheets(path)]
+    return hashlib.sha256("".join(sheets).encode()).hexdigest()
 
 
 def titles_of(maps: Sequence[RegionMap]) -> list[str]:

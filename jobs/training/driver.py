@@ -80,7 +80,7 @@ def check_input(settings: TrainSettings, run: RunConfig, resumes: bool) -> int:
         shards.require_tars(shards.manifest.of(Split.TRAIN))
     steps = open_stream(run, WorkerContext(world_size=max(1, settings.workers))).steps
     if not resumes and (run.weights is not None or run.recipe.start != "random"):
-        with weights_follow():
+        with weights_follow():  # it is only asked whether they fit
             encoder = FeatureEncoder(run.recipe.network)
         load_start(encoder, run.recipe.network.backbone, run.recipe.start, run.weights)
     return steps

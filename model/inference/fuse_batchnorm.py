@@ -4,11 +4,10 @@ In: an encoder in evaluation mode. Out: a copy that computes the same with fewer
 """
 
 import copy
-from collections.abc import Callable
 from itertools import pairwise
 
 from torch import nn
-from torch.nn.utils.fusion import fuse_conv_bn_weights, fuse_linear_bn_weights
+from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
 from model.pvda import FeatureEncoder
 
@@ -40,18 +39,12 @@ def _fuse_children(parent: nn.Module) -> None:
     """Fold each BatchNorm into the child registered just before it: in our networks that is the
     layer it normalises.
     """
-    for (_, layer), (norm_name, norm) in pairwise(list(parent.named_children())):
-        fuse: Callable[..., tuple[nn.Parameter, nn.Parameter]]
+    children = list(parent.named_children())
+    for (name, layer), (norm_name, norm) in pairwise(children):
         if isinstance(layer, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
-            fuse = fuse_conv_bn_weights
+            setattr(parent, name, fuse_conv_bn_eval(layer, norm))
         elif isinstance(layer, nn.Linear) and isinstance(norm, nn.BatchNorm1d):
-            fuse = fuse_linear_bn_weights
+            setattr(parent, name, fuse_linear_bn_eval(layer, norm))
         else:
             continue
-        assert norm.running_mean is not None  # in evaluation
-        assert norm.running_var is not None
-        layer.weight, layer.bias = fuse(
-            layer.weight, layer.bias, norm.running_mean, norm.running_var, norm.eps,
-            norm.weight, norm.bias,
-        )  # fmt: skip
         setattr(parent, norm_name, nn.Identity())

@@ -57,6 +57,8 @@ def test_train_two_ray_workers_end_at_damaged_input(
     with pytest.raises(InputError, match=r"train-\S+\.tar"):
         train(settings(str(shards), run, recipe, workers=2, checkpoint_minutes=60.0))
     assert "lost a worker" not in capfd.readouterr().err
+    named = [one["name"] for one in ray.util.list_named_actors(all_namespaces=True)]
+    assert not [name for name in named if "Autoscaling" in name], "a process that takes seconds"
     assert loads((run / "last.pt").read_bytes()).history[0]["step"] == 1
 
 

@@ -26,7 +26,7 @@ from pipeline.index.searcher import Index
 from pipeline.locate.gallery_map import read_gallery_map
 from pipeline.shards.manifest import read_manifest
 from pipeline.simulation.over_map.settings import TownMapSettings
-from pipeline.simulation.over_map.town_map import MAP, make_town_map
+from pipeline.simulation.over_map.town_map import MAP, SURFACE, make_town_map
 from tests.sources.mosaics import mosaic, noise, quarters
 
 
@@ -54,10 +54,20 @@ def test_adapt_makes_a_localizer_and_says_what_to_expect(adapted_region: AdaptSe
     (out / "elsewhere.json").rename(out / "index" / "localizer.json")
 
 
-def test_adapt_again_makes_nothing_anew(adapted_region: AdaptSettings) -> None:
+def test_adapt_again_makes_nothing_anew(adapted_region: AdaptSettings, tmp_path: Path) -> None:
+    """Not where the map has been moved, either; one of other bytes is another map."""
     made = [path for path in Path(adapted_region.out).rglob("*") if path.is_file()]
     kept = {path: path.stat().st_mtime_ns for path in made}
     adapt(adapted_region)
+    town = Path(shutil.copytree(Path(adapted_region.mosaic).parent, tmp_path / "moved"))
+    moved = replace(adapted_region, mosaic=str(town / MAP), surface=str(town / SURFACE))
+    adapt(moved)
+    for changed in (town / SURFACE, town / MAP):
+        data = changed.read_bytes()
+        changed.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+        with pytest.raises(InputError, match="adapted with another mosaic, surface, expected"):
+            adapt(moved)
+        changed.write_bytes(data)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
     with pytest.raises(InputError, match="adapted with another seed"):
         adapt(replace(adapted_region, seed=1))

@@ -24,6 +24,8 @@ def test_map_is_known_again_elsewhere(tmp_path: Path) -> None:
         )
         assert one == moved == RegionMap(name=f"0/{name}", sha256=one.sha256)
         assert other.sha256 != one.sha256
+        heights = str(tmp_path / "1" / name)
+        assert identify_map(str(tmp_path / "0" / name), heights).surface_sha256 == other.sha256
 
 
 def test_maps_of_one_name_are_called_apart() -> None:
