@@ -55,8 +55,13 @@ def with_absolute_paths(settings: AdaptSettings) -> AdaptSettings:
 
 
 def check_map(settings: AdaptSettings) -> list[str]:
-    """The files of the map. Raises InputError where there is none, or a folder that does not hold
-    the sheets of one."""
+    """The files of the map. Raises InputError where there is none, a folder that does not hold the
+    sheets of one, or no surface model where one is named."""
+    if settings.surface is not None and not storage.exists(settings.surface):
+        raise InputError(
+            f"no surface model at {settings.surface}, expected a GeoTIFF, or a folder of its "
+            "sheets; check --surface, or leave it out: the ground is taken for flat then"
+        )
     if not storage.exists(settings.mosaic):
         raise InputError(
             f"no map at {settings.mosaic}, expected a GeoTIFF, or a folder of its sheets; check "

@@ -96,6 +96,9 @@ def test_adapt_without_a_map_is_refused(tmp_path: Path) -> None:
     mosaic(tmp_path / "sheets" / "b.tif", noise(1, 8, 8))
     with pytest.raises(InputError, match="in its bands"):
         adapt(replace(given, mosaic=str(tmp_path / "sheets")))
+    named = replace(given, mosaic=str(tmp_path / "sheets"), surface=str(tmp_path / "dsm.tif"))
+    with pytest.raises(InputError, match=r"no surface model at .*dsm\.tif, expected a GeoTIFF"):
+        adapt(named)
     (tmp_path / "none.tif").write_bytes(b"no map")
     (tmp_path / "region").mkdir()
     (tmp_path / "region" / "mine.txt").write_text("not a region's")
