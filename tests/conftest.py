@@ -4,7 +4,7 @@ import gc
 import os
 import re
 from collections.abc import Iterator
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -180,8 +180,8 @@ def adapted_region(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) 
     """A localizer of a town of 400 m, with a moment of training on fewer places than anybody would
     learn from. Beside it lies the town, as benchmarks/region.py arranges them.
     """
-    from jobs.region import adapt, flights
-    from jobs.region.expect import located_outcomes
+    from jobs.region import flights
+    from jobs.region.adapt import adapt
     from jobs.region.settings import AdaptSettings
     from pipeline.matching import map_windows, photo_features
     from pipeline.simulation.over_map.settings import TownMapSettings
@@ -201,9 +201,7 @@ def adapted_region(tmp_path_factory: pytest.TempPathFactory, ray_cluster: None) 
         # The town has a pixel each half metre: windows of no more than twice as many.
         patch.setattr(map_windows, "MOST_SIDE_PX", 600)
         patch.setattr(photo_features, "PHOTO_PX", 320)
-        some = partial(located_outcomes, most=8)
-        patch.setattr(adapt, "located_outcomes", lambda *given: some(*given[:3]))
-        adapt.adapt(settings)
+        adapt(settings)
     return settings
 
 

@@ -34,7 +34,7 @@ def test_adapt_makes_a_localizer_and_says_what_to_expect(adapted_region: AdaptSe
     out = Path(adapted_region.out)
     assert "What to expect of map.tif" in (out / PAGE).read_text()
     figures = json.loads((out / "expect" / "figures.json").read_text())
-    assert [one["photos"] for one in figures["expectations"][:2]] == [8, 8]
+    assert [one["photos"] for one in figures["expectations"][:2]] == [20, 20]
     errors = np.array([one["error_m"] for one in figures["outcomes"] if one["known"]])
     assert np.median(errors) < 25
     levels = read_gallery_map(Index(str(out / "index"))).level_sides_m
