@@ -18,7 +18,7 @@ from jobs.encoding.localizer import Localizer, write_localizer
 from jobs.region.expect import located_outcomes, lookalikes, real_photos
 from jobs.region.flights import CHECK, EXPECT, plan_flights, take_flight
 from jobs.region.folder import Region, claim, print_command, with_absolute_paths
-from jobs.region.maps import RegionMap, identify_map, titles_of, with_one_file_each
+from jobs.region.maps import RegionMap, identify_map, maps_of, titles_of, with_one_file_each
 from jobs.region.settings import AdaptSettings
 from jobs.region.tuning import choose_encoder
 from jobs.stages.calibrate import calibrate_index
@@ -105,11 +105,11 @@ def adapt(settings: AdaptSettings) -> list[Expectation]:
 def is_finished(region: Region, settings: AdaptSettings) -> bool:
     """Whether the region was made to its end, of this map and surface model by their bytes."""
     path = region.path("expect", FIGURES)
-    known = storage.read_json(path).get("maps", [None])[0] if storage.exists(path) else None
-    if not isinstance(known, dict):  # not finished, or by a release that noted no maps
+    known = maps_of(storage.read_json(path)) if storage.exists(path) else []
+    if not known:
         return False
     found = identify_map(settings.mosaic, settings.surface)
-    return replace(found, name=known["name"]) == RegionMap(**known)
+    return replace(found, name=known[0].name) == known[0]
 
 
 def camera_ranges(settings: AdaptSettings) -> CameraRanges:

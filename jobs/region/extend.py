@@ -21,7 +21,7 @@ from jobs.region.adapt import (
 from jobs.region.expect import located_outcomes, real_photos
 from jobs.region.flights import EXPECT, plan_flights, take_flight
 from jobs.region.folder import Region, check_map, print_command, with_absolute_paths
-from jobs.region.maps import RegionMap, identify_map, join_surfaces, with_one_file_each
+from jobs.region.maps import identify_map, join_surfaces, maps_of, with_one_file_each
 from jobs.region.settings import AdaptSettings
 from jobs.stages.demo import step
 from pipeline.core import storage
@@ -43,7 +43,7 @@ def extend_region(settings: AdaptSettings) -> list[Expectation]:
     region = Region(out=settings.out)
     figures = _figures(region)
     check_map(settings)
-    known = [RegionMap(**one) for one in figures["maps"]]
+    known = maps_of(figures)
     more = identify_map(settings.mosaic, settings.surface)
     if more.sha256 in {one.sha256 for one in known}:
         found = read_expectations(figures["expectations"])
@@ -82,7 +82,7 @@ def extend_region(settings: AdaptSettings) -> list[Expectation]:
 def _figures(region: Region) -> dict[str, Any]:
     path = region.path("expect", FIGURES)
     figures: dict[str, Any] = storage.read_json(path) if storage.exists(path) else {}
-    if not all(isinstance(one, dict) for one in figures.get("maps", [None])):
+    if not maps_of(figures):
         raise InputError(
             f"no finished region at {region.out}, expected one to extend; adapt its first map "
             "without --extend"

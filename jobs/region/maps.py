@@ -5,8 +5,9 @@ In: --mosaic and --surface, files or folders of sheets. Out: paths of one file e
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from jobs.encoding.localizer import read_localizer, usable_surface
 from jobs.region.folder import Region
@@ -49,6 +50,12 @@ def _digest(path: str) -> str:
         return checksum_file(path).sha256
     sheets = [checksum_file(sheet).sha256 for sheet in find_sheets(path)]
     return hashlib.sha256("".join(sheets).encode()).hexdigest()
+
+
+def maps_of(figures: Mapping[str, Any]) -> list[RegionMap]:
+    """The maps of a region by its figures; none where it is not finished, or is of a release that
+    noted none."""
+    return [RegionMap(**one) for one in figures.get("maps", ()) if isinstance(one, dict)]
 
 
 def titles_of(maps: Sequence[RegionMap]) -> list[str]:
