@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 ROOT = Path(__file__).parents[1]
 PYTHON_PATH = (str(Path(__file__).parent / "chaos" / "hook"), str(ROOT))
@@ -177,7 +177,7 @@ def serve() -> dict[str, Any]:
     sys.exit(0)
 
 
-def run_job(order: dict[str, Any]) -> None:
+def run_job(order: dict[str, Any]) -> NoReturn:
     """Run the script of an order in this process, and exit."""
     os.setsid()
     log = os.open(order["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
@@ -189,12 +189,16 @@ def run_job(order: dict[str, Any]) -> None:
     if "CHAOS" in order["environment"] and "CHAOS" not in before:
         hook = importlib.import_module("sitecustomize")  # of PYTHON_PATH; else it has done so
         hook.inject_faults(importlib.import_module("pipeline.core.storage"))
-    path = order["path"]
-    sys.argv = [path, *order["arguments"]]
-    sys.path.insert(0, os.path.dirname(path))
+    run_script([order["path"], *order["arguments"]])
+
+
+def run_script(words: list[str]) -> NoReturn:
+    """As `python SCRIPT ARGUMENTS`, in this process."""
+    sys.argv = words
+    sys.path.insert(0, os.path.dirname(words[0]))
     code: Any = 1
     try:
-        runpy.run_path(path, run_name="__main__")
+        runpy.run_path(words[0], run_name="__main__")
         code = 0
     except SystemExit as exit_:
         code = exit_.code

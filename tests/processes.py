@@ -16,6 +16,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.launcher import ROOT
+from tests.ray_workers import SOCKET
+
 LOG, STARTED = "head.log", "Ray runtime started"
 "Where `ray start` writes, and what, when its node takes drivers."
 
@@ -142,18 +145,20 @@ def _start_head(
         f"start --head --block --disable-usage-stats --node-ip-address=127.0.0.1 --port={port} "
         f"--dashboard-port={dashboard} --dashboard-agent-listen-port={agent} "
         f"--dashboard-agent-grpc-port={metrics} --runtime-env-agent-port={environments} "
-        f"--ray-client-server-port={client} --num-cpus={cpus} --temp-dir={scratch} "
+        f"--ray-client-server-port={client} --num-cpus={cpus} --temp-dir={scratch} --no-monitor "
         # It follows the workers' output for drivers, and ours want none: see cluster.connect.
         "--include-log-monitor=false"
     )
     folder = Path(sys.executable).parent
     # `python` of a submitted job is the first of its node's PATH.
     path = os.pathsep.join((str(folder), os.environ["PATH"]))
-    environment = os.environ | {"PATH": path} | environment
+    workers = {SOCKET: str(Path(scratch, "workers"))}
+    environment = os.environ | {"PATH": path} | environment | workers
     environment.pop("RAY_ADDRESS", None)  # of another cluster
     with Path(scratch, LOG).open("wb") as log:
         head = subprocess.Popen(
-            [str(folder / "ray"), *words.split()],
+            [sys.executable, "-m", "tests.ray_workers", str(folder / "ray"), *words.split()],
+            cwd=ROOT,
             env=environment,
             start_new_session=True,
             stdout=log,
