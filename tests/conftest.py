@@ -28,6 +28,10 @@ os.environ.setdefault("RAY_TRAIN_HEALTH_CHECK_INTERVAL_S", "0.5")
 os.environ.setdefault("RAY_TRAIN_ENABLE_PREEMPTION_WATCHER", "0")
 # Its agents look at every process, for a dashboard that nobody opens, and after their parent.
 os.environ.setdefault("REPORTER_UPDATE_INTERVAL_MS", "60000")
+os.environ.setdefault("METRICS_RECORD_INTERVAL_S", "600")
+os.environ.setdefault("NODE_STATS_UPDATE_INTERVAL_SECONDS", "600")
+os.environ.setdefault("RAY_enable_metrics_collection", "0")
+os.environ.setdefault("RAY_task_events_report_interval_ms", "0")
 os.environ.setdefault("RAY_enable_pipe_based_agent_to_parent_health_check", "1")
 # Never a cluster that someone, or another test, runs on this machine.
 os.environ["RAY_ADDRESS"] = "local"

@@ -2,7 +2,7 @@
 
 By itself each worker imports Ray and then torch, some three seconds of a core, and the tests start
 hundreds. Here the process that a raylet starts for one ends in our hook (chaos/hook), which hands
-its command to the process above the cluster; a fork of that goes on with Ray's own script.
+its command to the process above the cluster. A fork of that goes on with Ray's own script.
 """
 
 import ctypes
@@ -28,12 +28,15 @@ LIBRARIES = (
     *("pandas", "pyarrow.parquet", "scipy.io", "faiss", "cv2", "PIL.Image", "simplejpeg"),
     *("grpc", "aiohttp", "pydantic", "requests", "jsonschema", "tyro"),  # Ray imports most of them
 )
-"""What workers import. Not Ray: its C++ reads the job that a worker belongs to from the environment
-when it is loaded."""
+"""What workers import, before they are known. Not Ray: its C++ reads from the environment whose job
+a worker is for when it is loaded, so each job has a process that has imported Ray too."""
+MOST_JOBS = 3
+"With such a process; of others, the one that was used last goes first."
 
 
 def serve(ray_start: list[str]) -> dict[str, Any]:
-    """Start a cluster and fork a child per order; returns in the children only, with their order.
+    """Start a cluster and have a worker forked per order; returns in the workers only, with their
+    order.
 
     The process exits when the cluster has ended.
     """
@@ -46,28 +49,67 @@ def serve(ray_start: list[str]) -> dict[str, Any]:
     for name in LIBRARIES:
         importlib.import_module(name)
     gc.freeze()
+    jobs = dict[str, int]()
     while head.poll() is None:
         with suppress(ChildProcessError):
             while os.waitpid(-1, os.WNOHANG)[0]:
                 pass
-        if select.select([orders], [], [], 0.2)[0]:
-            connection, _ = orders.accept()
-            with connection, connection.makefile() as stream:
-                order = json.load(stream)
+        if not select.select([orders], [], [], 0.2)[0]:
+            continue
+        connection, _ = orders.accept()
+        with connection, connection.makefile("rb") as stream:
+            data = stream.read()
+        job = json.loads(data)["environment"].get("RAY_JOB_ID", "")
+        if job not in jobs:
+            read, write = os.pipe()
             if not os.fork():
                 orders.close()
-                return dict(order)
+                for pipe in (write, *jobs.values()):
+                    os.close(pipe)
+                return serve_job(read)
+            os.close(read)
+            jobs[job] = write
+        jobs[job] = jobs.pop(job)  # the last that was used
+        os.write(jobs[job], data + b"\n")
+        for former in list(jobs)[:-MOST_JOBS]:
+            os.close(jobs.pop(former))
     os._exit(head.returncode)
+
+
+def serve_job(pipe: int) -> dict[str, Any]:
+    """Fork a worker per order on the pipe; returns in them only.
+
+    The process exits when the pipe has been closed and the workers have ended.
+    """
+    end_with_parent()
+    with os.fdopen(pipe) as orders:
+        for line in orders:
+            order: dict[str, Any] = json.loads(line)
+            if "ray" not in sys.modules:
+                os.environ.update(order["environment"])
+                importlib.import_module("ray.train.torch")
+                gc.freeze()
+                signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel forgets who has ended
+            if not os.fork():
+                signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+                return order
+    with suppress(ChildProcessError):
+        os.wait()
+    os._exit(0)
 
 
 def run_worker(order: dict[str, Any]) -> None:
     """Do in this process what an order's command would do, and exit."""
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG: it ends with its cluster
+    end_with_parent()
     os.environ.clear()
     os.environ.update(order["environment"])
     os.chdir(order["folder"])
     sys.path[:] = order["path"]  # `ray job submit` brings a copy of the project
     run_script(order["command"])
+
+
+def end_with_parent() -> None:
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
 if __name__ == "__main__":
