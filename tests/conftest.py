@@ -57,6 +57,7 @@ SLOW_FIXTURES = RAY_FIXTURES | {"prepared", "browser"}
 does with tests/fuzz, and with tests and files that are marked."""
 STARTS = re.compile(r"\b(ray_session|ray_cluster|ray_address|prepared|adapted_region)\b")
 "In a file of tests: it needs the session's Ray, or the process that starts jobs."
+STARTS_RAY = re.compile(r"\bray_(session|cluster|address)\b")
 RAY_UNITS = {"training": "tests/jobs/", "other stages": "tests/"}
 """Beginning of such files' names: of several test processes (pytest -n), one runs a unit to its
 end, with a Ray and a launcher of its own. Of the others, each file is a unit."""
@@ -82,8 +83,17 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         fuzzes = item.nodeid.startswith("tests/fuzz/")
         if fuzzes or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
-    if hasattr(config, "workerinput"):  # a process of pytest-xdist: the longest units first
-        items.sort(key=lambda item: unit_of(item.nodeid.partition("::")[0]) not in RAY_UNITS)
+    if hasattr(config, "workerinput"):  # a process of pytest-xdist
+        items.sort(key=lambda item: turn_of(item.nodeid.partition("::")[0]))
+
+
+@cache
+def turn_of(file: str) -> tuple[bool, bool]:
+    """The longest units come first. Two Rays do not start at once: the unit "training" begins with
+    what needs none."""
+    unit = unit_of(file)
+    needs_ray = STARTS_RAY.search((ROOT / file).read_text()) is not None
+    return unit not in RAY_UNITS, unit == "training" and needs_ray
 
 
 class UnitScheduling(LoadScopeScheduling):  # type: ignore[misc]
