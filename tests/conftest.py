@@ -58,6 +58,7 @@ does with tests/fuzz, and with tests and files that are marked."""
 STARTS = re.compile(r"\b(ray_session|ray_cluster|ray_address|prepared|adapted_region)\b")
 "In a file of tests: it needs the session's Ray, or the process that starts jobs."
 STARTS_RAY = re.compile(r"\bray_(session|cluster|address)\b")
+"It needs the session's Ray."
 RAY_UNITS = {"training": "tests/jobs/", "other stages": "tests/"}
 """Beginning of such files' names: of several test processes (pytest -n), one runs a unit to its
 end, with a Ray and a launcher of its own. Of the others, each file is a unit."""

@@ -28,10 +28,10 @@ LIBRARIES = (
     *("pandas", "pyarrow.parquet", "scipy.io", "faiss", "cv2", "PIL.Image", "simplejpeg"),
     *("grpc", "aiohttp", "pydantic", "requests", "jsonschema", "tyro"),  # Ray imports most of them
 )
-"""What workers import, before they are known. Not Ray: its C++ reads from the environment whose job
-a worker is for when it is loaded, so each job has a process that has imported Ray too."""
+"""What workers import. Ray is not among it: as it is loaded, its C++ reads from the environment which
+job the worker is for. So each job has a process of its own that has imported Ray too."""
 MOST_JOBS = 3
-"With such a process; of others, the one that was used last goes first."
+"With such a process at once: where there are more, the one unused for longest takes no orders."
 
 
 def serve(ray_start: list[str]) -> dict[str, Any]:
