@@ -1,8 +1,9 @@
 """A cluster of Ray whose workers are forked from a process that has imported their libraries.
 
 By itself each worker imports Ray and then torch, some three seconds of a core, and the tests start
-hundreds. Here the process that a raylet starts for one ends in our hook (chaos/hook), which hands
-its command to the process above the cluster. A fork of that goes on with Ray's own script.
+more than a hundred. Here the process that a raylet starts for one ends in our hook (chaos/hook),
+which hands its command to the process above the cluster. A fork of that goes on with Ray's own
+script.
 """
 
 import ctypes
@@ -28,8 +29,8 @@ LIBRARIES = (
     *("pandas", "pyarrow.parquet", "scipy.io", "faiss", "cv2", "PIL.Image", "simplejpeg"),
     *("grpc", "aiohttp", "pydantic", "requests", "jsonschema", "tyro"),  # Ray imports most of them
 )
-"""What workers import. Ray is not among it: as it is loaded, its C++ reads from the environment which
-job the worker is for. So each job has a process of its own that has imported Ray too."""
+"""What workers import. Not Ray: as it is loaded, its C++ reads from the environment which job the
+worker is for. So each job has a process of its own that has imported Ray too."""
 MOST_JOBS = 3
 "With such a process at once: where there are more, the one unused for longest takes no orders."
 
