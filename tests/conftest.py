@@ -26,7 +26,7 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("RAY_TRAIN_HEALTH_CHECK_INTERVAL_S", "0.5")
 # A process of its own per training, for nodes that a cloud takes back.
 os.environ.setdefault("RAY_TRAIN_ENABLE_PREEMPTION_WATCHER", "0")
-# Its agents look at every process, for a dashboard that nobody opens, and after their parent.
+# Its processes take figures for a dashboard that nobody opens, and look after their parent.
 os.environ.setdefault("REPORTER_UPDATE_INTERVAL_MS", "60000")
 os.environ.setdefault("METRICS_RECORD_INTERVAL_S", "600")
 os.environ.setdefault("NODE_STATS_UPDATE_INTERVAL_SECONDS", "600")
@@ -55,10 +55,10 @@ RAY_FIXTURES = {"ray_session", "ray_cluster"}
 SLOW_FIXTURES = RAY_FIXTURES | {"prepared", "browser"}
 """Tests that use one of them start Ray, jobs or Chromium: `make test-fast` leaves them out. So it
 does with tests/fuzz, and with tests and files that are marked."""
-STARTS = re.compile(r"\b(ray_session|ray_cluster|ray_address|prepared|adapted_region)\b")
-"In a file of tests: it needs the session's Ray, or the process that starts jobs."
 STARTS_RAY = re.compile(r"\bray_(session|cluster|address)\b")
-"It needs the session's Ray."
+"In a file of tests: it needs the session's Ray."
+STARTS = re.compile(rf"{STARTS_RAY.pattern}|\b(prepared|adapted_region)\b")
+"It needs that, or the process that starts jobs."
 RAY_UNITS = {"training": "tests/jobs/", "other stages": "tests/"}
 """Beginning of such files' names: of several test processes (pytest -n), one runs a unit to its
 end, with a Ray and a launcher of its own. Of the others, each file is a unit."""

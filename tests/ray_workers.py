@@ -52,22 +52,20 @@ def serve(ray_start: list[str]) -> dict[str, Any]:
     gc.freeze()
     jobs = dict[str, int]()
     while head.poll() is None:
-        with suppress(ChildProcessError):
-            while os.waitpid(-1, os.WNOHANG)[0]:
-                pass
         if not select.select([orders], [], [], 0.2)[0]:
             continue
         connection, _ = orders.accept()
         with connection, connection.makefile("rb") as stream:
             data = stream.read()
-        job = json.loads(data)["environment"].get("RAY_JOB_ID", "")
+        environment = json.loads(data)["environment"]
+        job = environment.get("RAY_JOB_ID", "")
         if job not in jobs:
             read, write = os.pipe()
             if not os.fork():
                 orders.close()
                 for pipe in (write, *jobs.values()):
                     os.close(pipe)
-                return serve_job(read)
+                return serve_job(read, environment)
             os.close(read)
             jobs[job] = write
         jobs[job] = jobs.pop(job)  # the last that was used
@@ -77,23 +75,22 @@ def serve(ray_start: list[str]) -> dict[str, Any]:
     os._exit(head.returncode)
 
 
-def serve_job(pipe: int) -> dict[str, Any]:
-    """Fork a worker per order on the pipe; returns in them only.
+def serve_job(pipe: int, environment: dict[str, str]) -> dict[str, Any]:
+    """Import Ray for the job of that environment, and fork a worker per order on the pipe; returns
+    in them only.
 
     The process exits when the pipe has been closed and the workers have ended.
     """
     end_with_parent()
+    os.environ.update(environment)
+    importlib.import_module("ray.train.torch")
+    gc.freeze()
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel forgets who has ended
     with os.fdopen(pipe) as orders:
         for line in orders:
-            order: dict[str, Any] = json.loads(line)
-            if "ray" not in sys.modules:
-                os.environ.update(order["environment"])
-                importlib.import_module("ray.train.torch")
-                gc.freeze()
-                signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel forgets who has ended
             if not os.fork():
                 signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-                return order
+                return dict(json.loads(line))
     with suppress(ChildProcessError):
         os.wait()
     os._exit(0)
