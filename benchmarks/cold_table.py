@@ -9,8 +9,6 @@ once from a slow disk). Latencies are those of a query's rows, and a ratio to th
 """
 
 import argparse
-import mmap
-import os
 import tempfile
 import time
 from collections.abc import Sequence
@@ -18,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from index import write_rows
+from page_cache import drop_from_cache
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.features.row_reader import RowReader
@@ -33,17 +32,6 @@ def write_table(table: Path, parts: int, rows: int, dimension: int) -> None:
     for number in range(parts):
         vectors_ND = np.roll(block, number, axis=0)
         write_rows(table, "gallery", "satellite", number, vectors_ND, number * rows)
-
-
-def drop_from_cache(table: Path, reader: RowReader) -> None:
-    """Write the files back, and drop them from the page cache and from the reader's memory."""
-    for part in reader._open.values():  # what is mapped stays in the cache
-        part.file.madvise(mmap.MADV_DONTNEED)
-    for path in table.iterdir():
-        descriptor = os.open(path, os.O_RDONLY)
-        os.fsync(descriptor)
-        os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
-        os.close(descriptor)
 
 
 def draw_queries(count: int, candidates: int, parts: int, rows: int) -> list[Query]:
@@ -99,7 +87,7 @@ def main() -> None:
         warm: dict[bool, list[float]] = {False: [], True: []}
         for number, query in enumerate(queries):
             at_once = bool(number % 2)
-            drop_from_cache(table, reader)  # a read brings in much around it
+            drop_from_cache(scratch)  # a read brings in much around it
             cold[at_once].append(time_query(reader, query, at_once))
         for number, query in enumerate(queries):  # the first time to fill the cache
             time_query(reader, query, True)

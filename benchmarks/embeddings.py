@@ -110,7 +110,6 @@ def main() -> None:
     add("--rows", type=int, default=200_000, help="rows of the gallery")
     add("--queries", type=int, default=RECALL_QUERIES, help="rows of the queries")
     add("--batch-size", type=int, default=512, help="crops of a batch")
-    add("--compiled", action="store_true", help="compile the encoder: minutes, then faster")
     args = parser.parse_args()
     paths = sorted(Path(args.imagery).rglob("*.jpg"))
     if not paths:
@@ -127,7 +126,7 @@ def main() -> None:
         batch_size=args.batch_size,
         precision="float32",
         mirror=False,
-        compiled=args.compiled,
+        images=args.rows,
     )
     write_split(args, encoder, size, images_N, names, "query", "drone", args.queries, seed=1)
     write_split(args, encoder, size, images_N, names, "gallery", "satellite", args.rows, seed=0)

@@ -22,6 +22,7 @@ from typing import Any
 
 import faiss
 import numpy as np
+from page_cache import drop_from_cache
 
 from pipeline.core.arrays import Floats
 from pipeline.core.records import Split
@@ -48,10 +49,11 @@ HEADINGS = (
     "recall@10",
     "queries/s",
     "single p50, p99 ms",
+    "the same, cold",
     "bytes a row",
     "over exact search",
     "breadth, candidates, ratio",
-    "built in",
+    "built in, training",
     "memory while building",
     "with mapped files",
     "memory to search",
@@ -162,11 +164,28 @@ class Queries:
     rounds: int
     cpu: bool
     """Whether times are CPU seconds of one thread."""
+    cold: int
+    """How many of them are also answered one by one, each after the table and the index were
+    dropped from the page cache."""
 
 
-def search(path: str, given: Queries, scale: float, answer: Connection) -> None:
+def cold_latency(index: Index, folders: tuple[str, str], queries_QD: Floats) -> tuple[float, float]:
+    """Milliseconds, p50 and p99, of single queries that find nothing of the folders in the page
+    cache, each its pages for the first time, whose checksums it compares.
+    """
+    times = []
+    for query_1D in np.split(queries_QD, len(queries_QD)):
+        drop_from_cache(*folders)
+        start = time.perf_counter()
+        index.search_rows(query_1D, 10)
+        times.append(1e3 * (time.perf_counter() - start))
+    p50, p99 = np.quantile(times, [0.5, 0.99])
+    return float(p50), float(p99)
+
+
+def search(table: str, path: str, given: Queries, scale: float, answer: Connection) -> None:
     """Send recall@10, queries per second, their ratio to exact search, the memory to search, and
-    p50 and p99 of single queries.
+    p50 and p99 of single queries, warm and cold.
 
     `scale` is the number of rows of the index over those of the exact search.
     """
@@ -175,6 +194,9 @@ def search(path: str, given: Queries, scale: float, answer: Connection) -> None:
     index = Index(path, threads=1 if given.cpu else None)
     index.search(given.queries_QD[:4])
     memory = memory_of("RssAnon") - before
+    cold = (float("nan"),) * 2
+    if given.cold:
+        cold = cold_latency(index, (table, path), given.queries_QD[: given.cold])
     flat = faiss.IndexFlatIP(given.flat_ND.shape[1])
     flat.add(given.flat_ND)
     ours, exact = [], []
@@ -190,7 +212,8 @@ def search(path: str, given: Queries, scale: float, answer: Connection) -> None:
     ratio = np.median([one / other for one, other in zip(exact, ours, strict=True)])
     rate = len(given.queries_QD) / float(np.median(ours))
     speed = measure_speed(index.search_rows, given.queries_QD, 1, 1.0, clock)
-    answer.send((float(recall), rate, float(ratio), memory, (speed["p50_ms"], speed["p99_ms"])))
+    warm = speed["p50_ms"], speed["p99_ms"]
+    answer.send((float(recall), rate, float(ratio), memory, warm, cold))
 
 
 def former_plan(rows: int, dimension: int, effective: int) -> str:
@@ -224,7 +247,7 @@ def report(table: str, out: str, factory: str, args: argparse.Namespace, given: 
     metadata, anonymous, resident = in_a_process(build, settings)
     seconds = time.perf_counter() - start
     scale = metadata.rows / len(given.flat_ND)
-    recall, rate, ratio, memory, (p50, p99) = in_a_process(search, out, given, scale)
+    recall, rate, ratio, memory, warm, cold = in_a_process(search, table, out, given, scale)
     label = metadata.factory
     label += " + table" * (metadata.refine == "table") + " on disk" * metadata.on_disk
     params = metadata.search_params
@@ -232,11 +255,11 @@ def report(table: str, out: str, factory: str, args: argparse.Namespace, given: 
         label + f" ({said})" * bool(said),
         f"{recall:.4f}",
         f"{rate:,.0f}",
-        f"{p50:.2f}, {p99:.2f}",
+        *(f"{p50:.2f}, {p99:.2f}" for p50, p99 in (warm, cold)),
         f"{metadata.bytes_per_vector:,.0f}",
         f"{ratio:.1f} x",
         f"{params.nprobe_or_ef}, {params.rerank_factor}, {params.list_ratio}",
-        f"{seconds:.0f} s",
+        f"{seconds:.0f}, {metadata.measured.get('training_seconds', 0):.0f} s",
         f"{anonymous / 1e9:.2f} GB",
         f"{resident / 1e9:.2f} GB",
         f"{memory / 1e9:.2f} GB",
@@ -255,6 +278,7 @@ def main() -> None:
     add("--target-recall", type=float, default=0.95)
     add("--rounds", type=int, default=7, help="alternating rounds of search")
     add("--cpu", action="store_true", help="CPU seconds of one thread: on a machine that is shared")
+    add("--cold", type=int, default=0, help="single queries from a cold disk; 0: none")
     add("--table", help="feature table: used if it exists, written otherwise")
     factories = [PLANNED, FORMER, "IVF1024,SQ8", "IVF1024,RaBitQ+table"]
     add(
@@ -284,6 +308,7 @@ def main() -> None:
             flat_ND=np.concatenate(list(blocks)),
             rounds=args.rounds,
             cpu=args.cpu,
+            cold=args.cold,
         )
         print(
             f"{gallery.rows:,} x {table.dimension} in {table.dtype}, budget {args.memory_budget}, "

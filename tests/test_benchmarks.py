@@ -11,7 +11,10 @@ import ray
 from tests.launcher import ROOT, Launcher
 
 FOLDER = ROOT / "benchmarks"
-HELPERS = {"synthetic", "ablation_data", "embedding_worker", "gpu_measurements", "whole_map"}
+HELPERS = {
+    *("synthetic", "ablation_data", "embedding_worker", "gpu_measurements", "page_cache"),
+    "whole_map",
+}
 "Modules that other benchmarks import."
 RESNET = "--backbone resnet18 --width 0.25 --size 128"
 "The smallest network of the embedding benchmarks."
@@ -70,7 +73,7 @@ CASES: dict[str, tuple[str, str]] = {
         r"\| embedding, built-in, float32, folded.* \| 1\.0000",
     ),
     "index": (
-        "--rows 2000 --dimension 32 --rounds 1 --factories planned former",
+        "--rows 2000 --dimension 32 --rounds 1 --cold 2 --factories planned former",
         r"Flat \(the planner\) .* [\d.]+ x \|(.|\n)*Flat \(the former rule\) ",
     ),
     "fixed_costs": (

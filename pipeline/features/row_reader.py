@@ -8,9 +8,11 @@ Shapes: R requested rows, D dimensions, P pages, W bytes of an embedding.
 """
 
 import mmap
+import resource
 import time
 from collections import OrderedDict
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,8 +31,8 @@ COLD_ROW_S = 0.0005
 page is read for the first time."""
 Wanted = tuple[str, str, Ints]
 "A part, the shard that it was made of, and the numbers of rows in it."
-MAX_OPEN_PARTS = 512
-"Mapped at once: each takes a file descriptor."
+MAX_MAPPED_PARTS = 32_768
+"Half of the mappings that Linux gives a process by default."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +51,7 @@ class RowReader:
 
     def __init__(self, table: str, dimension: int) -> None:
         self._table, self._dimension = table, dimension
+        self._most_open = most_open_parts()
         self._open: OrderedDict[str, _MappedPart] = OrderedDict()
 
     def read(self, part: str, shard_sha256: str, row_R: Ints) -> Floats | Halves:
@@ -156,9 +159,25 @@ class RowReader:
                 )
             mapped = _map(parquet, path, header.dtype)
         self._open[name] = mapped
-        if len(self._open) > MAX_OPEN_PARTS:
+        if len(self._open) > self._most_open:
             self._open.popitem(last=False)
         return mapped
+
+
+def most_open_parts() -> int:
+    """Parts that may be mapped at once: each takes one of the process's file descriptors, of which
+    half are left to others.
+
+    Raises the process's soft limit to the hard one: opening a part again takes a thousand times as
+    long as reading a row of it, and only select(), which nothing here calls, needs the lower one.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = 2 * MAX_MAPPED_PARTS if hard == resource.RLIM_INFINITY else hard
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with suppress(OSError, ValueError):  # a system that allows less than it says
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+            soft = wanted
+    return MAX_MAPPED_PARTS if soft == resource.RLIM_INFINITY else min(MAX_MAPPED_PARTS, soft // 2)
 
 
 def supports_row_reads(table: str) -> bool:

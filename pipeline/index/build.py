@@ -137,14 +137,15 @@ def _build_plan(
     selected, others = tables
     index = new_index(plan.factory, selected.dimension)
     training_rows = 0 if index.is_trained else plan.training_rows
+    measured: dict[str, Any] = {"rejected": decision.rejected}
     if not workspace.is_trained():
         if training_rows:
             _, sample_SD = sample_rows(selected, rows_of_part, training_rows)
             train_index(index, plan.factory, sample_SD)
+            measured["training_seconds"] = round(time.perf_counter() - start, 3)
         workspace.save_trained(index)
     rows = sum(rows_of_part.values())
     part_rows = min(plan.part_rows, math.ceil(rows / settings.parts))
-    measured: dict[str, Any] = {"rejected": decision.rejected}
     if decision.front:
         measured |= {"pareto_front": list(decision.front), "trial_rows": decision.sample_rows}
     if settings.p99_ms is not None:

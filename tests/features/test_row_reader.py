@@ -1,5 +1,6 @@
 """Single rows of a table equal what pyarrow reads; changed parts are rejected."""
 
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -129,7 +130,7 @@ def test_row_reader_rejects_changed_or_missing_part(tmp_path: Path) -> None:
 
 
 def test_row_reader_keeps_few_parts_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(row_reader, "MAX_OPEN_PARTS", 2)
+    monkeypatch.setattr(row_reader, "most_open_parts", lambda: 2)
     for number in range(5):
         write_table_part(tmp_path, number, clustered(4, 8, number))
     reader = RowReader(str(tmp_path), 8)
@@ -139,6 +140,35 @@ def test_row_reader_keeps_few_parts_open(tmp_path: Path, monkeypatch: pytest.Mon
         )
         assert np.array_equal(found, clustered(4, 8, number)[2:3])
         assert len(reader._open) <= 2
+
+
+@pytest.mark.parametrize(
+    ("soft", "hard", "raised", "parts"),
+    [
+        (1_024, 4_096, 4_096, 2_048),
+        (1_024, 1_024, None, 512),
+        (1_024, resource.RLIM_INFINITY, 65_536, 32_768),
+        (1_048_576, 1_048_576, None, 32_768),
+        (resource.RLIM_INFINITY, resource.RLIM_INFINITY, None, 32_768),
+    ],
+)
+def test_most_open_parts_leaves_half_of_the_descriptors(
+    monkeypatch: pytest.MonkeyPatch, soft: int, hard: int, raised: int | None, parts: int
+) -> None:
+    asked = list[tuple[int, int]]()
+    monkeypatch.setattr(resource, "getrlimit", lambda which: (soft, hard))
+    monkeypatch.setattr(resource, "setrlimit", lambda which, limits: asked.append(limits))
+    assert row_reader.most_open_parts() == parts
+    assert asked == ([] if raised is None else [(raised, hard)])
+
+
+def test_most_open_parts_where_the_limit_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(which: int, limits: tuple[int, int]) -> None:
+        raise ValueError("not allowed to raise maximum limit")
+
+    monkeypatch.setattr(resource, "getrlimit", lambda which: (256, 4_096))
+    monkeypatch.setattr(resource, "setrlimit", refuse)
+    assert row_reader.most_open_parts() == 128
 
 
 def test_row_reader_needs_local_table() -> None:
