@@ -5,7 +5,7 @@ Prints one line per index: `planned` is the planner's, `former` that of the rule
 before plans were tried, any other word a FAISS factory string. The stage builds each in a separate
 process, whose memory is sampled; then the index and exact search in memory answer the same queries,
 alternating. `--table` keeps the synthetic vectors for the next call, or takes the embeddings of a
-network (`benchmarks/embeddings.py`).
+network (`benchmarks/embeddings.py`); with `--out` a killed run resumes its builds.
 """
 
 import argparse
@@ -29,6 +29,7 @@ from pipeline.core.records import Split
 from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.features.table import open_table
 from pipeline.index.build import build_index
+from pipeline.index.metadata import METADATA_FILE
 from pipeline.index.recall import RECALL_QUERIES, exact_search, measure_speed
 from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings
@@ -243,9 +244,9 @@ def report(table: str, out: str, factory: str, args: argparse.Namespace, given: 
         factory=None if name == PLANNED else name,
         refine=refined,
     )
-    start = time.perf_counter()
+    kept, start = Path(out, METADATA_FILE).exists(), time.perf_counter()
     metadata, anonymous, resident = in_a_process(build, settings)
-    seconds = time.perf_counter() - start
+    seconds = metadata.build_seconds if kept else time.perf_counter() - start
     scale = metadata.rows / len(given.flat_ND)
     recall, rate, ratio, memory, warm, cold = in_a_process(search, table, out, given, scale)
     label = metadata.factory
@@ -260,8 +261,7 @@ def report(table: str, out: str, factory: str, args: argparse.Namespace, given: 
         f"{ratio:.1f} x",
         f"{params.nprobe_or_ef}, {params.rerank_factor}, {params.list_ratio}",
         f"{seconds:.0f}, {metadata.measured.get('training_seconds', 0):.0f} s",
-        f"{anonymous / 1e9:.2f} GB",
-        f"{resident / 1e9:.2f} GB",
+        *("kept" if kept else f"{peak / 1e9:.2f} GB" for peak in (anonymous, resident)),
         f"{memory / 1e9:.2f} GB",
     ]
     for rejected, why in metadata.measured["rejected"].items():
@@ -278,6 +278,7 @@ def main() -> None:
     add("--target-recall", type=float, default=0.95)
     add("--rounds", type=int, default=7, help="alternating rounds of search")
     add("--cpu", action="store_true", help="CPU seconds of one thread: on a machine that is shared")
+    add("--out", help="folder where the indexes are kept, and taken from the next time")
     add("--cold", type=int, default=0, help="single queries from a cold disk; 0: none")
     add("--table", help="feature table: used if it exists, written otherwise")
     factories = [PLANNED, FORMER, "IVF1024,SQ8", "IVF1024,RaBitQ+table"]
@@ -317,7 +318,7 @@ def main() -> None:
         )
         print(f"| {' | '.join(HEADINGS)} |\n|{'---|' * len(HEADINGS)}", flush=True)
         for number, factory in enumerate(args.factories):
-            report(str(folder), f"{scratch}/index-{number}", factory, args, given)
+            report(str(folder), f"{args.out or scratch}/index-{number}", factory, args, given)
 
 
 if __name__ == "__main__":
