@@ -23,6 +23,7 @@ from pipeline.index.faiss_io import FAISS
 from pipeline.index.finish import finish_index, load_finished
 from pipeline.index.metadata import METADATA_FILE, IndexMetadata, SearchParams
 from pipeline.index.planning.choice import plan_label
+from pipeline.index.planning.plan import IndexPlan
 from pipeline.index.planning.planner import Decision, Planner, print_decision
 from pipeline.index.recall import sample_queries
 from pipeline.index.settings import IndexSettings
@@ -140,8 +141,7 @@ def _build_plan(
     measured: dict[str, Any] = {"rejected": decision.rejected}
     if not workspace.is_trained():
         if training_rows:
-            _, sample_SD = sample_rows(selected, rows_of_part, training_rows)
-            train_index(index, plan.factory, sample_SD)
+            _train(index, plan, selected, rows_of_part)
             measured["training_seconds"] = round(time.perf_counter() - start, 3)
         workspace.save_trained(index)
     rows = sum(rows_of_part.values())
@@ -176,3 +176,9 @@ def _build_plan(
     )
     queries = sample_queries(selected, rows_of_part, others)
     return finish_index(settings.out, metadata, queries, workspace, start)
+
+
+def _train(index: Any, plan: IndexPlan, table: FeatureTable, rows_of_part: dict[str, int]) -> None:
+    """Train a plan's empty index. The sample is gone when rows are added."""
+    _, sample_SD = sample_rows(table, rows_of_part, plan.training_rows)
+    train_index(index, plan.factory, sample_SD)
