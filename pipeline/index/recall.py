@@ -12,6 +12,7 @@ import faiss
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
+from pipeline.core.prefetch import prefetch
 from pipeline.features.table import FeatureTable
 from pipeline.index.faiss_io import FAISS
 from pipeline.index.metadata import SearchParams
@@ -80,10 +81,9 @@ def exact_search(queries_QD: Floats, table: FeatureTable, k: int) -> Ints:
     """Row numbers (Q, K) of the rows with the highest inner products, block by block."""
     heap = faiss.ResultHeap(len(queries_QD), k, keep_max=True)
     start = 0
-    for block_BD in table.blocks():
-        flat = faiss.IndexFlatIP(table.dimension)
-        flat.add(block_BD)
-        scores, rows = flat.search(queries_QD, min(k, len(block_BD)))
+    for block_BD in prefetch(table.blocks(), 1):
+        nearest = min(k, len(block_BD))
+        scores, rows = faiss.knn(queries_QD, block_BD, nearest, faiss.METRIC_INNER_PRODUCT)
         heap.add_result(scores, rows + start)
         start += len(block_BD)
     heap.finalize()
