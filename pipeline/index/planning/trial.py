@@ -42,6 +42,8 @@ TRIAL_QUERIES = 256
 TRIAL_SECONDS = 0.05
 "For which a setting's batches are timed, and its single ones."
 QUARTER = 4
+KMEANS_ROUNDS, LEARNED_PER_LIST = 10, 256
+"Of FAISS's k-means for lists, and the most rows that it learns a centre from."
 MOST_GROWTH = 0.5
 """Largest power of the rows by which lost recall is taken to grow: two samples give it roughly, and
 one lost neighbour in a thousand is no trend."""
@@ -116,6 +118,43 @@ def try_plan(plan: IndexPlan, gallery: GallerySpec, sample: Sample) -> PlanTrial
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class BuildTimes:
+    """Seconds of building an index over a sample."""
+
+    training: float
+    adding: float
+    comparing: float
+    "Of all rows with the centres of all lists, as adding does once."
+    learned: float
+    "Share of the rows that the centres are learned from."
+
+
+def expected_seconds(
+    times: BuildTimes, more_training: float, more_rows: float, more_lists: float, deeper: float
+) -> float:
+    """Seconds of building the whole gallery, which has so many times the sample's rows to train on,
+    rows and lists; `deeper`: as many times as long to find a row's neighbours in a graph.
+
+    Only comparing rows with centres takes longer where there are more lists. Learning the centres
+    compares KMEANS_ROUNDS times.
+    """
+    rounds = min(times.training, KMEANS_ROUNDS * times.comparing * times.learned)
+    training = rounds / times.learned * more_lists + times.training - rounds
+    once = min(times.adding, times.comparing)
+    adding = once * more_lists + (times.adding - once) * deeper
+    return training * more_training + adding * more_rows
+
+
+def _comparing_seconds(index: Any, rows_SD: Floats) -> float:
+    """Seconds of finding each row's list; of a projection's index, in as many directions."""
+    ivf = FAISS.extract_index_ivf(index)
+    reduced_SD = np.ascontiguousarray(rows_SD[:, : ivf.d])
+    start = time.perf_counter()
+    ivf.quantizer.search(reduced_SD, 1)
+    return time.perf_counter() - start
+
+
 class _SampleIndex:
     """A plan, built over a sample in memory."""
 
@@ -134,12 +173,20 @@ class _SampleIndex:
         trained = time.perf_counter()
         self.index.add(rows_SD)
         added = time.perf_counter()
-        # Each row is compared with every centre, or with some of a graph for each doubling of it.
         graph = math.log(gallery.rows) / math.log(rows) if _is_graph(self.index) else 1.0
         more_lists = lists / fewer if lists else 1.0
-        training = min(plan.training_rows, gallery.rows) / rows * more_lists
-        adding = more_lists * graph / share
-        self.build_seconds = (trained - start) * training + (added - trained) * adding
+        self.build_seconds = expected_seconds(
+            BuildTimes(
+                training=trained - start,
+                adding=added - trained,
+                comparing=_comparing_seconds(self.index, rows_SD) if lists else 0.0,
+                learned=min(rows, LEARNED_PER_LIST * fewer) / rows if lists else 1.0,
+            ),
+            more_training=min(plan.training_rows, gallery.rows) / rows,
+            more_rows=1 / share,
+            more_lists=more_lists,
+            deeper=graph,
+        )
         # A query compares with every centre and with the rows of some lists.
         lengths = (gallery.rows / lists) / (rows / fewer) if lists else 1 / share
         self._slower = graph if _is_graph(self.index) else max(more_lists, lengths)
