@@ -18,10 +18,13 @@ from pipeline.features.row_reader import RowReader
 from pipeline.index.faiss_io import local_copy, read_faiss, search_faiss
 from pipeline.index.ids import RowIds
 from pipeline.index.metadata import REBUILD_HINT, PartMetadata, SearchParams, check_files
+from pipeline.index.planning.plan import RERANK_FACTOR
 
 FILTERED_EXACT_ROWS = 5_000
 """Matching rows up to which each is scored: about what a search over lists costs, and a narrow
 filter loses no recall."""
+FEW_HIDDEN = 0.05
+"Share of the rows that a filter, or their removal, may hide without a dip of recall."
 RERANK_BLOCK = 1_024
 "Candidates' vectors in memory at a time: 8 MB at 2,048 dimensions, which stay in the core's cache."
 NO_ROW = -1
@@ -127,9 +130,13 @@ def rescored(queries_QD: Floats, rows_QC: Ints, vectors: Callable[[Ints], Floats
 def filtered_params(params: SearchParams, share: float) -> SearchParams:
     """Search parameters where a filter leaves a share of the rows: the fewer match, the more lists
     hold as many of them, and the farther these are and the nearer to each other, so that coarse
-    codes order them worse: with as many candidates as without a filter, .965 became .940.
+    codes order them worse: of embeddings .965 became .940 with as many candidates as without a
+    filter. Where it hides many, queries whose near rows are hidden get the candidates that tuning
+    saved on them.
     """
     factor = params.rerank_factor
+    if factor > 1 and share < 1 - FEW_HIDDEN:
+        factor = max(factor, RERANK_FACTOR)
     return SearchParams(
         nprobe_or_ef=math.ceil(params.nprobe_or_ef / share),
         rerank_factor=math.ceil(factor / math.sqrt(share)) if factor > 1 else 1,

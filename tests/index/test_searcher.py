@@ -17,6 +17,7 @@ from pipeline.features.table import open_table
 from pipeline.index.build import build_index
 from pipeline.index.metadata import SearchParams
 from pipeline.index.part import FILTERED_EXACT_ROWS, NO_ROW, filtered_params
+from pipeline.index.planning.plan import RERANK_FACTOR
 from pipeline.index.searcher import Index, merge_results
 from pipeline.index.settings import IndexSettings
 from tests.index.index_tables import write_gallery
@@ -232,9 +233,13 @@ def test_open_index_absent_is_rejected(tmp_path: Path) -> None:
 def test_filtered_params_widen_as_fewer_rows_match() -> None:
     usual = SearchParams(nprobe_or_ef=8, rerank_factor=2)
     assert filtered_params(usual, 1.0) == usual
+    few_removed = filtered_params(usual, 0.96)
+    assert (few_removed.nprobe_or_ef, few_removed.rerank_factor) == (9, 3)  # 2 / sqrt(0.96): 2.04
     quarter = filtered_params(usual, 0.25)
-    assert (quarter.nprobe_or_ef, quarter.rerank_factor) == (32, 4)
+    assert (quarter.nprobe_or_ef, quarter.rerank_factor) == (32, 2 * RERANK_FACTOR)
     fifth = filtered_params(usual, 0.2)
-    assert (fifth.nprobe_or_ef, fifth.rerank_factor) == (40, 5)  # 2 / sqrt(0.2) is 4.47
+    assert (fifth.nprobe_or_ef, fifth.rerank_factor) == (40, 23)  # 10 / sqrt(0.2) is 22.36
+    many = SearchParams(nprobe_or_ef=8, rerank_factor=20)
+    assert filtered_params(many, 0.25).rerank_factor == 40
     # Without candidates that are scored again, more of them would change nothing.
     assert filtered_params(SearchParams(nprobe_or_ef=8, rerank_factor=1), 0.25).rerank_factor == 1
