@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from index import write_rows
+from made_table import write_rows
 from page_cache import drop_from_cache
 
 from pipeline.core.arrays import Floats, Ints

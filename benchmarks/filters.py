@@ -18,7 +18,7 @@ from pathlib import Path
 
 import faiss
 import numpy as np
-from index import make_table
+from made_table import make_table
 
 from pipeline.core.arrays import Doubles, Floats, Ints
 from pipeline.core.filters import Filter

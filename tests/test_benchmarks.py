@@ -13,7 +13,7 @@ from tests.launcher import ROOT, Launcher
 FOLDER = ROOT / "benchmarks"
 HELPERS = {
     *("synthetic", "ablation_data", "embedding_worker", "gpu_measurements", "page_cache"),
-    "whole_map",
+    *("made_table", "whole_map"),
 }
 "Modules that other benchmarks import."
 RESNET = "--backbone resnet18 --width 0.25 --size 128"
