@@ -24,7 +24,7 @@ from model.inference.optimise import optimise_encoder
 from model.weights.builtin import BUILTIN
 from pipeline.features.part import PartFooter, PartRows, write_part
 from pipeline.images.decode import decode
-from pipeline.index.recall import RECALL_QUERIES
+from pipeline.index.tuning.ground_truth import RECALL_QUERIES
 
 PART_ROWS = 16_384
 MIN_SIDE = 0.35

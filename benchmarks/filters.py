@@ -28,9 +28,9 @@ from pipeline.core.records import Split
 from pipeline.features.table import FeatureTable, open_table
 from pipeline.index.build import build_index
 from pipeline.index.part import NO_ROW
-from pipeline.index.recall import NEIGHBOURS, exact_search
 from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings
+from pipeline.index.tuning.ground_truth import NEIGHBOURS, exact_search
 
 SELECTIVITIES = [1e-5, 1e-4, 1e-3, 1e-2, 0.03, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0]
 AROUND, ONE = "around", "one"

@@ -30,10 +30,11 @@ from pipeline.core.records import Split
 from pipeline.features.table import open_table
 from pipeline.index.build import build_index
 from pipeline.index.metadata import METADATA_FILE
-from pipeline.index.recall import exact_search, measure_speed
 from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings
 from pipeline.index.train import SPECTRUM_ROWS, effective_dimension, sample_rows
+from pipeline.index.tuning.ground_truth import exact_search
+from pipeline.index.tuning.recall import measure_speed
 from pipeline.index.workspace import rows_by_part
 
 BLOCK_ROWS = 8_192

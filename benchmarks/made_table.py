@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.features.part import PartFooter, PartRows, write_part
-from pipeline.index.recall import RECALL_QUERIES
+from pipeline.index.tuning.ground_truth import RECALL_QUERIES
 
 PART_ROWS = 16_384
 IMAGES_PER_PLACE = 20

@@ -1,11 +1,13 @@
 """Filters of rows by split, view, location and position; used by feature tables, indexes, service.
 
 In: conditions, and rows as Arrow columns. Out: a boolean mask of the rows that meet all conditions,
-and the names of the columns that the mask is computed from. A row without a position is in no box
-and in no circle.
+and the names of the columns that the mask is computed from; and, from the least and greatest values
+of some rows, whether one of them may. A row without a position is in no box and in no circle.
 Shapes: N rows.
 """
 
+from bisect import bisect_left
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +21,8 @@ from pipeline.core.records import Split, View
 
 METRES_PER_RADIAN = 6_350_000
 "A little less than on any meridian, so that a band of latitudes contains the circle inside it."
+Bounds = Callable[[str], tuple[Any, Any] | None]
+"The least and greatest value of a column among some rows; None where they are not known."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +59,33 @@ class Filter:
             if self.near:
                 mask_N &= _within_circle(lat_N, lon_N, self.near, mask_N)
         return mask_N
+
+    def may_match(self, bounds: Bounds) -> bool:
+        """Whether the bounds of some rows leave room for one that meets the conditions: where not,
+        none of them need be read. Neighbours on a map mostly lie in neighbouring rows.
+        """
+        for name, wanted in self._ranges().items():
+            found = bounds(name)
+            if found and not any(found[0] <= high and low <= found[1] for low, high in wanted):
+                return False
+        if self.locations is None or not (found := bounds("location")):
+            return True
+        names = sorted(self.locations)
+        first = bisect_left(names, found[0])
+        return first < len(names) and names[first] <= found[1]
+
+    def _ranges(self) -> dict[str, list[tuple[Any, Any]]]:
+        """For each column with a condition the ranges of values that can meet it."""
+        ranges: dict[str, list[tuple[Any, Any]]] = {}
+        for name, value in (("split", self.split), ("view", self.view)):
+            if value is not None:
+                ranges[name] = [(str(value), str(value))]
+        if self.near:
+            ranges["lat"] = [latitude_band(self.near)]
+        if self.box:
+            ranges["lat"] = [(self.box.south, self.box.north)]
+            ranges["lon"] = self.box.spans()
+        return ranges
 
 
 def latitude_band(circle: Circle) -> tuple[float, float]:

@@ -25,9 +25,9 @@ from pipeline.index.metadata import METADATA_FILE, IndexMetadata, SearchParams
 from pipeline.index.planning.choice import plan_label
 from pipeline.index.planning.plan import IndexPlan
 from pipeline.index.planning.planner import Decision, Planner, print_decision
-from pipeline.index.recall import sample_queries
 from pipeline.index.settings import IndexSettings
 from pipeline.index.train import new_index, sample_rows, train_index
+from pipeline.index.tuning.ground_truth import sample_queries
 from pipeline.index.workspace import BuildWorkspace, rows_by_part, unfinished_work
 
 DECIDING = ("split", "view", "factory", "refine", "parts")

@@ -7,9 +7,12 @@ Shapes: N rows of a part of the index, R requested rows.
 """
 
 from collections.abc import Iterable
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from pipeline.core import parquet as parquet_files
 from pipeline.core import storage
@@ -87,6 +90,7 @@ class RowIds:
         except (pa.ArrowException, OSError) as error:
             raise InputError(f"{path} is damaged ({error}); {REBUILD_HINT}") from None
         self._begin = np.cumsum([0, *(len(batch) for batch in self._batches)])
+        self._bounds: dict[tuple[int, str], tuple[Any, Any] | None] = {}
 
     def __len__(self) -> int:
         return int(self._begin[-1])
@@ -112,7 +116,18 @@ class RowIds:
         return parquet_files.select_or_null(taken, names, IDS_SCHEMA)
 
     def mask(self, where: Filter) -> Mask:
-        """Which rows match the filter (N,)."""
-        return np.concatenate(
-            [np.empty(0, np.bool_), *(where.mask(batch) for batch in self._batches)]
-        )
+        """Which rows match the filter (N,). Batches that it surely leaves out are not looked at."""
+        mask_N = np.zeros(len(self), np.bool_)
+        for number, batch in enumerate(self._batches):
+            if where.may_match(partial(self._bounds_of, number)):
+                begin = self._begin[number]
+                mask_N[begin : begin + len(batch)] = where.mask(batch)
+        return mask_N
+
+    def _bounds_of(self, number: int, column: str) -> tuple[Any, Any] | None:
+        """Least and greatest value of a column in a batch, found once; None without a value."""
+        if (number, column) not in self._bounds:
+            ends = pc.min_max(self._batches[number][column]).as_py()
+            known = ends["min"] is not None
+            self._bounds[number, column] = (ends["min"], ends["max"]) if known else None
+        return self._bounds[number, column]

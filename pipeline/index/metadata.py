@@ -16,6 +16,7 @@ from pipeline.core.json_files import from_json, is_file_name
 from pipeline.core.records import excerpt
 from pipeline.features.encoding import EncodingConfig
 from pipeline.index.planning.families import Refine
+from pipeline.index.planning.plan import RERANK_FACTOR
 
 SCHEMA_VERSION = 3
 METADATA_FILE = "index.json"
@@ -33,6 +34,9 @@ class SearchParams:
     list_ratio: float = 0.0
     """Lists whose centre scores below this share of the query's best centre are skipped; 0:
     none."""
+    filtered_rerank_factor: int = RERANK_FACTOR
+    """Candidates per wanted row where a filter hides many rows, if there are candidates: these over
+    the root of the share of rows that it leaves."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,6 +6,7 @@ P pairs of query and candidate.
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,7 +19,6 @@ from pipeline.features.row_reader import RowReader
 from pipeline.index.faiss_io import local_copy, read_faiss, search_faiss
 from pipeline.index.ids import RowIds
 from pipeline.index.metadata import REBUILD_HINT, PartMetadata, SearchParams, check_files
-from pipeline.index.planning.plan import RERANK_FACTOR
 
 FILTERED_EXACT_ROWS = 5_000
 """Matching rows up to which each is scored: about what a search over lists costs, and a narrow
@@ -63,15 +63,21 @@ class IndexPart:
         if metadata.removed:
             self._kept_N = ~self.ids.mask(Filter(locations=frozenset(metadata.removed)))
 
-    def allowed(self, where: Filter | None) -> Mask | None:
-        """Which rows a search may return (N,); None: all."""
+    def allowed(self, where: Filter | Mask | None) -> Mask | None:
+        """Which rows a search may return (N,); None: all. `where`: conditions on a row, or a mask
+        of the whole index's.
+        """
         if where is None:
             return self._kept_N
-        mask_N = self.ids.mask(where)
+        if isinstance(where, Filter):
+            mask_N = self.ids.mask(where)
+        else:
+            first = self.metadata.first_row
+            mask_N = where[first : first + self.metadata.rows]
         return mask_N if self._kept_N is None else mask_N & self._kept_N
 
     def search(
-        self, queries_QD: Floats, k: int, params: SearchParams, where: Filter | None = None
+        self, queries_QD: Floats, k: int, params: SearchParams, where: Filter | Mask | None = None
     ) -> tuple[Floats, Ints]:
         """Scores and rows (Q, K), counted within the part, best first; NO_ROW where fewer match."""
         allowed_N = self.allowed(where)
@@ -131,15 +137,17 @@ def filtered_params(params: SearchParams, share: float) -> SearchParams:
     """Search parameters where a filter leaves a share of the rows: the fewer match, the more lists
     hold as many of them, and the farther these are and the nearer to each other, so that coarse
     codes order them worse: of embeddings .965 became .940 with as many candidates as without a
-    filter. Where it hides many, queries whose near rows are hidden get the candidates that tuning
-    saved on them.
+    filter. Where it hides many, it may hide what is nearest to a query, and then what is left is
+    nearly all at one distance; `tune_filtered` found how many candidates that takes.
     """
     factor = params.rerank_factor
     if factor > 1 and share < 1 - FEW_HIDDEN:
-        factor = max(factor, RERANK_FACTOR)
-    return SearchParams(
+        factor = max(factor, params.filtered_rerank_factor)
+    return replace(
+        params,
         nprobe_or_ef=math.ceil(params.nprobe_or_ef / share),
         rerank_factor=math.ceil(factor / math.sqrt(share)) if factor > 1 else 1,
+        list_ratio=0.0,
     )
 
 

@@ -16,7 +16,7 @@ import faiss
 import numpy as np
 import pyarrow as pa
 
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core.arrays import Floats, Ints, Mask
 from pipeline.core.errors import InputError
 from pipeline.core.filters import Filter
 from pipeline.core.records import View
@@ -120,11 +120,11 @@ class Index:
         self,
         queries_QD: Floats,
         k: int = 10,
-        where: Filter | None = None,
+        where: Filter | Mask | None = None,
         params: SearchParams | None = None,
     ) -> tuple[Floats, Ints]:
         """Scores and row numbers (Q, K) in the whole index, best first; NO_ROW where fewer rows
-        match.
+        match. `where`: conditions on a row, or which of the index's rows match.
         """
         queries_QD = np.ascontiguousarray(queries_QD, np.float32)
         if queries_QD.ndim != 2 or queries_QD.shape[1] != self.dimension:

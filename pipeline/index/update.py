@@ -30,8 +30,8 @@ from pipeline.index.metadata import (
     read_metadata,
     write_metadata,
 )
-from pipeline.index.recall import sample_queries
 from pipeline.index.searcher import Index
+from pipeline.index.tuning.ground_truth import sample_queries
 from pipeline.index.workspace import BuildWorkspace, rows_by_part
 
 

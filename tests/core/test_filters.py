@@ -1,9 +1,11 @@
 """Filters: each condition against a loop over the rows, corners and poles included."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -81,6 +83,70 @@ def test_circle_contains_rows_within_its_radius(
     )
     found_N = Filter(near=Circle(lat=lat, lon=lon, radius_m=radius)).mask(rows)
     assert np.array_equal(found_N, haversine_m(places_N2, np.array([lat, lon])) <= radius)
+
+
+PLACES = st.lists(
+    st.tuples(st.none() | st.floats(-90, 90), st.floats(-180, 180), st.sampled_from("abc")),
+    min_size=1,
+    max_size=6,
+)
+
+
+@st.composite
+def filters(draw: st.DrawFn) -> Filter:
+    box = near = None
+    if draw(st.booleans()):
+        south, north = sorted([draw(st.floats(-90, 90)), draw(st.floats(-90, 90))])
+        box = Box(
+            south=south,
+            north=north,
+            west=draw(st.floats(-180, 180)),
+            east=draw(st.floats(-180, 180)),
+        )
+    if draw(st.booleans()):
+        near = Circle(
+            lat=draw(st.floats(-90, 90)),
+            lon=draw(st.floats(-180, 180)),
+            radius_m=draw(st.floats(1, 2.1e7)),
+        )
+    return Filter(
+        view=draw(st.none() | st.sampled_from([View.DRONE, View.SATELLITE])),
+        locations=draw(st.none() | st.frozensets(st.sampled_from("abcd"), max_size=2)),
+        box=box,
+        near=near,
+    )
+
+
+@given(PLACES, filters())
+def test_bounds_never_leave_out_a_matching_row(
+    places: list[tuple[float | None, float, str]], where: Filter
+) -> None:
+    lats, lons, names = zip(*places, strict=True)
+    rows = rows_of(lats, lons, ["drone"] * len(places), list(names))
+    ends = {name: pc.min_max(rows[name]).as_py() for name in rows.schema.names}
+
+    def bounds(name: str) -> tuple[Any, Any] | None:
+        return None if ends[name]["min"] is None else (ends[name]["min"], ends[name]["max"])
+
+    assert where.may_match(bounds) or not where.mask(rows).any()
+
+
+def test_bounds_leave_out_rows_far_from_the_conditions() -> None:
+    known = {"lat": (47.0, 48.0), "lon": (8.0, 9.0), "view": ("drone", "drone")}
+    known["location"] = ("b", "d")
+
+    def may_match(**conditions: Any) -> bool:
+        return Filter(**conditions).may_match(known.get)
+
+    assert may_match(box=Box(south=47.5, north=50, west=8.5, east=20))
+    assert not may_match(box=Box(south=48.1, north=50, west=8.5, east=20))
+    assert not may_match(box=Box(south=47.5, north=50, west=9.1, east=-170))
+    assert may_match(near=Circle(lat=48.001, lon=8.5, radius_m=200))
+    assert not may_match(near=Circle(lat=48.01, lon=8.5, radius_m=200))
+    assert not may_match(view=View.SATELLITE)
+    assert may_match(locations=frozenset(["a", "c"]))
+    assert not may_match(locations=frozenset(["a", "e"]))
+    assert Filter(box=Box(south=0, north=1, west=0, east=1)).may_match(lambda name: None)
 
 
 @pytest.mark.parametrize(

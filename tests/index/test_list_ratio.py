@@ -10,9 +10,11 @@ from pipeline.features.table import open_table
 from pipeline.index.balance import imbalance, lost_balance
 from pipeline.index.faiss_io import FAISS, search_faiss
 from pipeline.index.metadata import SearchParams
-from pipeline.index.recall import RecallQueries, cheaper_params, exact_search, measure_recall
 from pipeline.index.searcher import Index
 from pipeline.index.train import new_index, train_index
+from pipeline.index.tuning.ground_truth import RecallQueries, exact_search
+from pipeline.index.tuning.recall import measure_recall
+from pipeline.index.tuning.search_params import cheaper_params
 from pipeline.index.update import extend_index
 from tests.index.index_tables import build, clustered, write_gallery, write_table_part
 

@@ -9,17 +9,12 @@ from pipeline.core.records import Split
 from pipeline.features.table import open_table
 from pipeline.index.build import build_index
 from pipeline.index.metadata import SearchParams
-from pipeline.index.recall import (
-    RecallQueries,
-    exact_search,
-    measure_recall,
-    search_param_grid,
-    tune,
-    without_own_row,
-)
 from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings
 from pipeline.index.train import effective_dimension, new_index, sample_rows
+from pipeline.index.tuning.ground_truth import RecallQueries, exact_search, without_own_row
+from pipeline.index.tuning.recall import measure_recall
+from pipeline.index.tuning.search_params import search_param_grid, tune
 from pipeline.index.workspace import rows_by_part
 from tests.index.index_tables import clustered, write_gallery
 

@@ -4,11 +4,12 @@ from pathlib import Path
 
 import faiss
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from pipeline.core import storage
-from pipeline.core.arrays import Floats
+from pipeline.core.arrays import Floats, Mask
 from pipeline.core.errors import InputError
 from pipeline.core.filters import Filter
 from pipeline.core.geo import Box, Circle
@@ -243,3 +244,25 @@ def test_filtered_params_widen_as_fewer_rows_match() -> None:
     assert filtered_params(many, 0.25).rerank_factor == 40
     # Without candidates that are scored again, more of them would change nothing.
     assert filtered_params(SearchParams(nprobe_or_ef=8, rerank_factor=1), 0.25).rerank_factor == 1
+
+
+def test_mask_looks_only_at_batches_that_may_match(
+    table: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each part of the table lies on a meridian of its own, and here is a batch of its own."""
+    monkeypatch.setattr("pipeline.index.ids.BATCH_ROWS", 200)
+    ids = Index(build(table, tmp_path / "index", factory="Flat")).parts[0].ids
+    looked_at: list[int] = []
+    mask_of = Filter.mask
+
+    def mask(where: Filter, rows: pa.RecordBatch) -> Mask:
+        looked_at.append(len(rows))
+        return mask_of(where, rows)
+
+    monkeypatch.setattr(Filter, "mask", mask)
+    for where in FILTERS.values():
+        expected_N = mask_of(where, ids.take(np.arange(len(ids))))
+        assert np.array_equal(ids.mask(where), expected_N)
+    looked_at.clear()
+    ids.mask(Filter(box=Box(south=0, north=1, west=0.5, east=1.5)))
+    assert looked_at == [200]

@@ -24,15 +24,10 @@ from pipeline.index.metadata import SearchParams
 from pipeline.index.part import FILTERED_EXACT_ROWS, NO_ROW, filtered_params, rescored, top_k
 from pipeline.index.planning.choice import PlanTrial, TrialPoint
 from pipeline.index.planning.plan import ROWS_PER_LIST, TRAINING_SHARE, GallerySpec, IndexPlan
-from pipeline.index.recall import (
-    NEIGHBOURS,
-    RecallQueries,
-    cheaper_params,
-    measure_recall,
-    measure_speed,
-    search_param_grid,
-)
 from pipeline.index.train import new_index, sample_rows, train_index
+from pipeline.index.tuning.ground_truth import NEIGHBOURS, RecallQueries
+from pipeline.index.tuning.recall import measure_recall, measure_speed
+from pipeline.index.tuning.search_params import cheaper_params, search_param_grid
 
 TRIAL_SHARE = 1 / 16
 "Of the rows: a trial takes a sixteenth of the building, about."
