@@ -1,4 +1,5 @@
-"""Encodes photos as an index's gallery was encoded: the same network, the same encoding.
+"""Encodes photos as an index's gallery was encoded: the same network, the same encoding; in float32
+where the gallery is in 8-bit integers.
 
 In: a checkpoint's bytes, and fingerprint and encoding from the index's metadata. Out: a
 PhotoEncoder, whose embeddings the index can be searched with; no setting has to be repeated.
@@ -10,16 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from jobs.encoding.encoder import digest_of, encoder_fingerprint
-from jobs.encoding.probe_images import (
-    CALIBRATION_IMAGES,
-    PROBE_IMAGES,
-    ImageBytes,
-    first_images,
-    synthetic_images,
-)
+from jobs.encoding.encoder import encoder_fingerprint
+from jobs.encoding.probe_images import synthetic_images
 from model.checkpoint import build_encoder, loads
-from model.inference.int8 import PrecisionError, require_int8
 from model.inference.optimise import optimise_encoder
 from pipeline.batches.ordered import stack
 from pipeline.camera.overhead import overhead_view
@@ -32,7 +26,6 @@ from pipeline.features.encoding import EncodingConfig
 from pipeline.images.decode import DecodeError, decode
 from pipeline.images.inspect import inspect
 from pipeline.images.transforms import resize
-from pipeline.shards.shard_set import open_or_scan
 
 FORWARD_BATCH = 32
 "Photos per forward pass."
@@ -52,15 +45,13 @@ class PhotoEncoder:
         name: str,
         fingerprint: str,
         encoding: EncodingConfig | None,
-        shards: str | None = None,
         images: int | None = None,
     ) -> None:
         """`checkpoint`: the bytes of the file `name`. `fingerprint`, `encoding`: of the index.
         `images`: that it will encode, about; a compiler is asked where it pays for so many.
 
-        `shards` are those that the index was made of: needed only where it was encoded in int8,
-        which their images calibrated. Raises CheckpointError when the bytes are no checkpoint,
-        InputError when they did not make the index.
+        Raises CheckpointError when the bytes are no checkpoint, InputError when they did not make
+        the index.
         """
         opened = loads(checkpoint, name)
         if encoding is None:
@@ -81,20 +72,17 @@ class PhotoEncoder:
         self.remarks: list[str] = []
         "What the check of the encoder found."
         device = "cuda" if torch.cuda.is_available() else "cpu"
-        probe_B3HW, calibration_B3HW = _check_images(encoding, self.image_size, shards, device)
         encoder = build_encoder(opened).to(  # type: ignore[call-overload]
             device, memory_format=torch.channels_last
         )
         self._encode = optimise_encoder(
             encoder,
-            probe_B3HW=torch.from_numpy(probe_B3HW),
+            probe_B3HW=torch.from_numpy(synthetic_images(self.image_size)),
             batch_size=FORWARD_BATCH,
-            precision=encoding.precision,
+            # Finer is no worse (docs/results.md), and needs no VNNI and no images of the gallery.
+            precision="float32" if encoding.precision == "int8" else encoding.precision,
             mirror=encoding.mirror,
             images=images,
-            calibration_B3HW=None
-            if calibration_B3HW is None
-            else torch.from_numpy(calibration_B3HW),
             log=self.remarks.append,
         )
 
@@ -160,31 +148,3 @@ def decode_photo(data: bytes) -> Pixels:
     """
     inspect(data)
     return decode(data)
-
-
-def _check_images(
-    encoding: EncodingConfig, size: int, shards: str | None, device: str
-) -> tuple[ImageBytes, ImageBytes | None]:
-    """Images to check the encoder by, and those that calibrate int8. Raises InputError."""
-    if encoding.precision != "int8":
-        return synthetic_images(size), None
-    if shards is None:
-        raise InputError(
-            "the index was encoded in int8, which images of its shards calibrated; expected "
-            "--shards; give those that it was made of"
-        )
-    try:
-        require_int8(device)
-    except PrecisionError as error:
-        raise InputError(str(error)) from None
-    count = PROBE_IMAGES + CALIBRATION_IMAGES
-    images_B3HW = first_images(
-        open_or_scan(shards), size, encoding.resizer, count, encoding.perspective
-    )
-    calibration_B3HW = images_B3HW[PROBE_IMAGES:]
-    if digest_of(calibration_B3HW) != encoding.calibration:
-        raise InputError(
-            f"the images of {shards} are not those that calibrated the index, expected the shards "
-            "that it was made of; give these as --shards"
-        )
-    return images_B3HW[:PROBE_IMAGES], calibration_B3HW

@@ -28,7 +28,8 @@ class EncoderSettings:
     have the camera's pose; by default as the encoder was trained."""
     precision: Precision = "auto"
     """float32; bfloat16; int8, for CPUs that multiply 8-bit integers fast, calibrated by images of
-    the shards; auto: bfloat16 on GPUs, else float32."""
+    the shards; auto: that of a table to go on with, else bfloat16 on GPUs, int8 for thousands of
+    images by the built-in encoder on such CPUs, else float32."""
     compiling: Compiling = "auto"
-    """Whether the encoder is compiled, on CPUs by OpenVINO (int8: by torch), on GPUs by torch;
-    auto: where that saves more time than it takes."""
+    """Whether the encoder is compiled, on CPUs by OpenVINO (int8 always), on GPUs by torch; auto:
+    where that saves more time than it takes."""

@@ -60,11 +60,7 @@ def calibrate_index(settings: CalibrateSettings) -> Calibration:
         return done
     data = read_checkpoint_bytes(settings.checkpoint)
     encoder = PhotoEncoder(
-        data,
-        settings.checkpoint,
-        index.metadata.fingerprint,
-        index.metadata.encoding,
-        settings.shards,
+        data, settings.checkpoint, index.metadata.fingerprint, index.metadata.encoding
     )
     gallery = read_gallery_map(index)
     context = CalibrationContext(

@@ -60,7 +60,6 @@ def locate_photos(
         settings.checkpoint,
         index.metadata.fingerprint,
         index.metadata.encoding,
-        settings.shards,
         images=len(photos),
     )
     gallery = read_gallery_map(index)

@@ -60,9 +60,8 @@ def load_predictor(
         try:
             data = read_checkpoint_bytes(checkpoint)
             return PhotoEncoder(
-                data, checkpoint, metadata.fingerprint, metadata.encoding, shards,
-                images=WORTH_A_SECOND,
-            )  # fmt: skip
+                data, checkpoint, metadata.fingerprint, metadata.encoding, images=WORTH_A_SECOND
+            )
         except CheckpointError as error:
             raise InputError(str(error)) from None
 

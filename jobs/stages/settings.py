@@ -110,7 +110,7 @@ class LocateSettings(FlightSettings, PoseSettings):
     "An HTML page with photos, candidates and a map, in one file that needs no connection."
     shards: str | None = None
     """The shards that the index was made of: photos are matched with their pixels, and the page
-    shows them; needed also where the index's embeddings are int8."""
+    shows them."""
     match: bool = True
     """Match each photo with the map's pixels around its candidates: its place within metres instead
     of a tile's middle. Takes --shards whose tiles know their corners, such as those of a GeoTIFF;
@@ -181,7 +181,7 @@ class ServeSettings(ServiceSettings):
     "Folder or URI of the index; the service switches to one that is built there later."
     shards: str | None = None
     """The shards that the index was made of: photos are matched with their pixels, and the page
-    shows them; needed also where the index's embeddings are int8."""
+    shows them."""
     match: bool = True
     """Match each photo with the map's pixels around its candidates, as jobs/locate.py does. Takes
     --shards whose tiles know their corners; --no-match answers with tiles."""

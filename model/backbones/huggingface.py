@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from model.backbones import HUB_PREFIX
 from model.backbones.base import Backbone, Features
 from model.errors import MissingLibrary
-from model.inference.torchao_logs import filter_torchao_logs
 from model.weights.pretrained import read_pretrained
 
 IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -253,9 +252,8 @@ class Swin(HuggingFaceBackbone):
 def import_transformers() -> Any:
     """The library. Raises MissingLibrary with the command that installs it."""
     try:
-        with filter_torchao_logs():  # the library imports torchao where that is installed
-            library = import_module("transformers")
-            import_module("transformers.modeling_utils")  # `transformers` itself imports on use
+        library = import_module("transformers")
+        import_module("transformers.modeling_utils")  # `transformers` itself imports on use
     except ImportError as error:
         raise MissingLibrary(
             f"this backbone needs transformers, which cannot be imported here ({error}); pip "

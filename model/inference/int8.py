@@ -1,24 +1,24 @@
-"""The backbone in 8-bit integers, for CPUs that multiply them fast: torchao's post-training
-quantisation for x86.
+"""8-bit integers for CPUs that multiply them fast: post-training quantisation by NNCF of what
+OpenVINO runs.
 
-In: an encoder with fused BatchNorms, and images to calibrate by. Out: the same encoder with a
-quantised backbone, to be compiled: uncompiled it computes the same slower than float32. Rings and
-refinement stay in float32: they are a thousandth of the products.
+In: an encoder as OpenVINO's graph, and images to calibrate by. Out: the graph with its convolutions
+quantised, to be compiled. Rings and refinement are not quantised: they are a thousandth of the
+products.
 """
 
+import contextlib
 import hashlib
-from collections.abc import Callable
+import io
+import logging
+import os
 from importlib import import_module
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from model.inference.torchao_logs import filter_torchao_logs
 from model.pvda import FeatureEncoder
 
-QUANTIZE_MODULE = "torchao.quantization.pt2e.quantize_pt2e"
-QUANTIZER_MODULE = "torchao.quantization.pt2e.quantizer.x86_inductor_quantizer"
-"Imported on use: torchao is optional, and its import takes seconds."
 CALIBRATION_BATCH = 8
 "Images at a time, independent of embedding's batch size: the ranges must not depend on that."
 INT8_INSTRUCTIONS = ("avx512_vnni", "avx_vnni", "amx_int8")
@@ -32,9 +32,7 @@ class PrecisionError(ValueError):
 
 
 def require_int8(device: str) -> None:
-    """Raise PrecisionError where int8 would not be faster than float32, or torchao is not
-    installed.
-    """
+    """Raise PrecisionError where int8 would not be faster than float32, or without NNCF."""
     has = torch.cpu.get_capabilities()
     if device != "cpu":
         raise PrecisionError(
@@ -47,13 +45,11 @@ def require_int8(device: str) -> None:
             "float32; choose --precision float32"
         )
     try:
-        with filter_torchao_logs():
-            import_module(QUANTIZER_MODULE)
+        _import_nncf()
     except ImportError as error:
         raise PrecisionError(
-            f"int8 needs torchao, which cannot be imported here ({error}); pip install "
-            "'pvda[int8]', or choose "
-            "--precision float32"
+            f"int8 needs NNCF, which cannot be imported here ({error}); pip install 'pvda[int8]', "
+            "or choose --precision float32"
         ) from error
 
 
@@ -66,35 +62,31 @@ def require_quantizable(encoder: FeatureEncoder) -> None:
         )
 
 
-def quantise(encoder: FeatureEncoder, size: int, calibrate: Callable[[], None]) -> None:
-    """Put a quantised backbone into a fused `encoder`, for images of `size` x `size` pixels.
+def quantise(graph: Any, images_B3HW: Tensor) -> Any:
+    """A graph with 8-bit convolutions, for images as bytes of the size of `images_B3HW`, which
+    calibrate it.
 
-    `calibrate` runs images through the encoder while observers record the ranges of its
-    activations: per tensor, 8 bits unsigned, from histograms. Weights have a range per output
-    channel, signed. It runs on one thread: sums in another order give other ranges in their last
-    digit, and workers would round differently.
+    Activations have a range per tensor, from the least and greatest values of these images, weights
+    one per output channel.
     """
-    threads = torch.get_num_threads()
-    with filter_torchao_logs(), torch.no_grad():
-        pt2e, x86 = import_module(QUANTIZE_MODULE), import_module(QUANTIZER_MODULE)
-        example_B3HW = torch.zeros(CALIBRATION_BATCH, 3, size, size).to(
-            memory_format=torch.channels_last
+    nncf = _import_nncf()
+    batches = [part_B3HW.numpy() for part_B3HW in torch.split(images_B3HW, CALIBRATION_BATCH)]
+    with contextlib.redirect_stdout(io.StringIO()):  # of progress bars, one for each step
+        return nncf.quantize(
+            graph,
+            nncf.Dataset(batches),
+            subset_size=len(batches),
+            ignored_scope=nncf.IgnoredScope(types=["MatMul"], validate=False),
         )
-        quantizer = x86.X86InductorQuantizer().set_global(
-            x86.get_default_x86_inductor_quantization_config()
-        )
-        any_batch = ({0: torch.export.Dim.AUTO},)
-        exported = torch.export.export(
-            encoder.backbone, (example_B3HW,), dynamic_shapes=any_batch
-        ).module()
-        watched = pt2e.prepare_pt2e(exported, quantizer)
-        encoder.add_module("backbone", watched)
-        torch.set_num_threads(1)
-        try:
-            calibrate()
-        finally:
-            torch.set_num_threads(threads)
-        encoder.add_module("backbone", pt2e.convert_pt2e(watched))
+
+
+def _import_nncf() -> Any:
+    """NNCF: optional, and its import takes seconds. Raises ImportError."""
+    # Elsewhere it sends statistics of its use over the network.
+    os.environ.setdefault("NNCF_CI", "1")
+    nncf = import_module("nncf")
+    nncf.set_log_level(logging.ERROR)
+    return nncf
 
 
 def calibration_digest(images_B3HW: Tensor) -> str:

@@ -1,22 +1,25 @@
 """An encoder run by OpenVINO, whose kernels for CPUs are faster than torch's.
 
 In: a module of images as bytes (B, 3, H, W), and a batch of such images. Out: a callable for
-batches of any number of images of that size, in float32 or bfloat16. No C++ compiler is needed, and
-a second suffices where torch.compile takes half a minute. An image's embedding has the same bits in
-any batch.
+batches of any number of images of that size, in float32, bfloat16 or 8-bit integers. No C++
+compiler is needed, and a second suffices where torch.compile takes half a minute. An image's
+embedding has the same bits in any batch.
 """
 
 import warnings
+from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from model.inference.compile import EmbedBatch, NotCompiled
+from model.inference.int8 import quantise
 from model.inference.precision import EffectivePrecision
 
-PRECISIONS: dict[EffectivePrecision, str] = {"float32": "f32", "bfloat16": "bf16"}
-"""That it is asked for, and OpenVINO's names of them. Where a CPU does not multiply bfloat16 it
-computes in float32."""
+PRECISIONS: dict[EffectivePrecision, str] = {"float32": "f32", "bfloat16": "bf16", "int8": "bf16"}
+"""OpenVINO's name of a precision; with int8, of that of what is not quantised. Where a CPU does not
+multiply bfloat16 it computes in float32."""
 SETTINGS = {
     "PERFORMANCE_HINT": "LATENCY",  # one batch at a time, on all threads
     "ENABLE_CPU_PINNING": False,  # other processes and decoding threads share the cores
@@ -24,16 +27,21 @@ SETTINGS = {
 
 
 def compile_openvino(
-    module: nn.Module, images_B3HW: Tensor, precision: EffectivePrecision = "float32"
+    module: nn.Module,
+    images_B3HW: Tensor,
+    precision: EffectivePrecision = "float32",
+    calibration_B3HW: Tensor | None = None,
 ) -> EmbedBatch:
     """`module`, which is on the CPU and in float32, for images of this size, on as many threads as
-    torch's now.
+    torch's now. int8 is calibrated by `calibration_B3HW`.
 
     Raises NotCompiled: OpenVINO is not installed, or does not know one of the module's operations.
     """
-    few_B3HW = images_B3HW[:2]
     try:
-        run = _compile(_trace(module, few_B3HW), few_B3HW, PRECISIONS[precision])
+        graph = _convert(_trace(module, images_B3HW[:2]), images_B3HW[:2])
+        if calibration_B3HW is not None:
+            graph = quantise(graph, calibration_B3HW)
+        run = _compile(graph, PRECISIONS[precision])
         run(images_B3HW)
     except Exception as error:  # torch's tracer, the conversion and the compilation have many kinds
         lines = str(error).strip().splitlines()
@@ -55,10 +63,10 @@ def _trace(module: nn.Module, images_B3HW: Tensor) -> torch.jit.ScriptModule:
     return traced
 
 
-def _compile(traced: torch.jit.ScriptModule, images_B3HW: Tensor, precision: str) -> EmbedBatch:
+def _convert(traced: torch.jit.ScriptModule, images_B3HW: Tensor) -> Any:
+    """The module as OpenVINO's graph, for any number of images."""
     # Here: whoever embeds a handful of images need not load it. Not by openvino.convert_model,
     # which sends statistics of its use over the network.
-    import openvino
     from openvino.frontend import FrontEndManager
     from openvino.frontend.pytorch.ts_decoder import TorchScriptPythonDecoder
 
@@ -66,6 +74,12 @@ def _compile(traced: torch.jit.ScriptModule, images_B3HW: Tensor, precision: str
     frontend = FrontEndManager().load_by_framework("pytorch")
     graph = frontend.convert(frontend.load(decoder))
     graph.reshape([-1, *images_B3HW.shape[1:]])
+    return graph
+
+
+def _compile(graph: Any, precision: str) -> EmbedBatch:
+    import openvino
+
     settings = SETTINGS | {
         "INFERENCE_PRECISION_HINT": precision,
         "INFERENCE_NUM_THREADS": torch.get_num_threads(),
@@ -74,6 +88,9 @@ def _compile(traced: torch.jit.ScriptModule, images_B3HW: Tensor, precision: str
 
     def run(images_B3HW: Tensor) -> Tensor:
         [embeddings_BE] = compiled(images_B3HW.contiguous().numpy()).values()
-        return torch.from_numpy(embeddings_BE.copy())  # the next batch is written to the same place
+        embeddings_BE = torch.from_numpy(embeddings_BE)
+        # In new memory: the next batch is written to the same place. In bfloat16 their lengths are
+        # a thousandth off 1.
+        return embeddings_BE.clone() if precision == "f32" else F.normalize(embeddings_BE)
 
     return run

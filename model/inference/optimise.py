@@ -19,14 +19,8 @@ from model.inference.compile import NotCompiled, compile_frozen
 from model.inference.embed import CompiledKind, EncoderKind, FastEncoder, MirroredEncoder, embed
 from model.inference.fuse_batchnorm import fuse_batchnorm
 from model.inference.fuse_padding import fuse_padding
-from model.inference.int8 import (
-    CALIBRATION_BATCH,
-    PrecisionError,
-    quantise,
-    require_int8,
-    require_quantizable,
-)
-from model.inference.openvino_runtime import PRECISIONS, compile_openvino
+from model.inference.int8 import PrecisionError, require_int8, require_quantizable
+from model.inference.openvino_runtime import compile_openvino
 from model.inference.precision import EffectivePrecision, Precision, effective_precision
 from model.pvda import FeatureEncoder
 
@@ -155,8 +149,7 @@ def _compile_if_it_pays(
     images: float, module: MirroredEncoder, check: _AgreementCheck, folded: FastEncoder, log: Log
 ) -> FastEncoder | None:
     """`module` compiled for so many images by the first compiler that pays and is able to."""
-    in_openvino = check.device.type == "cpu" and check.precision in PRECISIONS
-    if in_openvino and images >= OPENVINO_PAYS_FROM:
+    if check.device.type == "cpu" and images >= OPENVINO_PAYS_FROM:
         fast = _compile("openvino", module, check, log)
         if fast is not None:
             return fast
@@ -199,29 +192,20 @@ def _compile(
 def _int8(
     module: MirroredEncoder, check: _AgreementCheck, calibration_B3HW: Tensor | None, log: Log
 ) -> FastEncoder:
-    """`module` quantised and compiled. Raises PrecisionError."""
+    """`module` quantised and run by OpenVINO. Raises PrecisionError."""
     if calibration_B3HW is None or not len(calibration_B3HW):
         raise PrecisionError(
             "int8 without images to calibrate by; expected 64 or more of the gallery; give some"
         )
-    log(
-        f"calibrating int8 on {len(calibration_B3HW)} images and compiling it: this takes a minute "
-        "or two"
-    )
+    log(f"calibrating int8 on {len(calibration_B3HW)} images")
     start = time.perf_counter()
-
-    def calibrate() -> None:
-        for batch_B3HW in torch.split(calibration_B3HW, CALIBRATION_BATCH):
-            module(batch_B3HW)
-
-    quantise(module.encoder, check.probe_B3HW.shape[2], calibrate)
     try:
-        fast = check.measure("compiled", compile_frozen(module, check.batch()))
+        run = compile_openvino(module, check.batch(), "int8", calibration_B3HW)
     except NotCompiled as error:
         raise PrecisionError(
-            f"int8 needs a compiler and torch.compile failed ({error}); install g++, or choose "
-            "--precision float32"
+            f"int8 is run by OpenVINO, which failed ({error}); choose --precision float32"
         ) from error
+    fast = check.measure("openvino", run)
     log(f"int8 encoder, made in {time.perf_counter() - start:.0f} s: {check.describe(fast)}")
     if not _agrees(fast):
         raise PrecisionError(

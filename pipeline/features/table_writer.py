@@ -7,12 +7,14 @@ others.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from pipeline.core import storage
 from pipeline.core.errors import InputError
 from pipeline.core.progress import console
 from pipeline.core.records import Rejection
+from pipeline.features.encoding import EncodingConfig
 from pipeline.features.expected_parts import (
     add_expected,
     expected_parts_file,
@@ -42,6 +44,14 @@ class WrittenTable:
     "Images without a row, of all parts."
     list_changed: bool
     "Whether the list of them is another than before the run."
+
+
+def encoding_of_parts(path: str) -> EncodingConfig | None:
+    """How the parts that a table has already were encoded; None without an intact one."""
+    for name in part_names(path):
+        with suppress(InputError):
+            return read_header(storage.join(path, name)).footer.encoding
+    return None
 
 
 class FeatureTableWriter:

@@ -26,7 +26,7 @@ from jobs.training.settings import RunConfig
 from model.checkpoint import build_encoder, dumps, loads
 from model.inference.embed import embed
 from model.inference.int8 import PrecisionError
-from model.weights.builtin import BUILTIN
+from model.weights.builtin import BUILTIN, read_builtin
 from pipeline.core.errors import InputError
 from pipeline.core.records import Split
 from pipeline.features.embed import embed_gallery
@@ -109,6 +109,45 @@ def test_int8_unavailable_is_refused_before_any_worker_starts(
     settings = EncoderSettings(precision="int8")
     with pytest.raises(InputError, match="choose --precision float32"):
         make_encoder_spec(checkpoint, "it", settings_of(tiny_shards), settings)
+
+
+def precision_of(embedding: EmbeddingSettings, name: str = "builtin", **given: Any) -> str:
+    """The precision that the built-in encoder takes; fails where it needs more than its bytes."""
+    spec = make_encoder_spec(read_builtin(), name, embedding, EncoderSettings(**given))
+    return spec.encoding.precision
+
+
+def test_many_images_are_embedded_in_int8_where_it_pays(
+    tiny_shards: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the built-in encoder, whose recall in int8 is known, on CPUs that have it."""
+    embedding = settings_of(tiny_shards)
+    monkeypatch.setattr(encoder_module, "require_int8", lambda device: None)
+    assert precision_of(embedding) == "float32", "few images"
+    monkeypatch.setattr(encoder_module, "INT8_PAYS_FROM", 1)
+    assert precision_of(embedding) == "int8"
+    assert "in int8, which this CPU multiplies fast" in " ".join(capsys.readouterr().err.split())
+    assert precision_of(embedding, "other.pt") == "float32", "whose recall in int8 is unknown"
+    assert precision_of(embedding, precision="float32") == "float32"
+
+    def unavailable(device: str) -> None:
+        raise PrecisionError("this CPU has none")
+
+    monkeypatch.setattr(encoder_module, "require_int8", unavailable)
+    assert precision_of(embedding) == "float32"
+
+
+def test_a_table_is_continued_in_its_precision(
+    tmp_path: Path, tiny_shards: str, checkpoint: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A set that has grown past the limit would otherwise be refused its own table."""
+    embedding = settings_of(tiny_shards, out=str(tmp_path), split=Split.QUERY, workers=0)
+    spec = make_encoder_spec(read_builtin(), "builtin", embedding)
+    embed_gallery(embedding, spec)
+    monkeypatch.setattr(encoder_module, "require_int8", lambda device: None)
+    monkeypatch.setattr(encoder_module, "INT8_PAYS_FROM", 1)
+    assert precision_of(embedding) == "float32"
+    assert precision_of(replace(embedding, out="none")) == "int8"
 
 
 def test_table_records_the_encoding_and_remarks_are_printed(

@@ -1,6 +1,7 @@
 """Photos are encoded as the gallery was, by the encoding in the index, and by no other network."""
 
 import io
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -103,8 +104,15 @@ def test_photo_encoder_refuses_an_index_of_imported_features(checkpoint: bytes) 
         PhotoEncoder(checkpoint, "last.pt", "f" * 64, None)
 
 
-def test_photo_encoder_needs_the_shards_of_an_int8_index(checkpoint: bytes) -> None:
+def test_photos_of_an_int8_index_are_encoded_in_float32(
+    checkpoint: bytes, lively_encoder: FeatureEncoder
+) -> None:
     encoding = EncodingConfig(mirror=True, resizer="torch", precision="int8", calibration="c" * 8)
     fingerprint = encoder_fingerprint(loads(checkpoint), encoding)
-    with pytest.raises(InputError, match=r"encoded in int8.*expected --shards"):
-        PhotoEncoder(checkpoint, "last.pt", fingerprint, encoding)
+    encoder = PhotoEncoder(checkpoint, "last.pt", fingerprint, encoding)
+    assert (encoder.fingerprint, encoder.encoding) == (fingerprint, encoding)
+    image_HW3 = encoder.to_input(decode(photo(1)))
+    expected_BE = embed(lively_encoder, torch.from_numpy(stack([image_HW3]))).numpy()
+    assert np.allclose(encoder.encode([photo(1)])[0], expected_BE, atol=1e-5)
+    with pytest.raises(InputError, match=r"last.pt did not make this index"):
+        PhotoEncoder(checkpoint, "last.pt", fingerprint, replace(encoding, calibration="d" * 8))

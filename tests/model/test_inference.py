@@ -4,20 +4,17 @@ Shapes: B images, E numbers of an embedding.
 """
 
 import shutil
-import sys
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from model.inference import int8, optimise
+from model.inference import optimise
 from model.inference.compile import NotCompiled, compile_frozen
 from model.inference.embed import MirroredEncoder, embed
-from model.inference.fuse_batchnorm import fuse_batchnorm
-from model.inference.int8 import INT8_INSTRUCTIONS, PrecisionError, calibration_digest, require_int8
+from model.inference.int8 import PrecisionError, calibration_digest
 from model.inference.optimise import MIN_COSINE, optimise_encoder
 from model.inference.precision import describe_preprocessing, effective_precision
 from model.pvda import FeatureEncoder
@@ -193,89 +190,6 @@ def test_compile_without_compiler_gives_one_reason() -> None:
         pytest.raises(NotCompiled, match=r"^[^\n]+$"),
     ):
         compile_frozen(module, torch.rand(2, 3, 8, 8))
-
-
-@pytest.mark.slow
-@needs_compiler
-def test_int8_agrees_on_other_images(lively_encoder: FeatureEncoder) -> None:
-    pytest.importorskip("torchao", reason="int8 is optional: pip install 'pvda[int8]'")
-    if not any(torch.cpu.get_capabilities().get(name) for name in INT8_INSTRUCTIONS):
-        pytest.skip("this CPU has no VNNI and no AMX")
-    calibration_B3HW = images(9, seed=50)
-    encoder, said = fast(lively_encoder, precision="int8", calibration_B3HW=calibration_B3HW)
-    assert (encoder.kind, encoder.precision) == ("compiled", "int8")
-    assert 0.99 <= encoder.mean_agreement < 1 - 1e-7
-    assert said[0].startswith("calibrating int8 on 9 images")
-    assert said[1].startswith("int8 encoder, made in ")
-    found_BE = encoder(images(5, seed=5))
-    torch.testing.assert_close(found_BE.norm(dim=1), torch.ones(5))
-    assert (found_BE * embed(lively_encoder, images(5, seed=5))).sum(1).mean() > 0.99
-
-
-@pytest.mark.slow
-def test_int8_ranges_do_not_depend_on_threads(
-    lively_encoder: FeatureEncoder,
-) -> None:
-    """Two workers that round differently would differ from each other as much as from float32."""
-    pytest.importorskip("torchao", reason="int8 is optional: pip install 'pvda[int8]'")
-    threads, found = torch.get_num_threads(), []
-    try:
-        for count in (1, 2):
-            torch.set_num_threads(count)
-            module = MirroredEncoder(fuse_batchnorm(lively_encoder), mirror=True)
-            int8.quantise(module.encoder, 64, partial(module, images(6)))
-            assert torch.get_num_threads() == count
-            found.append(str(module.encoder.backbone.code))  # the ranges are numbers in it
-    finally:
-        torch.set_num_threads(threads)
-    assert "quantize_per_tensor" in found[0]
-    assert found[0] == found[1]
-
-
-def test_int8_unavailable_is_rejected_with_the_remedy(
-    lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with pytest.raises(
-        PrecisionError, match="int8 is for CPUs and the device is cuda; choose --precision bfloat16"
-    ):
-        require_int8("cuda")
-    monkeypatch.setattr(
-        torch.cpu, "get_capabilities", lambda: {"architecture": "x86_64", "avx512_vnni": True}
-    )
-    monkeypatch.setitem(sys.modules, int8.QUANTIZER_MODULE, None)
-    with pytest.raises(
-        PrecisionError, match=r"int8 needs torchao, .*; pip install 'pvda\[int8\]', or choose"
-    ):
-        require_int8("cpu")
-    monkeypatch.setattr(
-        torch.cpu, "get_capabilities", lambda: {"architecture": "x86_64", "avx2": True}
-    )
-    with pytest.raises(
-        PrecisionError,
-        match=r"this CPU \(x86_64\) has no avx512_vnni.*; choose --precision float32",
-    ):
-        fast(lively_encoder, precision="int8", calibration_B3HW=images(4))
-    monkeypatch.setattr(optimise, "require_int8", lambda device: None)
-    with pytest.raises(
-        PrecisionError, match="int8 without images to calibrate by; expected 64 or more"
-    ):
-        fast(lively_encoder, precision="int8")
-
-
-def test_int8_with_low_agreement_is_rejected(
-    lively_encoder: FeatureEncoder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Neither a slow table nor a wrong one is what was asked for."""
-    monkeypatch.setattr(optimise, "require_int8", lambda device: None)
-    monkeypatch.setattr(optimise, "quantise", lambda *_: None)
-    monkeypatch.setattr(
-        optimise, "compile_frozen", lambda module, _: lambda x: module(x).roll(1, dims=1)
-    )
-    with pytest.raises(
-        PrecisionError,
-        match=r"by a mean cosine of -?0\.\d+, expected at least 0.99; calibrate by more",
-    ):
-        fast(lively_encoder, precision="int8", calibration_B3HW=images(4))
 
 
 def test_precision_changes_the_fingerprint() -> None:
