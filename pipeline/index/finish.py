@@ -23,7 +23,7 @@ from pipeline.index.searcher import Index
 from pipeline.index.train import new_index
 from pipeline.index.tuning.ground_truth import NEIGHBOURS, RecallQueries
 from pipeline.index.tuning.recall import TIMED_SECONDS, measure_speed
-from pipeline.index.tuning.search_params import search_param_grid, tune, tune_filtered
+from pipeline.index.tuning.search_params import search_param_grid, tune, tune_hidden
 from pipeline.index.workspace import BuildWorkspace, rows_by_part
 
 
@@ -47,7 +47,7 @@ def finish_index(
     # Measured as if nothing had been removed, for exact search returns removed locations.
     all_parts = tuple(replace(part, removed=()) for part in metadata.parts)
     index = Index(out, metadata=replace(metadata, parts=all_parts))
-    grid = search_param_grid(new_index(metadata.factory, metadata.dimension), metadata.refine)
+    grid = [*search_param_grid(new_index(metadata.factory, metadata.dimension), metadata.refine)]
     limit, batch = metadata.measured.get("p99_limit_ms"), metadata.measured.get("latency_batch", 1)
 
     def speed(params: SearchParams, batch: int) -> dict[str, float]:
@@ -57,8 +57,10 @@ def finish_index(
     def fast_enough(params: SearchParams) -> bool:
         return limit is None or speed(params, batch)["p99_ms"] <= limit
 
-    params, at_1, at_10 = tune(index, queries, grid, metadata.target_recall, fast_enough)
-    params, filtered_at_10 = tune_filtered(index, queries, params, metadata.target_recall)
+    params, at_1, at_10 = tune(index, queries, iter(grid), metadata.target_recall, fast_enough)
+    params, filtered_at_10 = tune_hidden(
+        index, queries, params, metadata.target_recall, max(step.nprobe_or_ef for step in grid)
+    )
     single = speed(params, 1)
     measured = metadata.measured | {
         "recall_at_1": at_1,

@@ -34,9 +34,11 @@ class SearchParams:
     list_ratio: float = 0.0
     """Lists whose centre scores below this share of the query's best centre are skipped; 0:
     none."""
-    filtered_rerank_factor: int = RERANK_FACTOR
-    """Candidates per wanted row where a filter hides many rows, if there are candidates: these over
-    the root of the share of rows that it leaves."""
+    hidden_nprobe_or_ef: int | None = None
+    """nprobe or efSearch for queries whose nearest row a filter hides, where it leaves half of the
+    rows; None: not chosen."""
+    hidden_rerank_factor: int = RERANK_FACTOR
+    "Their candidates per wanted row, if there are candidates."
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -81,20 +81,48 @@ class IndexPart:
     ) -> tuple[Floats, Ints]:
         """Scores and rows (Q, K), counted within the part, best first; NO_ROW where fewer match."""
         allowed_N = self.allowed(where)
-        count = self.metadata.rows if allowed_N is None else int(np.count_nonzero(allowed_N))
+        if allowed_N is None:
+            return self._search(queries_QD, k, params, None)
+        count = int(np.count_nonzero(allowed_N))
         if not count:
             return _empty_result(len(queries_QD), k)
-        if allowed_N is not None and count <= FILTERED_EXACT_ROWS and self._reader is not None:
+        if count <= FILTERED_EXACT_ROWS and self._reader is not None:
             row_C = np.flatnonzero(allowed_N)
             rows_QC = np.broadcast_to(row_C, (len(queries_QD), count))
             return top_k(self._exact_scores(queries_QD, row_C), rows_QC, k)
-        if allowed_N is not None:
-            params = filtered_params(params, count / self.metadata.rows)
-        wanted = min(count, max(k, k * params.rerank_factor))
+        share = count / self.metadata.rows
+        if share >= 1 - FEW_HIDDEN:
+            return self._search(queries_QD, k, filtered_params(params, share), allowed_N)
+        shown_Q = self._nearest_is_allowed(queries_QD, params, allowed_N)
+        scores_QK, rows_QK = _empty_result(len(queries_QD), k)
+        for some_Q, chosen in (
+            (shown_Q, filtered_params(params, share)),
+            (~shown_Q, hidden_params(params, share)),
+        ):
+            if some_Q.any():
+                found = self._search(queries_QD[some_Q], k, chosen, allowed_N)
+                scores_QK[some_Q], rows_QK[some_Q] = found
+        return scores_QK, rows_QK
+
+    def _search(
+        self, queries_QD: Floats, k: int, params: SearchParams, allowed_N: Mask | None
+    ) -> tuple[Floats, Ints]:
+        """`search` over the index's codes, and the table's vectors for the best of them."""
+        rows = self.metadata.rows if allowed_N is None else int(np.count_nonzero(allowed_N))
+        wanted = min(rows, max(k, k * params.rerank_factor))
         scores_QC, rows_QC = search_faiss(self.index, queries_QD, wanted, k, params, allowed_N)
         if params.rerank_factor > 1 and self._reader is not None:
             scores_QC = rescored(queries_QD, rows_QC, self.vectors)
         return top_k(scores_QC, rows_QC, k)
+
+    def _nearest_is_allowed(
+        self, queries_QD: Floats, params: SearchParams, allowed_N: Mask
+    ) -> Mask:
+        """Whether a filter shows the place that a query looks most like (Q,), by the codes alone.
+        Where it hides it, what is left is nearly all at one distance, in many lists.
+        """
+        _, rows_Q1 = search_faiss(self.index, queries_QD, 1, 1, params, None)
+        return np.asarray(allowed_N[rows_Q1[:, 0]] & (rows_Q1[:, 0] != NO_ROW))
 
     def vectors(self, row_R: Ints) -> Floats:
         """The table's vectors (R, D) of these rows, which must ascend."""
@@ -137,18 +165,28 @@ def filtered_params(params: SearchParams, share: float) -> SearchParams:
     """Search parameters where a filter leaves a share of the rows: the fewer match, the more lists
     hold as many of them, and the farther these are and the nearer to each other, so that coarse
     codes order them worse: of embeddings .965 became .940 with as many candidates as without a
-    filter. Where it hides many, it may hide what is nearest to a query, and then what is left is
-    nearly all at one distance; `tune_filtered` found how many candidates that takes.
+    filter.
     """
     factor = params.rerank_factor
-    if factor > 1 and share < 1 - FEW_HIDDEN:
-        factor = max(factor, params.filtered_rerank_factor)
     return replace(
         params,
         nprobe_or_ef=math.ceil(params.nprobe_or_ef / share),
         rerank_factor=math.ceil(factor / math.sqrt(share)) if factor > 1 else 1,
         list_ratio=0.0,
     )
+
+
+def hidden_params(params: SearchParams, share: float) -> SearchParams:
+    """`filtered_params` for queries whose nearest row the filter hides: those that
+    `tune_hidden` found for a half of the rows.
+    """
+    factor = max(params.rerank_factor, params.hidden_rerank_factor)
+    at_half = replace(
+        params,
+        nprobe_or_ef=params.hidden_nprobe_or_ef or 2 * params.nprobe_or_ef,
+        rerank_factor=factor if params.rerank_factor > 1 else 1,
+    )
+    return filtered_params(at_half, 2 * share)
 
 
 def _empty_result(queries: int, k: int) -> tuple[Floats, Ints]:

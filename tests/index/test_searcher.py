@@ -1,5 +1,6 @@
 """Searching equals brute force under any filter and in any kind of index; plain FAISS opens it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import faiss
@@ -17,7 +18,7 @@ from pipeline.core.records import Split, View
 from pipeline.features.table import open_table
 from pipeline.index.build import build_index
 from pipeline.index.metadata import SearchParams
-from pipeline.index.part import FILTERED_EXACT_ROWS, NO_ROW, filtered_params
+from pipeline.index.part import FILTERED_EXACT_ROWS, NO_ROW, filtered_params, hidden_params
 from pipeline.index.planning.plan import RERANK_FACTOR
 from pipeline.index.searcher import Index, merge_results
 from pipeline.index.settings import IndexSettings
@@ -237,13 +238,23 @@ def test_filtered_params_widen_as_fewer_rows_match() -> None:
     few_removed = filtered_params(usual, 0.96)
     assert (few_removed.nprobe_or_ef, few_removed.rerank_factor) == (9, 3)  # 2 / sqrt(0.96): 2.04
     quarter = filtered_params(usual, 0.25)
-    assert (quarter.nprobe_or_ef, quarter.rerank_factor) == (32, 2 * RERANK_FACTOR)
-    fifth = filtered_params(usual, 0.2)
-    assert (fifth.nprobe_or_ef, fifth.rerank_factor) == (40, 23)  # 10 / sqrt(0.2) is 22.36
+    assert (quarter.nprobe_or_ef, quarter.rerank_factor) == (32, 4)
     many = SearchParams(nprobe_or_ef=8, rerank_factor=20)
     assert filtered_params(many, 0.25).rerank_factor == 40
     # Without candidates that are scored again, more of them would change nothing.
     assert filtered_params(SearchParams(nprobe_or_ef=8, rerank_factor=1), 0.25).rerank_factor == 1
+
+
+def test_hidden_params_are_those_of_a_half_and_widen() -> None:
+    untuned = SearchParams(nprobe_or_ef=8, rerank_factor=2)
+    half = hidden_params(untuned, 0.5)
+    assert (half.nprobe_or_ef, half.rerank_factor) == (16, RERANK_FACTOR)
+    tuned = replace(untuned, hidden_nprobe_or_ef=100, hidden_rerank_factor=40)
+    half, eighth = hidden_params(tuned, 0.5), hidden_params(tuned, 0.125)
+    assert (half.nprobe_or_ef, half.rerank_factor) == (100, 40)
+    assert (eighth.nprobe_or_ef, eighth.rerank_factor) == (400, 80)
+    assert hidden_params(replace(tuned, rerank_factor=1), 0.125).rerank_factor == 1
+    assert hidden_params(replace(tuned, rerank_factor=60), 0.5).rerank_factor == 60
 
 
 def test_mask_looks_only_at_batches_that_may_match(

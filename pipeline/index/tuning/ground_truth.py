@@ -74,13 +74,12 @@ def sample_queries(
     half_N = _half_of_locations(indexed)
     found = _exact_by_half(queries_QD, indexed, half_N, NEIGHBOURS + 1)
     wanted = min(NEIGHBOURS + 1, len(half_N))
-    exact_QK = without_own_row(merge_results(found, wanted)[1], own_row_Q)
+    nearest_QK = merge_results(found, wanted)[1]  # a query's own row is the first
     outside_QK, inside_QK = (without_own_row(rows_QK, own_row_Q) for _, rows_QK in found)
-    nearest_Q = exact_QK[:, 0] if exact_QK.size else own_row_Q
-    within_Q = ~half_N[nearest_Q]
+    within_Q = ~half_N[nearest_QK[:, 0]]
     return RecallQueries(
         queries_QD=queries_QD,
-        exact_QK=exact_QK,
+        exact_QK=without_own_row(nearest_QK, own_row_Q),
         own_row_Q=own_row_Q,
         source=source,
         hidden=HiddenPlaces(

@@ -5,6 +5,7 @@ In: an index, and queries with what exact search finds for them. Out: SearchPara
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from operator import itemgetter
 from typing import Any
 
 from pipeline.index.faiss_io import FAISS
@@ -105,19 +106,30 @@ def _lower_rerank_factor(
     return tuned
 
 
-def tune_filtered(
-    index: Index, queries: RecallQueries, params: SearchParams, target: float
+def tune_hidden(
+    index: Index, queries: RecallQueries, params: SearchParams, target: float, most: int
 ) -> tuple[SearchParams, float]:
-    """The same parameters with the candidates that filtered searches need for the target, and the
-    recall@10 that they reach: where a filter hides half of the locations, each query's own among
-    them. Without candidates there is nothing to choose.
+    """The same parameters with those for queries whose place a filter hides, and the recall@10 that
+    these reach where it hides half of the locations, each query's own among them.
+
+    Of twice the lists (or the graph's breadth, up to `most`) and twice the candidates the one that
+    finds more is taken until the target is reached, or there are no more; then the best so far.
     """
-    recall = measure_filtered_recall(index, queries, params)
-    while (
-        recall < target
-        and params.rerank_factor > 1
-        and params.filtered_rerank_factor < MAX_RERANK_FACTOR
-    ):
-        params = replace(params, filtered_rerank_factor=2 * params.filtered_rerank_factor)
-        recall = measure_filtered_recall(index, queries, params)
-    return params, recall
+
+    def measured(params: SearchParams) -> tuple[SearchParams, float]:
+        return params, measure_filtered_recall(index, queries, params)
+
+    last = measured(replace(params, hidden_nprobe_or_ef=min(most, 2 * params.nprobe_or_ef)))
+    best = last
+    while best[1] < target and (harder := [measured(one) for one in _harder(last[0], most)]):
+        last = max(harder, key=itemgetter(1))
+        best = max(best, last, key=itemgetter(1))
+    return best
+
+
+def _harder(params: SearchParams, most: int) -> Iterator[SearchParams]:
+    breadth, factor = params.hidden_nprobe_or_ef or most, params.hidden_rerank_factor
+    if breadth < most:
+        yield replace(params, hidden_nprobe_or_ef=min(most, 2 * breadth))
+    if params.rerank_factor > 1 and factor < MAX_RERANK_FACTOR:
+        yield replace(params, hidden_rerank_factor=2 * factor)
