@@ -10,6 +10,7 @@ import os
 import tempfile
 import time
 from collections import Counter
+from dataclasses import replace
 from typing import Any, get_args
 
 import ray
@@ -24,8 +25,10 @@ from embedding_worker import (
 )
 from synthetic import jpegs
 
+from jobs.encoding.encoder import read_checkpoint_bytes
 from jobs.encoding.settings import Compiling, EncoderSettings
 from model.backbones import BACKBONES
+from model.checkpoint import dumps, loads
 from model.inference.precision import EffectivePrecision
 from pipeline.core import cluster
 from pipeline.features.embed_worker import IN_FLIGHT, EncoderSpec
@@ -57,12 +60,22 @@ def end_to_end(actor: Any, shards: list[Shard]) -> tuple[float, Counter[str]]:
     return sum(shard.samples for shard in shards) / seconds, spent
 
 
+def weights(args: argparse.Namespace) -> bytes:
+    """The bytes of a trained checkpoint for images of the size asked for, or of random weights. Of
+    a random EfficientNet hardly anything reaches the last maps, nothing at all in int8.
+    """
+    if not args.checkpoint:
+        return checkpoint(recipe_of(args.backbone, args.width, args.size))
+    trained = loads(read_checkpoint_bytes(args.checkpoint), args.checkpoint)
+    return dumps(replace(trained, network=replace(trained.network, image_size=args.size)))
+
+
 def measure_speed(args: argparse.Namespace, images: list[bytes]) -> None:
     """Print the stage's images per second over the encoder's, the best of all rounds."""
     threads = args.threads or os.cpu_count() or 1
     with tempfile.TemporaryDirectory() as folder:
         spec = encoder_spec(
-            checkpoint(recipe_of(args.backbone, args.width, args.size)),
+            weights(args),
             args.batch,
             folder,
             images,
@@ -86,8 +99,9 @@ def measure_speed(args: argparse.Namespace, images: list[bytes]) -> None:
             )
         # Other work on the machine can only slow a round down: compare the best of each.
         print(
-            f"tar -> Parquet, {args.backbone} at {args.size} px in {args.precision}, batches of "
-            f"{args.batch}, {threads} threads, {args.decoders} decoding: "
+            f"tar -> Parquet, {args.checkpoint or args.backbone} at {args.size} px in "
+            f"{args.precision}, batches of {args.batch}, {threads} threads, {args.decoders} "
+            "decoding: "
             f"{max(stage) / max(resident):.3f} x the encoder alone (best of {args.rounds} rounds)"
         )
         ray.kill(actor)
@@ -114,6 +128,7 @@ def measure_memory(args: argparse.Namespace, images: list[bytes]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     add = parser.add_argument
+    add("--checkpoint", help="builtin, or a last.pt; by default random weights")
     add("--backbone", default="resnet50", choices=BACKBONES, help="with its recipe's rings")
     add("--width", type=float, default=1.0, help="its channels, as a multiple")
     add("--size", type=int, default=256, help="side of its images, pixels")
