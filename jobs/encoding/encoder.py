@@ -129,7 +129,7 @@ def make_encoder_spec(
         open_set() if open_set else open_or_scan(embedding.shards, embedding.split, embedding.view)
     )
     total = sum(shard.samples for shard in shards.manifest.of(embedding.split, embedding.view))
-    precision = _effective_precision(settings.precision, embedding, name == BUILTIN, total)
+    precision = _precision_of_workers(settings.precision, embedding, name == BUILTIN, total)
     count = PROBE_IMAGES + (CALIBRATION_IMAGES if precision == "int8" else 0)
     perspective = settings.perspective or trained_perspective(checkpoint)
     images_B3HW = first_images(shards, size, settings.resizer, count, perspective)
@@ -170,7 +170,7 @@ def trained_perspective(checkpoint: Checkpoint) -> Perspective:
     return "overhead" if checkpoint.recipe.get("perspective") == "overhead" else "as_taken"
 
 
-def _effective_precision(
+def _precision_of_workers(
     asked: Precision, embedding: EmbeddingSettings, is_builtin: bool, images: int
 ) -> EffectivePrecision:
     """The precision that the workers will compute in. `auto`: that of the table's parts, if there

@@ -5,7 +5,7 @@ ids of their rows, and `index.json`; `searcher.Index` opens it and finds hits, `
 it over a cluster, `update` extends, reduces and verifies it.
 
 Begin with `planning/`, which chooses the kind of index; then `build.py`, the stage, which trains
-(`train.py`), builds work units (`units.py`, `workspace.py`) and measures recall (`recall.py`,
+(`train.py`), builds work units (`units.py`, `workspace.py`) and measures recall (`tuning/`,
 `finish.py`); then `searcher.py` and `part.py`, one search. `metadata.py` has the fields of
 `index.json`.
 """
