@@ -10,7 +10,7 @@ the gallery in int8. Embeds in this process without Ray, so that a small set tak
 import argparse
 import time
 from dataclasses import dataclass
-from itertools import islice, product
+from itertools import islice, permutations, product
 from typing import Any
 
 import numpy as np
@@ -108,7 +108,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("checkpoints", nargs="+")
     parser.add_argument("--shards", required=True)
-    parser.add_argument("--precisions", nargs="+", default=["float32"])
+    choices = [*MIN_COSINE, *map(":".join, permutations(MIN_COSINE, 2))]
+    parser.add_argument("--precisions", nargs="+", default=["float32"], choices=choices)
     parser.add_argument("--size", type=int, help="pixels a side, if not as trained")
     options = parser.parse_args()
     shards, baseline = open_shards(options.shards), None

@@ -31,6 +31,7 @@ from pipeline.index.part import NO_ROW
 from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings
 from pipeline.index.tuning.ground_truth import NEIGHBOURS, exact_search
+from pipeline.index.tuning.recall import share_found
 
 SELECTIVITIES = [1e-5, 1e-4, 1e-3, 1e-2, 0.03, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0]
 AROUND, ONE = "around", "one"
@@ -123,15 +124,6 @@ def search_in_boxes(index: Index, queries_QD: Floats, one: Boxes) -> Ints:
     return found_QK
 
 
-def recall_of(exact_QK: Ints, found_QK: Ints) -> float:
-    """Of the rows that exact search finds; a box may hold fewer than ten."""
-    shares = [
-        len({*exact} - {NO_ROW} & {*found}) / (len({*exact} - {NO_ROW}) or 1)
-        for exact, found in zip(exact_QK.tolist(), found_QK.tolist(), strict=True)
-    ]
-    return float(np.mean(shares))
-
-
 def build(folder: Path, out: str, factory: str, target_recall: float) -> Index:
     settings = IndexSettings(
         table=str(folder),
@@ -199,7 +191,7 @@ def main() -> None:
                 ratio = rate / unfiltered.setdefault(number, rate)
                 cells = (
                     f"{one.share:g}", f"{rows:,.0f}", label_of(index),
-                    f"{recall_of(exact_QK, found_QK):.4f}", f"{rate:,.0f}", f"{ratio:.2f} x",
+                    f"{share_found(exact_QK, found_QK):.4f}", f"{rate:,.0f}", f"{ratio:.2f} x",
                 )  # fmt: skip
                 print(f"| {' | '.join(cells)} |", flush=True)
 

@@ -34,7 +34,7 @@ from pipeline.index.searcher import Index
 from pipeline.index.settings import IndexSettings
 from pipeline.index.train import SPECTRUM_ROWS, effective_dimension, sample_rows
 from pipeline.index.tuning.ground_truth import exact_search
-from pipeline.index.tuning.recall import measure_speed
+from pipeline.index.tuning.recall import measure_speed, share_found
 from pipeline.index.workspace import rows_by_part
 
 BLOCK_ROWS = 8_192
@@ -154,13 +154,12 @@ def search(table: str, path: str, given: Queries, scale: float, answer: Connecti
         start = clock()
         flat.search(given.queries_QD, 10)
         exact.append((clock() - start) * scale)
-    pairs = zip(given.exact_QK.tolist(), found.tolist(), strict=True)
-    recall = np.mean([len({*a} & {*b}) / 10 for a, b in pairs])
+    recall = share_found(given.exact_QK, found)
     ratio = np.median([one / other for one, other in zip(exact, ours, strict=True)])
     rate = len(given.queries_QD) / float(np.median(ours))
     speed = measure_speed(index.search_rows, given.queries_QD, 1, 1.0, clock)
     warm = speed["p50_ms"], speed["p99_ms"]
-    answer.send((float(recall), rate, float(ratio), memory, warm, cold))
+    answer.send((recall, rate, float(ratio), memory, warm, cold))
 
 
 def former_plan(rows: int, dimension: int, effective: int) -> str:

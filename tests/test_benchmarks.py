@@ -62,7 +62,8 @@ CASES: dict[str, tuple[str, str]] = {
         r"gallery: 20 of 20, \d+ crops/s, [\d.]+ x the encoder alone",
     ),
     "encoders": (
-        "--shards {trained}/shards {trained}/run/last.pt builtin",
+        "--shards {trained}/shards {trained}/run/last.pt builtin "
+        "--precisions float32 float32:bfloat16",
         r"builtin, float32: R@1 .* [\d.]+ x the first encoder's",
     ),
     "evaluate": ("--scale 0.01", r"satellite->drone .* [\d.]+ x the float32 products"),

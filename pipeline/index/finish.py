@@ -57,7 +57,7 @@ def finish_index(
     def fast_enough(params: SearchParams) -> bool:
         return limit is None or speed(params, batch)["p99_ms"] <= limit
 
-    params, at_1, at_10 = tune(index, queries, iter(grid), metadata.target_recall, fast_enough)
+    params, at_1, at_10 = tune(index, queries, grid, metadata.target_recall, fast_enough)
     params, filtered_at_10 = tune_hidden(
         index, queries, params, metadata.target_recall, max(step.nprobe_or_ef for step in grid)
     )

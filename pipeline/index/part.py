@@ -82,7 +82,7 @@ class IndexPart:
         """Scores and rows (Q, K), counted within the part, best first; NO_ROW where fewer match."""
         allowed_N = self.allowed(where)
         if allowed_N is None:
-            return self._search(queries_QD, k, params, None)
+            return self._search(queries_QD, k, params, None, self.metadata.rows)
         count = int(np.count_nonzero(allowed_N))
         if not count:
             return _empty_result(len(queries_QD), k)
@@ -92,7 +92,8 @@ class IndexPart:
             return top_k(self._exact_scores(queries_QD, row_C), rows_QC, k)
         share = count / self.metadata.rows
         if share >= 1 - FEW_HIDDEN:
-            return self._search(queries_QD, k, filtered_params(params, share), allowed_N)
+            params = filtered_params(params, share)
+            return self._search(queries_QD, k, params, allowed_N, count)
         shown_Q = self._nearest_is_allowed(queries_QD, params, allowed_N)
         scores_QK, rows_QK = _empty_result(len(queries_QD), k)
         for some_Q, chosen in (
@@ -100,16 +101,17 @@ class IndexPart:
             (~shown_Q, hidden_params(params, share)),
         ):
             if some_Q.any():
-                found = self._search(queries_QD[some_Q], k, chosen, allowed_N)
+                found = self._search(queries_QD[some_Q], k, chosen, allowed_N, count)
                 scores_QK[some_Q], rows_QK[some_Q] = found
         return scores_QK, rows_QK
 
     def _search(
-        self, queries_QD: Floats, k: int, params: SearchParams, allowed_N: Mask | None
+        self, queries_QD: Floats, k: int, params: SearchParams, allowed_N: Mask | None, count: int
     ) -> tuple[Floats, Ints]:
-        """`search` over the index's codes, and the table's vectors for the best of them."""
-        rows = self.metadata.rows if allowed_N is None else int(np.count_nonzero(allowed_N))
-        wanted = min(rows, max(k, k * params.rerank_factor))
+        """`search` over the index's codes, and the table's vectors for the best of them. `count`:
+        of the allowed rows.
+        """
+        wanted = min(count, max(k, k * params.rerank_factor))
         scores_QC, rows_QC = search_faiss(self.index, queries_QD, wanted, k, params, allowed_N)
         if params.rerank_factor > 1 and self._reader is not None:
             scores_QC = rescored(queries_QD, rows_QC, self.vectors)

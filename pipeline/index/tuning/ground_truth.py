@@ -122,7 +122,8 @@ def _exact_by_half(
 
 def _half_of_locations(table: FeatureTable) -> Mask:
     """The rows whose location's name comes before the middle one of all rows' (N,): tiles of a map
-    are named so that neighbours stay together.
+    are named so that neighbours stay together. Read twice: kept, the names of a large gallery would
+    be most of a memory budget.
     """
     every = -(-table.rows // MIDDLE_SAMPLE)
     some = sorted(chain.from_iterable(names[::every].to_pylist() for names in _locations(table)))

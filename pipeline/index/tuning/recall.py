@@ -39,10 +39,18 @@ def measure_recall(
         return 1.0, 1.0
     _, rows_QK = index.search_rows(queries.queries_QD, k + 1, params=params)
     found_QK = without_own_row(rows_QK, queries.own_row_Q)
-    k = min(k, NEIGHBOURS)
-    pairs = zip(exact_QK[:, :k].tolist(), found_QK[:, :k].tolist(), strict=True)
-    at_10 = np.mean([len({*exact} & {*found}) / k for exact, found in pairs])
-    return float((exact_QK[:, 0] == found_QK[:, 0]).mean()), float(at_10)
+    at_10 = share_found(exact_QK[:, :NEIGHBOURS], found_QK[:, :NEIGHBOURS])
+    return float((exact_QK[:, 0] == found_QK[:, 0]).mean()), at_10
+
+
+def share_found(exact_QK: Ints, found_QK: Ints) -> float:
+    """Recall@K: the share of exact search's rows that are among the found ones, whichever their
+    order; 1 where there are none. NO_ROW counts as no row.
+    """
+    pairs = zip(exact_QK.tolist(), found_QK.tolist(), strict=True)
+    found = sum(len({*exact} & {*rows} - {NO_ROW}) for exact, rows in pairs)
+    of_all = np.count_nonzero(exact_QK != NO_ROW)
+    return float(found / of_all) if of_all else 1.0
 
 
 def measure_filtered_recall(index: Index, queries: RecallQueries, params: SearchParams) -> float:
@@ -50,19 +58,16 @@ def measure_filtered_recall(index: Index, queries: RecallQueries, params: Search
     locations, each query's own among them; 1 where the filters leave no rows.
     """
     assert queries.hidden is not None
-    found, of_all = 0, 0
+    found_QK = np.full_like(queries.hidden.exact_QK, NO_ROW)
     for half in (False, True):
         some_Q = queries.hidden.within_Q == half
-        if not some_Q.any():
-            continue
-        allowed_N: Mask = queries.hidden.half_N == half
-        queries_QD, exact_QK = queries.queries_QD[some_Q], queries.hidden.exact_QK[some_Q]
-        _, rows_QK = index.search_rows(queries_QD, NEIGHBOURS + 1, allowed_N, params)
-        found_QK = without_own_row(rows_QK, queries.own_row_Q[some_Q])
-        for exact, rows in zip(exact_QK.tolist(), found_QK.tolist(), strict=True):
-            found += len({*exact} & {*rows} - {NO_ROW})
-            of_all += len({*exact} - {NO_ROW})
-    return found / of_all if of_all else 1.0
+        if some_Q.any():
+            allowed_N: Mask = queries.hidden.half_N == half
+            _, rows_QK = index.search_rows(
+                queries.queries_QD[some_Q], NEIGHBOURS + 1, allowed_N, params
+            )
+            found_QK[some_Q] = without_own_row(rows_QK, queries.own_row_Q[some_Q])
+    return share_found(queries.hidden.exact_QK, found_QK)
 
 
 def measure_speed(

@@ -3,7 +3,7 @@
 In: an index, and queries with what exact search finds for them. Out: SearchParams.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from operator import itemgetter
 from typing import Any
@@ -46,7 +46,7 @@ def search_param_grid(index: Any, refine: Refine) -> Iterator[SearchParams]:
 def tune(
     index: RowSearch,
     queries: RecallQueries,
-    grid: Iterator[SearchParams],
+    grid: Iterable[SearchParams],
     target: float,
     fast_enough: Callable[[SearchParams], bool] = lambda params: True,
 ) -> Tuned:
