@@ -15,7 +15,7 @@ from pipeline.index.part import NO_ROW
 from pipeline.index.searcher import Index
 from pipeline.index.tuning.ground_truth import RecallQueries, sample_queries
 from pipeline.index.tuning.recall import measure_filtered_recall
-from pipeline.index.tuning.search_params import MAX_RERANK_FACTOR, tune_hidden
+from pipeline.index.tuning.search_params import MAX_HIDDEN_RERANK_FACTOR, tune_hidden
 from pipeline.index.workspace import rows_by_part
 from tests.index.index_tables import build, write_gallery
 
@@ -91,7 +91,7 @@ def test_tune_hidden_takes_the_work_it_needs(
     assert most >= recall
     codes_alone = replace(few, rerank_factor=1)
     assert tune_hidden(index, queries, codes_alone, 1.01, most=8)[0].hidden_rerank_factor == 1
-    assert hardest.hidden_rerank_factor < 2 * MAX_RERANK_FACTOR
+    assert hardest.hidden_rerank_factor < 2 * MAX_HIDDEN_RERANK_FACTOR
 
 
 def test_only_hidden_queries_are_searched_harder(

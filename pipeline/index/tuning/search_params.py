@@ -19,6 +19,9 @@ from pipeline.index.tuning.recall import RowSearch, measure_filtered_recall, mea
 MAX_EF_SEARCH = 1_024
 "Of a graph: beyond, its recall hardly grows."
 MAX_RERANK_FACTOR = 8 * RERANK_FACTOR
+MAX_HIDDEN_RERANK_FACTOR = 32 * RERANK_FACTOR
+"""Where a filter hides a query's place: what is left is nearly all at one distance, the more rows
+the more of it. 3,200 candidates are about what a narrow filter leaves to be scored one by one."""
 LIST_RATIOS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3)
 "Of SearchParams.list_ratio, from the fewest lists to the most."
 Tuned = tuple[SearchParams, float, float]
@@ -131,5 +134,5 @@ def _harder(params: SearchParams, most: int) -> Iterator[SearchParams]:
     breadth, factor = params.hidden_nprobe_or_ef or most, params.hidden_rerank_factor
     if breadth < most:
         yield replace(params, hidden_nprobe_or_ef=min(most, 2 * breadth))
-    if params.rerank_factor > 1 and factor < MAX_RERANK_FACTOR:
+    if params.rerank_factor > 1 and factor < MAX_HIDDEN_RERANK_FACTOR:
         yield replace(params, hidden_rerank_factor=2 * factor)
