@@ -12,10 +12,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from pipeline.batches.kept import KeptShards
 from pipeline.core.errors import InputError
 from pipeline.shards.manifest import Shard
 from pipeline.shards.samples import Sample
-from pipeline.shards.shard_set import ShardSet
 
 Item = TypeVar("Item")
 
@@ -103,11 +103,11 @@ class SatelliteImages:
     """
 
     def __init__(
-        self, shards: ShardSet, satellite: Sequence[Shard], left_out: frozenset[str]
+        self, kept: KeptShards, satellite: Sequence[Shard], left_out: frozenset[str]
     ) -> None:
-        self._path, self._by_location = shards.path, dict[str, list[Sample]]()
+        self._path, self._by_location = kept.shards.path, dict[str, list[Sample]]()
         for shard in satellite:
-            for sample in shards.samples(shard):
+            for sample in kept.samples(shard):
                 location = location_of(sample)
                 if location not in left_out:
                     self._by_location.setdefault(location, []).append(sample)

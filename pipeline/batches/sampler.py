@@ -9,10 +9,10 @@ from itertools import islice
 
 import numpy as np
 
+from pipeline.batches.kept import KeptShards
 from pipeline.core.errors import InputError
 from pipeline.shards.manifest import Shard
 from pipeline.shards.samples import Sample
-from pipeline.shards.shard_set import ShardSet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ def plan_pass(
 
 
 def read_spans(
-    shards: ShardSet, left_out: frozenset[str], spans: Iterable[Span]
+    kept: KeptShards, left_out: frozenset[str], spans: Iterable[Span]
 ) -> Iterator[Sample]:
     """The spans' samples; samples of the locations that are left out are not counted.
 
@@ -63,7 +63,7 @@ def read_spans(
     for span in spans:
         samples = (
             sample
-            for sample in shards.samples(span.shard)
+            for sample in kept.samples(span.shard)
             if sample.metadata["location"] not in left_out
         )
         read = 0
@@ -71,6 +71,7 @@ def read_spans(
             yield sample
             read += 1
         if read < span.stop - span.start:
+            shards = kept.shards
             raise InputError(
                 f"{shards.tar(span.shard)} ends before sample {span.stop}, expected the "
                 f"{span.shard.samples} samples of the manifest; {shards.repair_hint}"

@@ -47,6 +47,8 @@ class StreamConfig:
     seed: int = 0
     shuffle_buffer: int = 4096
     "Encoded images buffered for shuffling; those of University-1652 take some 40 kB each."
+    keep_bytes: int = 2**28
+    "Of shards that stay in memory from epoch to epoch, with their decoded images."
     threads: int = 2
     "Threads that decode and augment ahead of the network."
     hold_out: float = 0.0

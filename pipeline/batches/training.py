@@ -5,7 +5,8 @@ when is a pure function of the seed, the epoch and the rank, so a resumed run se
 """
 
 import random
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import chain, count, islice
@@ -16,10 +17,10 @@ import numpy.typing as npt
 import webdataset as wds
 
 from pipeline.batches.holdout import exclude_locations, holdout_locations
+from pipeline.batches.kept import KeptShards
 from pipeline.batches.ordered import (
     Decoded,
     is_damaged,
-    open_image,
     split_failed,
     stack,
 )
@@ -33,7 +34,7 @@ from pipeline.batches.pairs import (
 from pipeline.batches.sampler import Span, plan_pass, read_spans
 from pipeline.batches.settings import StreamConfig
 from pipeline.core.errors import InputError
-from pipeline.core.prefetch import prefetch_map
+from pipeline.core.prefetch import In, Out, items_together, prefetch_map
 from pipeline.core.records import Split, View, key_matches
 from pipeline.images.augmentation import augment
 from pipeline.images.decode import DecodeError
@@ -78,6 +79,7 @@ class TrainingStream:
             view: exclude_locations(shards, shards.manifest.of(Split.TRAIN, view), self.held_out)
             for view in (View.DRONE, View.SATELLITE)
         }
+        self._kept = KeptShards(shards, config)
         counts = {
             view: sum(shard.samples for shard in found) for view, found in self._shards.items()
         }
@@ -121,12 +123,7 @@ class TrainingStream:
         drones = self._drones_of_pairs(epoch)
         rows = enumerate(islice(drones, skip * size, self.steps * size), start=skip * size)
         for group in wds.batched(size, collation_fn=None)(
-            prefetch_map(
-                partial(self._prepare_pair, self._satellites, epoch),
-                rows,
-                self.config.threads,
-                4 * size,
-            )
+            self._by_threads(partial(self._prepare_pair, self._satellites, epoch), rows)
         ):
             yield self._collate_pairs(group)
 
@@ -158,12 +155,12 @@ class TrainingStream:
         rng = random.Random(repr((config.seed, epoch, View.DRONE.value, self.rank)))
         buffer = min(config.shuffle_buffer, sum(s.samples for s in self._shards[View.DRONE]))
         shuffled = wds.shuffle(buffer, initial=buffer, rng=rng)
-        samples: Iterator[Sample] = shuffled(read_spans(self.shards, self.held_out, spans))
+        samples: Iterator[Sample] = shuffled(read_spans(self._kept, self.held_out, spans))
         return samples
 
     @cached_property
     def _satellites(self) -> SatelliteImages:
-        return SatelliteImages(self.shards, self._shards[View.SATELLITE], self.held_out)
+        return SatelliteImages(self._kept, self._shards[View.SATELLITE], self.held_out)
 
     def _prepare_pair(
         self, satellites: SatelliteImages, epoch: int, numbered: tuple[int, Sample]
@@ -219,7 +216,7 @@ class TrainingStream:
         rng = random.Random(repr((config.seed, epoch, view.value, self.rank)))
         return wds.DataPipeline(
             partial(self.plan, view, epoch),
-            partial(read_spans, self.shards, self.held_out),
+            partial(read_spans, self._kept, self.held_out),
             wds.shuffle(config.shuffle_buffer, initial=config.shuffle_buffer, rng=rng),
             enumerate,
             wds.slice(skip * config.batch_size, None),
@@ -235,13 +232,19 @@ class TrainingStream:
     def _decode(
         self, view: View, epoch: int, numbered: Iterable[tuple[int, Sample]]
     ) -> Iterator[Decoded]:
-        """The samples' images, decoded and augmented by threads, in order."""
-        return prefetch_map(
-            lambda one: self._prepare(view, epoch, *one),
-            numbered,
-            self.config.threads,
-            4 * self.config.batch_size,
-        )
+        """The samples' images, decoded and augmented, in order."""
+        return self._by_threads(lambda one: self._prepare(view, epoch, *one), numbered)
+
+    def _by_threads(self, prepare: Callable[[In], Out], items: Iterable[In]) -> Iterator[Out]:
+        """`prepare` of each item in order, by threads that work up to four batches ahead."""
+        ahead = 4 * self.config.batch_size
+        together = items_together(self.config.threads, ahead)
+        return prefetch_map(prepare, items, self._threads, ahead, together)
+
+    @cached_property
+    def _threads(self) -> ThreadPoolExecutor:
+        """Those of both views: more than are asked for would only wait for each other."""
+        return ThreadPoolExecutor(self.config.threads)
 
     def _prepare(
         self, view: View, epoch: int, number: int, sample: Sample, mirrored: bool = False
@@ -251,7 +254,7 @@ class TrainingStream:
         # A generator for each image, so that its augmentation does not depend on the thread.
         seed = [config.seed, epoch, list(View).index(view), self.rank, number]
         try:
-            image_HW3 = open_image(sample, config.perspective)
+            image_HW3 = self._kept.open(sample)
         except DecodeError as error:
             return sample, error
         return sample, augment(

@@ -8,27 +8,47 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from itertools import islice
 from typing import Any, TypeVar
 
 In = TypeVar("In")
 Out = TypeVar("Out")
 _Item = TypeVar("_Item")
 
+MOST_TOGETHER = 8
+"Short items that a thread does at a time: handing over a single one takes 0.1 to 0.2 ms."
+
 
 def prefetch_map(
-    function: Callable[[In], Out], items: Iterable[In], threads: int | Executor, depth: int
+    function: Callable[[In], Out],
+    items: Iterable[In],
+    threads: int | Executor,
+    depth: int,
+    together: int = 1,
 ) -> Iterator[Out]:
-    """`map` by threads, in order, at most `depth` items ahead of the consumer.
+    """`map` by threads, in order, at most `depth` items ahead of the consumer, `together` of them
+    at a time by one thread.
 
-    It pays for work that releases the GIL, such as decoding.
+    It pays for work that releases the GIL, such as decoding. An error comes in place of the results
+    of its call.
     """
+
+    def call(some: list[In]) -> list[Out]:
+        return [function(item) for item in some]
+
+    source = iter(items)
     with _executor(threads) as (pool, pending):
-        for item in items:
-            pending.append(pool.submit(function, item))
-            if len(pending) > depth:
-                yield pending.popleft().result()
+        while some := list(islice(source, together)):
+            pending.append(pool.submit(call, some))
+            if len(pending) > depth // together:
+                yield from pending.popleft().result()
         while pending:
-            yield pending.popleft().result()
+            yield from pending.popleft().result()
+
+
+def items_together(threads: int, depth: int) -> int:
+    """As many short items at a time as leave work for all threads within the depth."""
+    return max(1, min(MOST_TOGETHER, depth // (2 * threads)))
 
 
 def prefetch(

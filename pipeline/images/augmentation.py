@@ -147,14 +147,16 @@ def _move_as_published(
     """Pad, turn (satellite only) and crop. Turned corners are black and the nearest pixel is taken,
     as torchvision's RandomAffine does in LPN.
     """
+    import cv2
+
     size, pad = len(image_HW3), settings.pad
-    padded_HW3 = np.pad(image_HW3, ((pad, pad), (pad, pad), (0, 0)), mode="edge")
+    padded_HW3 = cv2.copyMakeBorder(image_HW3, pad, pad, pad, pad, cv2.BORDER_REPLICATE)
     if view == View.SATELLITE and settings.rotation:
         angle = float(rng.uniform(-settings.rotation, settings.rotation))
         turned = Image.fromarray(padded_HW3).rotate(angle, Image.Resampling.NEAREST)
         padded_HW3 = np.asarray(turned)
     top, left = rng.integers(0, 2 * pad, size=2, endpoint=True)
-    return padded_HW3[top : top + size, left : left + size]
+    return np.asarray(padded_HW3[top : top + size, left : left + size], np.uint8)
 
 
 def _move_affinely(

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.batches.kept import KeptShards
 from pipeline.batches.sampler import Span, plan_pass, read_spans
 from pipeline.batches.training import TrainingStream
 from pipeline.core.records import Split, View
@@ -95,7 +96,9 @@ def test_shuffle_keeps_every_sample_and_repeats(shards: str, buffer: int) -> Non
         [sample.key for _, sample in stream.sample_pipeline(View.SATELLITE, 3)] for _ in range(2)
     )
     spans = stream.plan(View.SATELLITE, 3)
-    planned_keys = [sample.key for sample in read_spans(stream.shards, frozenset(), spans)]
+    planned_keys = [
+        sample.key for sample in read_spans(KeptShards(stream.shards, PLAIN), frozenset(), spans)
+    ]
     assert once == again
     assert sorted(once) == sorted(planned_keys)
     assert (once == planned_keys) == (buffer == 1)
@@ -110,5 +113,7 @@ def test_read_spans_of_a_packed_shard(shards: str) -> None:
     assert all(sample.data.startswith(b"\x89PNG") for sample in samples)
     opened = open_shards(shards)
     shard = next(one for one in opened.manifest.shards if one.name == "train-satellite-000002")
-    part = list(read_spans(opened, frozenset(), [Span(shard=shard, start=1, stop=3)]))
+    part = list(
+        read_spans(KeptShards(opened, PLAIN), frozenset(), [Span(shard=shard, start=1, stop=3)])
+    )
     assert [sample.key for sample in part] == [sample.key for sample in samples[1:3]]

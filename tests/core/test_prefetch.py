@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator
 from itertools import count
-from threading import Event
+from threading import Event, get_ident
 
 import pytest
 
-from pipeline.core.prefetch import prefetch, prefetch_map
+from pipeline.core.prefetch import items_together, prefetch, prefetch_map
 from pipeline.images.decode import DecodeError
 
 
@@ -17,6 +17,27 @@ def test_prefetch_map_keeps_order_within_its_depth() -> None:
     assert [next(results) for _ in range(4)] == [0, 1, 4, 9]
     assert next(drawn) <= 4 + 5
     results.close()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("together", [1, 3, 8])
+def test_prefetch_map_does_items_together(together: int) -> None:
+    drawn = count()
+    numbers: Iterator[int] = (next(drawn) for _ in range(100))
+    results = prefetch_map(lambda number: number * number, numbers, 2, 8, together)
+    assert [next(results) for _ in range(10)] == [number**2 for number in range(10)]
+    assert next(drawn) <= 10 + 8 + together
+    assert len(list(results)) == 100 - 10
+    threads: set[int] = set()
+    list(prefetch_map(lambda _: threads.add(get_ident()), range(20), 2, 8, together))
+    assert len(threads) <= 2
+
+
+@pytest.mark.parametrize("threads", [1, 2, 16, 1000])
+def test_items_together_leave_work_for_all_threads(threads: int) -> None:
+    for depth in (1, 4, 32, 128):
+        together = items_together(threads, depth)
+        assert 1 <= together <= 8
+        assert together == 1 or depth // together >= 2 * threads
 
 
 def test_prefetch_map_raises_an_error_in_order() -> None:
