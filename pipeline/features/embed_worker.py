@@ -25,7 +25,7 @@ from pipeline.camera.local_plane import tile_side_m
 from pipeline.core import storage
 from pipeline.core.arrays import Floats, Halves, Pixels
 from pipeline.core.errors import InputError
-from pipeline.core.prefetch import items_together, prefetch, prefetch_map
+from pipeline.core.prefetch import prefetch, prefetch_map
 from pipeline.core.records import Rejection
 from pipeline.features.encoding import EncodingConfig
 from pipeline.features.part import PartFooter, PartRows, vector_lengths, write_part
@@ -164,9 +164,7 @@ class ShardEmbedder:
         )
 
     def _decode(self, samples: Iterable[Sample]) -> Iterator[tuple[Decoded, float]]:
-        ahead = self._job.batch_size
-        together = items_together(self._job.decode_threads, ahead)
-        return prefetch_map(self._decode_one, samples, self._decoders, ahead, together)
+        return prefetch_map(self._decode_one, samples, self._decoders, self._job.batch_size)
 
     def _decode_one(self, sample: Sample) -> tuple[Decoded, float]:
         start = time.perf_counter()
