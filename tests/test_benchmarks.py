@@ -81,6 +81,10 @@ CASES: dict[str, tuple[str, str]] = {
         "--out {out} --rounds 1 --jobs simulate",
         r"\| simulate \| [\d.]+ \| [\d.]+ x \|",
     ),
+    "vamana": (
+        "--rows 600 --dimension 32 --rounds 1 --seconds 0.05 --factories HNSW32,SQ8 IVF8,SQ8",
+        r"IVF8,SQ8 \| [\d.]+ \| [\d,]+ \| [\d.]+ x",
+    ),
     "filters": (
         "--rows 2000 --dimension 32 --selectivities 0.001 0.5 1 --factories IVF16,SQ8",
         r"\| 0.5 \| 1,000 \| IVF16,SQ8 \| [\d.]+ \|.* [\d.]+ x \|",
