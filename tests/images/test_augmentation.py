@@ -95,6 +95,16 @@ def test_augment_turns_a_satellite_image_by_up_to_90_degrees() -> None:
     assert (counts > 15).all()
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_augment_repeats_the_edge_as_numpy_pads(mirrored: bool) -> None:
+    image_HW3 = noise(SIZE, SIZE)[:, ::-1] if mirrored else noise(SIZE, SIZE)
+    padded_HW3 = np.pad(image_HW3, ((PAD, PAD), (PAD, PAD), (0, 0)), mode="edge")
+    for seed in range(20):
+        found_HW3 = augment(image_HW3, View.DRONE, SIZE, BARE, np.random.default_rng(seed))
+        top, left = np.random.default_rng(seed).integers(0, 2 * PAD, size=2, endpoint=True)
+        assert np.array_equal(found_HW3, padded_HW3[top : top + SIZE, left : left + SIZE])
+
+
 def test_augment_pads_before_turning_and_leaves_corners_black() -> None:
     white_HW3 = np.full((SIZE, SIZE, 3), 255, np.uint8)
     for image_HW3 in augmented(View.SATELLITE, Augmentation(pad=PAD), 50, white_HW3):
