@@ -83,7 +83,9 @@ def serve_job(pipe: int, environment: dict[str, str]) -> dict[str, Any]:
     """
     end_with_parent()
     os.environ.update(environment)
-    importlib.import_module("ray.train.torch")
+    # Not ray.train: importing it draws one of Ray's random ids, after which all workers would draw
+    # the same ones, and two that start at once would warm up the object store with one object.
+    importlib.import_module("ray")
     gc.freeze()
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel forgets who has ended
     with os.fdopen(pipe) as orders:

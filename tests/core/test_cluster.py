@@ -34,6 +34,22 @@ def test_tasks_pay_where_a_cluster_is_or_work_outweighs_one(
     assert cluster.tasks_pay(0.0)
 
 
+def test_workers_draw_other_random_ids(ray_cluster: None) -> None:
+    """Those of the tests are forked from one process; with the same ids they would take each
+    other's objects.
+    """
+
+    class Worker:
+        def first_ids(self) -> tuple[str, ...]:
+            return tuple(ray.ObjectRef.from_random().hex() for _ in range(20))
+
+    workers: list[Any] = [ray.remote(num_cpus=0)(Worker).remote() for _ in range(2)]
+    some, others = ray.get([worker.first_ids.remote() for worker in workers])
+    for worker in workers:
+        ray.kill(worker)
+    assert set(some).isdisjoint(others)
+
+
 def test_bounded_map_pairs_results_within_its_window(ray_cluster: None) -> None:
     in_flight, most = 0, 0
     double: Any = ray.remote(lambda number: 2 * number)
