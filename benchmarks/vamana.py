@@ -25,11 +25,12 @@ from made_table import make_table
 from pipeline.core.arrays import Floats, Ints
 from pipeline.core.records import Split
 from pipeline.features.table import open_table
-from pipeline.index.faiss_io import FAISS
+from pipeline.index.faiss_io import faiss_parameters
+from pipeline.index.train import new_index, train_index
+from pipeline.index.tuning.ground_truth import NEIGHBOURS
 from pipeline.index.tuning.recall import measure_speed, share_found
 
 BLOCK_ROWS = 1_024
-NEIGHBOURS = 10
 EFFORTS = (1, 2, 4, 8, 10, 16, 24, 32, 48, 64, 96, 128, 256)
 "nprobe of lists, efSearch or search window of graphs."
 DEGREE, WINDOW = 64, 128
@@ -55,38 +56,25 @@ class Tried:
     speeds: list[dict[str, float]] = field(default_factory=list)
 
 
-def try_efforts(
-    name: str,
-    search: Callable[[int, Floats], Ints],
-    exact_QK: Ints,
-    queries_QD: Floats,
-    target: float,
-    **figures: float,
-) -> Tried:
-    """The least effort that reaches the target, or the most."""
+def least_effort(
+    search: Callable[[int, Floats], Ints], exact_QK: Ints, queries_QD: Floats, target: float
+) -> tuple[int, float]:
+    """The least effort that reaches the target, or the most, and its recall."""
     for effort in EFFORTS:
         recall = share_found(exact_QK, search(effort, queries_QD))
         if recall >= target:
             break
-    return Tried(
-        name=name, search=partial(search, effort), recall=recall, effort=effort,
-        bytes_per_row=figures["bytes_per_row"], seconds=figures["seconds"],
-    )  # fmt: skip
+    return effort, recall
 
 
 def build_faiss(factory: str, rows_ND: Floats) -> tuple[Callable[[int, Floats], Ints], int]:
     """The search of a FAISS index by its effort, and its bytes."""
-    index = faiss.index_factory(rows_ND.shape[1], factory, faiss.METRIC_INNER_PRODUCT)
-    index.train(rows_ND)
+    index = new_index(factory, rows_ND.shape[1])
+    train_index(index, factory, rows_ND)
     index.add(rows_ND)
 
     def search(effort: int, queries_QD: Floats) -> Ints:
-        lists = isinstance(index, faiss.IndexIVF)
-        params = (
-            FAISS.SearchParametersIVF(nprobe=effort)
-            if lists
-            else FAISS.SearchParametersHNSW(efSearch=effort)
-        )
+        params = faiss_parameters(index, effort, None)
         rows_QK: Ints = index.search(queries_QD, NEIGHBOURS, params=params)[1]
         return rows_QK
 
@@ -171,13 +159,19 @@ def main() -> None:
         except RuntimeError as error:
             print(f"{name} cannot be built here: {error}")
             continue
-        figures = {"seconds": time.perf_counter() - begin, "bytes_per_row": size / len(rows_ND)}
-        found.append(try_efforts(name, search, exact_QK, queries_QD, args.target_recall, **figures))
+        seconds = time.perf_counter() - begin
+        effort, recall = least_effort(search, exact_QK, queries_QD, args.target_recall)
+        found.append(
+            Tried(
+                name=name, search=partial(search, effort), recall=recall, effort=effort,
+                bytes_per_row=size / len(rows_ND), seconds=seconds,
+            )
+        )  # fmt: skip
     for _ in range(args.rounds):
         for one in found:
             one.speeds.append(measure_speed(one.search, queries_QD, 1, args.seconds))
-    size = f"{len(rows_ND):,} x {rows_ND.shape[1]}"
-    print(f"{size}, target {args.target_recall}, {os.cpu_count()} cores")
+    shape = f"{len(rows_ND):,} x {rows_ND.shape[1]}"
+    print(f"{shape}, target {args.target_recall}, {os.cpu_count()} cores")
     print(f"| {' | '.join(HEADINGS)} |\n|{'---|' * len(HEADINGS)}")
     first = None
     for one in found:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pipeline.batches.ordered import open_image
 from pipeline.batches.settings import StreamConfig
 from pipeline.core.arrays import Pixels
+from pipeline.core.records import Split, View
 from pipeline.images.transforms import resize
 from pipeline.shards.manifest import Shard
 from pipeline.shards.samples import Sample
@@ -25,8 +26,9 @@ class KeptSample(Sample):
 
 
 class KeptShards:
-    """A set's shards; each is kept when it is first read, if its tar and its images at the
-    network's size fit into what is left of `keep_bytes`.
+    """A set's training shards. Those are kept, from their first reading on, whose tars and images
+    at the network's size fit into `keep_bytes` together: satellite images first, all of which an
+    epoch reads.
 
     Images are kept where resizing them is the first step of the augmentation.
     """
@@ -35,21 +37,29 @@ class KeptShards:
         self.shards, self._config = shards, config
         chosen = config.augmentation
         self._resizes_first = chosen.chain == "own" and not chosen.pair_mirror
-        self._left = config.keep_bytes
+        self._fitting = frozenset(self._that_fit())
         self._kept: dict[str, list[KeptSample]] = {}
+
+    def _that_fit(self) -> Iterator[str]:
+        """Names of the shards to keep."""
+        left = self._config.keep_bytes
+        image_bytes = 3 * self._config.image_size**2 if self._resizes_first else 0
+        for view in (View.SATELLITE, View.DRONE):
+            for shard in self.shards.manifest.of(Split.TRAIN, view):
+                size = shard.bytes + shard.samples * image_bytes
+                if size <= left:
+                    left -= size
+                    yield shard.name
 
     def samples(self, shard: Shard) -> Iterator[Sample]:
         """The samples of a shard in their order. Raises InputError as `ShardSet.samples` does."""
+        if shard.name not in self._fitting:
+            return self.shards.samples(shard)
         if shard.name not in self._kept:
-            image_bytes = 3 * self._config.image_size**2 if self._resizes_first else 0
-            size = shard.bytes + shard.samples * image_bytes
-            if size > self._left:
-                return self.shards.samples(shard)
             self._kept[shard.name] = [
                 KeptSample(key=sample.key, data=sample.data, metadata=sample.metadata)
                 for sample in self.shards.samples(shard)
             ]
-            self._left -= size
         return iter(self._kept[shard.name])
 
     def open(self, sample: Sample) -> Pixels:

@@ -18,12 +18,7 @@ import webdataset as wds
 
 from pipeline.batches.holdout import exclude_locations, holdout_locations
 from pipeline.batches.kept import KeptShards
-from pipeline.batches.ordered import (
-    Decoded,
-    is_damaged,
-    split_failed,
-    stack,
-)
+from pipeline.batches.ordered import Decoded, is_damaged, split_failed, stack
 from pipeline.batches.pairs import (
     SatelliteImages,
     group_distinct,
